@@ -26,6 +26,7 @@ import numpy as np
 import viser
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from gsparc.view.building import Given
 from gsparc.view.server.serve import Server
@@ -73,9 +74,10 @@ class Hand:
     """
 
     def __init__(self, server: Server) -> None:
-        before, self.received, self.delays, self.since = set(server.sessions), 0.0, [], 0.0
+        before, self.received, self.since = set(server.sessions), 0.0, 0.0
+        self.delays: list[float] = []
         self.socket = connect(
-            server.address.replace("http", "ws"), subprotocols=[f"viser-v{viser.__version__}"],
+            server.address.replace("http", "ws"), subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
             max_size=None, compression=None,
         )  # fmt: skip
         camera = {"wxyz": (1.0, 0, 0, 0), "position": (0.0, -9, 8), "fov": 1.3, "near": 0.01, "far": 1e3}

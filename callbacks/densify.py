@@ -94,7 +94,7 @@ class Densify(Checked, L.Callback):
             before = len(model.gaussians)
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
             self.statistics = self._blank(model)
-        _tell(trainer, module, planned, before)
+        _log_edit(trainer, module, planned, before)
 
     def plan(self, model: GaussianModel, generator: torch.Generator) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far."""
@@ -150,7 +150,7 @@ class Densify(Checked, L.Callback):
         self.statistics = dict(state["statistics"])
 
 
-def _tell(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int) -> None:
+def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int) -> None:
     """A line in the log and figures for the trackers, where anything was changed."""
     after, gone = len(module.model.gaussians), int((~planned.keep).sum())
     if gone or len(planned.parents):

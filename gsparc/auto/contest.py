@@ -1,4 +1,4 @@
-"""Candidates tried one after the other on inner folds, within seconds, the hopeless ones given up early."""
+"""Candidates tried in turn on inner folds, within seconds, the clearly worse ones given up early."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ class Contest:
             trial.seconds.append(self.budget.spent - began)
             trial.over_s = max(trial.over_s, trial.seconds[-1] - (seconds or 0.0))
             first = trial.refusal is None and len(trial.residual) == 1
-            trial.stopped = first and self._hopeless(trial)
+            trial.stopped = first and self._clearly_worse(trial)
             if first and waiting == 1 and folds > 1 and self._settled(trial):
                 log.info("auto: %s: clearly better than all others, tried no further", trial.name)
                 break
-        self._say(trial)
+        self._log_trial(trial)
 
     def _seconds(self, trial: Trial, rest: float, folds: int) -> float:
         """Of the next fit [s], so that those that follow, and one to all rows, have as many.
@@ -104,23 +104,23 @@ class Contest:
     def _squares(self, trials: Sequence[Trial]) -> np.ndarray:
         return products(trials, self.way, min(len(trial.residual) for trial in trials))
 
-    def _hopeless(self, trial: Trial) -> bool:
+    def _clearly_worse(self, trial: Trial) -> bool:
         best = self._best(other=trial)
         if best is None or len(self.way.asked) == 1:
             return False
         return self._behind(trial, best)
 
     def _settled(self, trial: Trial) -> bool:
-        """Whether all others are hopeless beside it: its fit to all rows has the seconds of more folds."""
+        """Whether all others are clearly worse: its fit to all rows has the seconds of more folds."""
         others = [one for one in self.trials if one.usable and one is not trial]
         return bool(others) and trial.usable and all(self._behind(one, trial) for one in others)
 
     def _behind(self, trial: Trial, best: Trial) -> bool:
         gram = self._squares([trial, best])
         units = self.way.units(min(len(trial.residual), len(best.residual)))
-        return stacking.hopeless(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], units)
+        return stacking.clearly_worse(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], units)
 
-    def _say(self, trial: Trial) -> None:
+    def _log_trial(self, trial: Trial) -> None:
         """One line of what was found."""
         if trial.refusal is not None:
             log.debug("%s: %s", trial.name, trial.refusal)

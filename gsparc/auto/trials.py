@@ -59,7 +59,7 @@ class Trial:
         limited_by: see `FitReport`.
         method: as the last of the fits left it.
         refusal: why it does not serve these data; None where it does.
-        stopped: whether it was given up as hopeless.
+        stopped: whether it was given up as clearly worse.
     """
 
     name: str

@@ -54,18 +54,18 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     try:
         main()
     except KeyboardInterrupt as interrupt:
-        _say(str(interrupt) or "interrupted")
+        _print_error(str(interrupt) or "interrupted")
         sys.exit(130)
     except BrokenPipeError:  # of Hydra's own lists: gsparc/__main__.py ends quietly
         raise
     except InUse as busy:
-        _say(str(busy))
+        _print_error(str(busy))
         sys.exit(1)
     except (_Failed, Exception) as failure:
         error = failure.error if isinstance(failure, _Failed) else failure
         if before == "1":
             raise error from error.__cause__
-        _say(_told(error))
+        _print_error(_message_of(error))
         sys.exit(1)
     finally:
         release()
@@ -74,7 +74,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
             os.environ[FULL_ERROR] = before
 
 
-def _told(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     """One line; of a launcher whose job has died, with what to do."""
     if type(error).__module__.startswith(LAUNCHERS):
         advice = "what is done is kept, the same command goes on with the rest"
@@ -112,7 +112,7 @@ def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], obje
     return wrapped
 
 
-def _say(message: str) -> None:
+def _print_error(message: str) -> None:
     Console(stderr=True, soft_wrap=True).print(
         f"error: {message}", markup=False, highlight=False, style="red"
     )

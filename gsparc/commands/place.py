@@ -13,7 +13,7 @@ from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 from gsparc.maps.pictures import draw_placing
-from gsparc.maps.placing import NewStation, new_station_error, number, place_next, said
+from gsparc.maps.placing import NewStation, in_words, new_station_error, number, place_next
 from gsparc.maps.promise import PromiseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.predictor import load
@@ -63,8 +63,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_summary(run_dir / "summary.json", facts)
     level = float(config.threshold_db)
     lines = [
-        f"now {said(found.what, found.before, level)}",
-        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {said(found.what, found.goal[0], level)} "
+        f"now {in_words(found.what, found.before, level)}",
+        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {in_words(found.what, found.goal[0], level)} "
         f"(90 % interval {number(found.what, found.low[0])} to {number(found.what, found.high[0])})",
     ]
     if not error.stations:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import socket
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -65,9 +66,32 @@ def hold(folder: Path, jobs: bool = False) -> None:
         raise InUse(f"{folder}: cannot be locked ({error}); give another hydra.run.dir=...") from None
 
 
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold one folder meanwhile, for callers from Python; nothing where a command of this process holds it.
+
+    Raises:
+        ValueError: another process has locked it, or it cannot be locked.
+    """
+    if folder.resolve() in (Path(lock.lock_file).parent for lock in _held):
+        yield
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = _locked(folder)
+    except (OSError, NotImplementedError) as error:
+        raise ValueError(f"{folder}: cannot be locked ({error}); give another folder") from None
+    except InUse as busy:
+        raise ValueError(str(busy)) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def _locked(folder: Path) -> FileLock:
     """Its lock, held."""
-    lock = FileLock(folder / LOCK)
+    lock = FileLock(folder.resolve() / LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout:

@@ -18,6 +18,7 @@ from gsparc.commands import cli
 from gsparc.commands.context import callbacks_of, context_of
 from gsparc.commands.continued import once
 from gsparc.commands.output import run_directory, show
+from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.run import fit_and_score
 from gsparc.data.datamodule import DataModule
@@ -78,8 +79,13 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         The facts of `summary.json`, and the objects they were computed from.
 
     Raises:
-        ValueError: bad data, settings or checkpoint; one line each.
+        ValueError: bad data, settings or checkpoint, or another run writes there; one line each.
     """
+    with held(run_dir):
+        return _train(config, run_dir)
+
+
+def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     RunSettings.of(config)
     module = _data(config)
     data = module.measurements
@@ -95,7 +101,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
-        _tell(method, report, config.budget_s)
+        _log_fit(method, report, config.budget_s)
         extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(files[number], method, yaml, extra)
 
@@ -187,7 +193,7 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
     return own if own.exists() else None
 
 
-def _tell(method: Method, report: FitReport, budget_s: float | None) -> None:
+def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
     """What the fit found, and whether a budget or options of the Trainer were asked for and not used."""
     if budget_s is not None and not method.takes_budget:
         log.warning("budget_s=%g is not used: the seconds of %s cannot be chosen", budget_s, method.name)

@@ -187,6 +187,8 @@ class PowerMetrics(SampleMetric):
     def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
         """See the base class."""
         floored, silent = int((samples["prediction"] <= 0).sum()), int((samples["target"] <= 0).sum())
+        if not samples["prediction"].any():
+            floored = 0  # zeros alone are meant, as the baseline's are
         if floored or silent:
             log.warning("%d predictions and %d targets without power (no decibels there)", floored, silent)
         squared = _statistic(samples["error_db"] ** 2)

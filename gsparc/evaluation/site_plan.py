@@ -223,7 +223,7 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
     if site.stations is None or len(place) > NAMED:
         return
     for number, (where, name) in enumerate(zip(place, site.stations.name, strict=True)):
-        _say(axis, name, where, "red" if number in jumping else "black")
+        _annotate(axis, name, where, "red" if number in jumping else "black")
 
 
 def _draw_suspicious(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
@@ -240,17 +240,17 @@ def _draw_suspicious(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray)
             *edge.T, c="red", marker="x", s=60, zorder=3, label=f"far outside, at the edge ({len(far)})"
         )
         for row, where in zip(far[:MOST_MARKS], edge, strict=False):
-            _say(
+            _annotate(
                 axis,
                 f"{found.rows[row]} at ({', '.join(f'{v:.4g}' for v in found.place[row])})",
                 where,
                 "red",
             )
     for row in near[:MOST_MARKS]:
-        _say(axis, found.rows[row], found.place[row], "red", above=False)
+        _annotate(axis, found.rows[row], found.place[row], "red", above=False)
 
 
-def _say(axis: Any, text: str, where: np.ndarray, colour: str, above: bool = True) -> None:
+def _annotate(axis: Any, text: str, where: np.ndarray, colour: str, above: bool = True) -> None:
     """Write beside a point: above to its right, or below to its left, where the map does not end there."""
     low, high = axis.get_xlim()
     left = where[0] > low + (0.75 if above else 0.25) * (high - low)

@@ -135,16 +135,16 @@ def _rectangle(area: Any) -> tuple[np.ndarray, np.ndarray]:
     except (TypeError, ValueError):
         corners = np.zeros(0)
     if corners.shape != (4,) or not np.isfinite(corners).all():
-        raise DataError(f"area={_said(area)}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
+        raise DataError(f"area={_as_text(area)}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
     if np.abs(corners).max() > FARTHEST:
-        raise DataError(f"area={_said(area)}: {np.abs(corners).max():.3g} is no coordinate in metres")
+        raise DataError(f"area={_as_text(area)}: {np.abs(corners).max():.3g} is no coordinate in metres")
     low, high = corners[:2], corners[2:]
     if not (high > low).all():
-        raise DataError(f"area={_said(area)}: is empty; x1 must be above x0 and y1 above y0")
+        raise DataError(f"area={_as_text(area)}: is empty; x1 must be above x0 and y1 above y0")
     return low, high
 
 
-def _said(area: Any) -> str:
+def _as_text(area: Any) -> str:
     return str(list(area)) if isinstance(area, Sequence) and not isinstance(area, str) else str(area)
 
 

@@ -59,7 +59,7 @@ class Evidence:
         return np.where(self.silent, np.minimum(error, 0.0), error)
 
     @property
-    def tells(self) -> np.ndarray:
+    def informative(self) -> np.ndarray:
         """Rows (n,) bool that bound an error: heard, or predicted above the level they lie below."""
         return ~self.silent | (self.level_db < self.mean_db)
 
@@ -129,7 +129,7 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     Raises:
         ValueError: too few rows.
     """
-    used = evidence.at(np.flatnonzero(evidence.tells & np.isfinite(evidence.error)))
+    used = evidence.at(np.flatnonzero(evidence.informative & np.isfinite(evidence.error)))
     if len(used) < LEAST_ROWS:
         raise ValueError(
             f"{len(used)} held-out rows are too few for a promise; {LEAST_ROWS} at least are needed"

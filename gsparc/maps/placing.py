@@ -212,7 +212,7 @@ def number(what: Goal, value: float) -> str:
     return f"{value:.1%}" if what == "coverage" else f"{value:.1f} dB"
 
 
-def said(what: Goal, value: float, threshold_db: float) -> str:
+def in_words(what: Goal, value: float, threshold_db: float) -> str:
     """A goal's value in words."""
     if what == "coverage":
         return f"{number(what, value)} of the area with {threshold_db:g} dB or more"

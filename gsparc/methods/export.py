@@ -43,10 +43,10 @@ class Paths:
 
 def judged(method: Method, site: Site, uplink: Any) -> Prediction:
     """Channels of the measured tones in stored units with their confidence and variance; see `heard`."""
-    return _reader(method).listen(_snapshots(method, site, uplink))
+    return _reader(method).from_uplink(_snapshots(method, site, uplink))
 
 
-def heard(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> Tensor:
+def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> Tensor:
     """Channels (B, A, K) in physical units from uplinks (B, U, L) in physical units.
 
     Raises:
@@ -56,10 +56,10 @@ def heard(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> 
     if frequency_hz is None:
         frequency_hz = site.subcarriers_hz
     wanted = torch.from_numpy(np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64)))
-    return _separator(method).listen_at(snapshots, wanted).mean * site.target_scale
+    return _separator(method).from_uplink_at(snapshots, wanted).mean * site.target_scale
 
 
-def heard_paths(method: Method, site: Site, uplink: Any) -> Paths:
+def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     """The sources of uplinks (B, U, L), physical units; see `heard`."""
     found = _separator(method).sources(_snapshots(method, site, uplink))
     assert site.uplink_hz is not None

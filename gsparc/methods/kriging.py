@@ -171,7 +171,8 @@ class Kriging(Interpolator):
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         if self.tree is not None and len(queries) > (block := self._block()):
-            return _joined([self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)])
+            parts = [self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)]
+            return Prediction.joined(parts)
         place, weights, left = self._weights(queries)
         shares = torch.from_numpy(weights)
 
@@ -204,16 +205,6 @@ class Kriging(Interpolator):
         self.channels = state["channels"].numpy() if "channels" in state else None
         self.variogram = Variogram(*(float(v) for v in state["variogram"]))
         self._solve()
-
-
-def _joined(parts: list[Prediction]) -> Prediction:
-    confidence = [part.confidence for part in parts if part.confidence is not None]
-    variance = [part.variance for part in parts if part.variance is not None]
-    return Prediction(
-        torch.cat([part.mean for part in parts]),
-        torch.cat(confidence) if confidence else None,
-        torch.cat(variance) if variance else None,
-    )
 
 
 def _by_place(rows: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from gsparc.data.gaussian_cloud import GaussianCloud
@@ -40,6 +41,18 @@ class Prediction:
     mean: Tensor
     confidence: Tensor | None = None
     variance: Tensor | None = None
+
+    @staticmethod
+    def joined(parts: Sequence[Prediction], order: Tensor | None = None) -> Prediction:
+        """One after the other, then in an order (B,); what any part lacks is None."""
+
+        def of(name: str) -> Any:
+            values = [getattr(part, name) for part in parts]
+            if any(value is None for value in values):
+                return None
+            return torch.cat(values) if order is None else torch.cat(values)[order]
+
+        return Prediction(of("mean"), of("confidence"), of("variance"))
 
 
 @dataclass(frozen=True)
@@ -193,12 +206,10 @@ class LeftOut:
     Attributes:
         rows: (n,) rows of the measurements, ascending where each occurs once.
         residual: (n, R) complex, what was measured less what the others predict, stored units.
-        aligned: whether a phase of every snapshot's own was estimated and removed before.
     """
 
     rows: np.ndarray
     residual: Tensor
-    aligned: bool = False
 
 
 @runtime_checkable

@@ -23,7 +23,7 @@ from gsparc.methods.covering import covering
 from gsparc.methods.neighbourhood import NEIGHBOURS, Neighbourhood
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.trend import REACH, Trend, trend_of
-from gsparc.methods.vecchia import Sample, most_likely, told
+from gsparc.methods.vecchia import Sample, most_likely, weights_of
 
 COVER = 20_000  # rows that weigh the mean law
 FIRST = 256  # rows of an ordering that condition on each other alone
@@ -113,7 +113,7 @@ class NearestProcess:
         """Mean [dB], variance of a measurement, of the amplitude, distance to the nearest row, each (b,)."""
         row, far = self.near.nearest(queries.detach().numpy(), without)
         near = torch.from_numpy(self.places[row])
-        weights, known = told(self.kernel, queries, near, torch.from_numpy(self.noise[row]))
+        weights, known = weights_of(self.kernel, queries, near, torch.from_numpy(self.noise[row]))
         about = torch.from_numpy(self.weights)
         terms, own = self._terms(near), self.trend.terms(queries)
         rest = torch.from_numpy(self.values[row]) - terms @ about
@@ -198,7 +198,7 @@ def weighed(
         for a in range(start, end, BLOCK):
             block = slice(a, min(a + BLOCK, end))
             _, row = tree.query(places[block], k=np.arange(1, min(NEIGHBOURS, tree.n) + 1))
-            shares, known = told(kernel, at[block], at[row], torch.from_numpy(noise[row]))
+            shares, known = weights_of(kernel, at[block], at[row], torch.from_numpy(noise[row]))
             left = (1 + torch.from_numpy(noise[block]) - known).sqrt()
             white.append((both[block] - torch.einsum("bk,bkp->bp", shares, both[row])) / left[:, None])
         start = end

@@ -20,7 +20,7 @@ from gsparc.methods.covering import covering
 from gsparc.methods.neighbourhood import NEIGHBOURS, Neighbourhood
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.target_rows import to_real
-from gsparc.methods.vecchia import Sample, most_likely, told
+from gsparc.methods.vecchia import Sample, most_likely, weights_of
 
 BLOCK = 256  # targets that are floats at a time
 LOOKED_AT = 600  # rows that settings are chosen on
@@ -50,7 +50,7 @@ class NearestTargets:
         row, _ = self.near.nearest(queries.detach().numpy())
         near = torch.from_numpy(self.near.places[row])
         noise = torch.full(row.shape, self.kernel.noise, dtype=near.dtype)
-        weights, known = told(self.kernel, queries, near, noise)
+        weights, known = weights_of(self.kernel, queries, near, noise)
         scores = torch.einsum("bk,bkp->bp", weights.float(), self.scores[torch.from_numpy(row)])
         return scores, (1 + self.kernel.noise - known).clamp_min(0.0)
 

@@ -47,11 +47,6 @@ class Neighbourhood:
         sets = [np.flatnonzero(self.level == number) for number in range(int(self.level.max()) + 1)]
         return [(own, cKDTree(self.places[own])) for own in sets]
 
-    @property
-    def counts(self) -> list[int]:
-        """Places of the sparsest set, of it and the next, and so on."""
-        return np.cumsum(np.bincount(self.level)).tolist()
-
     def nearest(
         self, queries: np.ndarray, without: np.ndarray | None = None, most: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +54,8 @@ class Neighbourhood:
 
         Args:
             queries: [m].
-            without: (B,) a place for each query that is no neighbour of it; None: none.
+            without: (B,) a place for each query that is no neighbour of it; None: none. Of one place
+                alone there is then no neighbour, and the distance is infinite.
             most: neighbours; None: NEIGHBOURS.
         """
         sparser = len(self._trees) - 1
@@ -73,9 +69,9 @@ class Neighbourhood:
             ks = np.arange(1, min(count + more, tree.n) + 1)
             distance, number = tree.query(queries, k=ks)
             row = own[number]
-            if without is not None and row.shape[1] > 1:
+            if without is not None:
                 later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
                 row, distance = (np.take_along_axis(part, later, 1) for part in (row, distance))
             found.append(row)
-            far.append(distance[:, 0])
+            far.append(distance.min(1, initial=np.inf))
         return np.concatenate(found, 1), np.min(far, axis=0)

@@ -18,8 +18,8 @@ WORDS = {
     "projection": lambda value: f"{value} projection",
     "frozen": lambda value: "frozen plan" if value else "live plan",
     "confidence": lambda value: "" if value else "no confidence",
-    "hybrid": lambda value: "" if value else "no rest",
-    "beside": lambda value: f"{value:.0%} of the process beside" if value else "no process beside",
+    "hybrid": lambda value: "" if value else "no residual",
+    "beside": lambda value: f"{value:.0%} of the averaged process" if value else "no averaged process",
     "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
 }
 

@@ -211,15 +211,8 @@ class PerStation(Method):
         for number in stations.unique().tolist():
             chosen = (stations == number).nonzero()[:, 0]
             parts.append((chosen, ask(self.of(number), chosen)))
-        order = torch.argsort(torch.cat([chosen for chosen, _ in parts]))
-
-        def joined(name: str) -> Tensor | None:
-            values = [getattr(part, name) for _, part in parts]
-            return None if any(v is None for v in values) else torch.cat(values)[order]
-
-        mean = joined("mean")
-        assert mean is not None
-        return Prediction(mean, joined("confidence"), joined("variance"))
+        rows, found = zip(*parts, strict=True)
+        return Prediction.joined(found, torch.argsort(torch.cat(rows)))
 
     def state(self) -> dict[str, Any]:
         """The state of every copy, by its station's number."""

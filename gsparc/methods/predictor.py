@@ -200,7 +200,7 @@ class Predictor:
         from gsparc.methods import export
 
         if uplink is not None:
-            channel = export.heard(self.method, self.site, uplink, frequency_hz)
+            channel = export.uplink_channels(self.method, self.site, uplink, frequency_hz)
             found = export.on_grid(channel, self.site, None, symbols)
             return found if isinstance(uplink, Tensor) else found.numpy()
         asked = torch.as_tensor(self._ask("csi", tx, rx))
@@ -218,7 +218,7 @@ class Predictor:
         from gsparc.methods import export
 
         if uplink is not None:
-            return export.heard_paths(self.method, self.site, uplink)
+            return export.uplink_paths(self.method, self.site, uplink)
         asked, pose, _, _ = self._ends(tx, rx)
         return export.placed_paths(self._whole, self.site, asked, pose)
 

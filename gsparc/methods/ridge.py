@@ -42,7 +42,7 @@ class Ridge(UplinkMethod):
                 self.maps, self.unit = _solve(*normal, penalty), unit
                 batch = data.batch(fold.val if len(fold.val) else fold.train)
                 assert batch.uplink is not None
-                miss = self.listen(batch.uplink).mean - batch.target
+                miss = self.from_uplink(batch.uplink).mean - batch.target
                 value = float((_power(miss) / _power(batch.target)).log10().mean())
                 if best is None or value < best[0]:
                     best = value, penalty, unit
@@ -68,8 +68,8 @@ class Ridge(UplinkMethod):
         """(B, M, F): M maps of F inputs each."""
         return uplink.flatten(1)[:, None] if self.inputs == "all" else self.own(uplink)
 
-    def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """See `UplinkMethod.listen`."""
+    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+        """See `UplinkMethod.from_uplink`."""
         assert self.site is not None and self.site.antennas is not None
         mean = torch.einsum("bmf,mfo->bmo", self._inputs(uplink), self.maps)
         return Prediction(mean.reshape(len(uplink), len(self.site.antennas), -1))

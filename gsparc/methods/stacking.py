@@ -43,7 +43,7 @@ def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
     return mean, few * float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
 
 
-def hopeless(own: np.ndarray, best: np.ndarray, both: np.ndarray, unit: np.ndarray) -> bool:
+def clearly_worse(own: np.ndarray, best: np.ndarray, both: np.ndarray, unit: np.ndarray) -> bool:
     """Whether squared errors (n,) are clearly larger than the best's, and a mixture would not want them.
 
     Args:

@@ -21,7 +21,7 @@ class SeparatesPaths(Protocol):
     def sources(self, uplink: Tensor) -> Any:
         """Gains, delays and directions (B, N) of uplinks (B, U, L)."""
 
-    def listen_at(
+    def from_uplink_at(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
     ) -> Prediction:
         """Channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
@@ -45,14 +45,14 @@ class UplinkMethod(Method):
             raise ValueError(f"{self.name}: fit or restore it first")
         if batch.uplink is None:
             raise ValueError(f"{self.name}: reads a fresh uplink, and these data have none; take model=gp")
-        return self.listen(batch.uplink, batch.noise_variance)
+        return self.from_uplink(batch.uplink, batch.noise_variance)
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """Always refused: `ValueError`."""
         raise ValueError(f"{self.name}: answers snapshots with their uplink, not positions")
 
     @abstractmethod
-    def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
         """Channels of the downlink (B, A, K) from uplinks (B, U, L), with noise powers (B,) where known."""
 
     def own(self, uplink: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ def correlation(
     return total
 
 
-def told(kernel: PowerKernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+def weights_of(kernel: PowerKernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Weights (B, k) of near rows' values in the mean at places, and what they take off its variance (B,).
 
     Args:

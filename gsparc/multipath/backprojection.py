@@ -22,6 +22,8 @@ from gsparc.multipath.worker import ask
 from gsparc.physics.waves import LIGHT, NEAR_M
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
+CANDIDATES, EXACT, POLISHED = 150_000, 1_500, 40  # points drawn in the box, scored exactly, moved by ascent
+STEPS, STEP_M = 25, 0.02  # of the ascent
 
 
 @dataclass(frozen=True)
@@ -86,25 +88,6 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
     return torch.cat(scores)
 
 
-@dataclass(frozen=True)
-class Effort:
-    """Effort of a search.
-
-    Attributes:
-        candidates: random points in the box.
-        exact: of them scored exactly.
-        polished: of those moved by gradient ascent.
-        steps: of the ascent.
-        step_m: its step size [m].
-    """
-
-    candidates: int = 150_000
-    exact: int = 1_500
-    polished: int = 40
-    steps: int = 25
-    step_m: float = 0.02
-
-
 def search_box(
     rows: Rows,
     factor: Factor,
@@ -112,20 +95,19 @@ def search_box(
     min_distance: float,
     limit: int,
     generator: torch.Generator,
-    effort: Effort = Effort(),
     spread: Spread = lambda points: points,
 ) -> Detections:
     """The best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
 
     `spread` gives the images of the static end's antennas, as `score` takes them.
     """
-    drawn = torch.rand(effort.candidates, 3, generator=generator, dtype=torch.float64)
+    drawn = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
     candidates = box[0] + (box[1] - box[0]) * drawn
     rough = quick_score(rows, spread(candidates), factor.alpha)
-    candidates = candidates[rough.topk(min(effort.exact, len(rough))).indices]
+    candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
     exact = torch.cat([score(rows, spread(part), factor)[0] for part in candidates.split(512)])
-    best = candidates[exact.topk(min(effort.polished, len(exact))).indices]
-    rates = [effort.step_m * (1 - 0.8 * step / effort.steps) for step in range(effort.steps)]
+    best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
+    rates = [STEP_M * (1 - 0.8 * step / STEPS) for step in range(STEPS)]
     (polished,) = ascend([best], lambda position: score(rows, spread(position), factor)[0], rates)
     scores, amplitude = score(rows, spread(polished), factor)
     chosen = pick_apart(polished, scores, min_distance, limit)

@@ -102,7 +102,7 @@ class ComplexGP(Method):
         self.runs, first = names.astype(np.int64), np.unique(run, return_index=True)[1]
         self.factors = self.turned[torch.from_numpy(first)]
         if len(names) > 1:
-            notes.append(self._said_of(names, run))
+            notes.append(self._factors_note(names, run))
         return FitReport(time.monotonic() - started, tuple(notes))
 
     def _fit_many(self, data: Measurements, known: np.ndarray) -> tuple[str, ...]:
@@ -134,7 +134,7 @@ class ComplexGP(Method):
         told_by = f"each query is predicted from the {NEAREST} nearest of {len(known)} rows (Vecchia)"
         return said, told_by, f"settings chosen on {len(row)} of them, each given its nearest"
 
-    def _said_of(self, names: np.ndarray, run: np.ndarray) -> str:
+    def _factors_note(self, names: np.ndarray, run: np.ndarray) -> str:
         """A note of the factors of runs (n,), numbers into `names` (runs,)."""
         first = [int(np.flatnonzero(run == number)[0]) for number in range(len(names))][:NAMED]
         factors = self.turned.numpy()[first]
@@ -178,7 +178,7 @@ class ComplexGP(Method):
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
         if self.near is not None:
             with torch.no_grad():
-                mean, left = self._told(self.near, self._moving(tx, rx))
+                mean, left = self._nearest_posterior(self.near, self._moving(tx, rx))
             variance = left / (1 + self.noise)
             sure = (1 - variance).float().clamp(0, 1)
             return Prediction(mean, sure, (self.power * variance).float())
@@ -206,10 +206,10 @@ class ComplexGP(Method):
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64; see `Differentiable`."""
         if self.near is not None:
-            return self._told(self.near, self._moving(tx, rx))[0]
+            return self._nearest_posterior(self.near, self._moving(tx, rx))[0]
         return self._mean(self._cross(tx, rx))
 
-    def _told(
+    def _nearest_posterior(
         self, near: Neighbourhood, queries: Tensor, without: np.ndarray | None = None
     ) -> tuple[Tensor, Tensor]:
         """Mean (B, A, K) complex64 and variance of a measurement (B,), of the power, by the nearest rows."""
@@ -233,7 +233,7 @@ class ComplexGP(Method):
         """See `LeaveOneOut`; rows are those of the fit, counted from 0."""
         if self.near is not None:
             rows = np.arange(len(self.places))
-            mean = self._told(self.near, self.places, rows)[0].flatten(1)
+            mean = self._nearest_posterior(self.near, self.places, rows)[0].flatten(1)
             return LeftOut(rows, (torch.from_numpy(self.targets) - mean).to(torch.complex128))
         inverse = torch.cholesky_inverse(self.factor).diagonal()
         return LeftOut(np.arange(len(self.places)), self.turned[:, None] * self.weights / inverse[:, None])

@@ -28,7 +28,7 @@ CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no th
 # Of the budget: no search starts, none adds sources, none goes on after; the rest is for the final process.
 LAST_START, ROUNDS_END, SEARCH_END = 0.6, 0.8, 0.9
 FINAL_SHARE = 0.1  # least share of the budget for the final process
-PROGRESS_S = 10.0  # [s] between two words about progress
+PROGRESS_S = 10.0  # [s] between two lines about progress
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
 
@@ -83,7 +83,7 @@ def search_many(
         scene = member.phased.scene
         log.info(
             "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
-            number + 1, len(row_sets), len(scene.words), len(scene.planes), member.left_out,
+            number + 1, len(row_sets), len(scene.sequences), len(scene.planes), member.left_out,
             budget.spent, budget.seconds,
         )  # fmt: skip
         errors.append(member.left_out)

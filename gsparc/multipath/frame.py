@@ -94,10 +94,10 @@ class FramedMethod(Method):
         unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
         return gain, delay, unit, self.frame.carrier_hz
 
-    def _left_out(self, rows: Rows, predicted: Tensor, constant: bool = False) -> LeftOut:
+    def _left_out(self, rows: Rows, predicted: Tensor) -> LeftOut:
         """See `LeaveOneOut`; of normalised predictions (n, R) of the rows."""
         scale = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
-        return LeftOut(rows.receiver.numpy(), (rows.target - predicted) * scale, constant)
+        return LeftOut(rows.receiver.numpy(), (rows.target - predicted) * scale)
 
     def _frame_state(self, rows: Rows) -> dict[str, Any]:
         """Antennas, frame and rows."""

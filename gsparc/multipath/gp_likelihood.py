@@ -19,7 +19,7 @@ from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Word, images
+from gsparc.physics.mirror_planes import Reflections, images
 from gsparc.physics.waves import ranges, wave
 
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
@@ -27,12 +27,12 @@ JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covarian
 
 @dataclass(frozen=True)
 class Scene:
-    """Image sources as words over mirror planes, with amplitudes, visibility, clutter and noise.
+    """Image sources as sequences over mirror planes, with amplitudes, visibility, clutter and noise.
 
     Attributes:
-        transmitter: (3,) float64 [m], the word ().
+        transmitter: (3,) float64 [m], the sequence ().
         planes: (P, 4) float64, see `gsparc.physics.mirror_planes`.
-        words: K of them, the transmitter first.
+        sequences: K of them, the transmitter first.
         log_amplitude: (K,) float32, log s_k.
         log_noise: log of the noise variance, in units of the rows' power.
         visibility: kernel of all sources' gains, beside the occlusion by clutter.
@@ -41,7 +41,7 @@ class Scene:
 
     transmitter: Tensor
     planes: Tensor
-    words: tuple[Word, ...]
+    sequences: tuple[Reflections, ...]
     log_amplitude: Tensor
     log_noise: float
     visibility: KernelVisibility = KernelVisibility()  # noqa: RUF009 frozen
@@ -50,12 +50,12 @@ class Scene:
     @cached_property
     def sources(self) -> Tensor:
         """Positions (K, 3) float64 [m]."""
-        return images(self.transmitter, self.planes, self.words)
+        return images(self.transmitter, self.planes, self.sequences)
 
     @cached_property
     def unfolding(self) -> Unfolding:
-        """The legs of every word's path."""
-        return Unfolding.of(self.transmitter, self.planes, self.words)
+        """The legs of every sequence's path."""
+        return Unfolding.of(self.transmitter, self.planes, self.sequences)
 
     def visible_share(self, places: Tensor) -> Tensor:
         """Share of each source that clutter lets through to places (n, 3) [m]: (n, K), or (1, 1)."""
@@ -65,7 +65,7 @@ class Scene:
 
     def images(self, rows: Rows) -> Tensor:
         """Images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
-        return images(rows.static_ends(self.transmitter), self.planes, self.words)
+        return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
 
     def unobstructed(self, rows: Rows) -> Tensor:
         """Waves (n, K) complex64 of the sources at every row, without clutter."""
@@ -75,21 +75,21 @@ class Scene:
         """The same, attenuated by clutter."""
         return self.unobstructed(rows) * self.visible_share(rows.position)
 
-    def with_words(self, words: list[Word], amplitude: Tensor) -> Scene:
+    def with_sequences(self, sequences: list[Reflections], amplitude: Tensor) -> Scene:
         """More sources, with amplitudes (k,)."""
         log_amplitude = torch.cat([self.log_amplitude, amplitude.log().float()])
-        return replace(self, words=(*self.words, *words), log_amplitude=log_amplitude)
+        return replace(self, sequences=(*self.sequences, *sequences), log_amplitude=log_amplitude)
 
     def only(self, kept: list[int]) -> Scene:
         """The sources of these indices, and the planes that they use."""
-        words = [self.words[i] for i in kept]
-        used = sorted({letter for word in words for letter in word})
+        sequences = [self.sequences[i] for i in kept]
+        used = sorted({index for sequence in sequences for index in sequence})
         new = {old: i for i, old in enumerate(used)}
-        renamed = tuple(tuple(new[letter] for letter in word) for word in words)
+        renamed = tuple(tuple(new[index] for index in sequence) for sequence in sequences)
         return replace(
             self,
             planes=self.planes[used],
-            words=renamed,
+            sequences=renamed,
             log_amplitude=self.log_amplitude[kept],
             clutter=self.clutter.renamed(new),
         )
@@ -126,18 +126,33 @@ def add_covariance(real: Tensor, imag: Tensor, scaled: Tensor, correlation: Tens
 
 
 @dataclass(frozen=True)
-class Factor:
-    """A factored covariance of n rows with R outputs.
+class Factored:
+    """A factored covariance of n numbers with R outputs.
 
     Attributes:
-        lower: (n, n) complex64, Cholesky factor.
-        alpha: (n, R) complex64, K^-1 y.
+        lower: (n, n) complex64 or float32, Cholesky factor.
+        alpha: (n, R), K^-1 y.
         nll: negative log marginal likelihood up to a constant.
     """
 
     lower: Tensor
     alpha: Tensor
     nll: float
+
+    @cached_property
+    def root(self) -> Tensor:
+        """(n, n), inverse of `lower`: K^-1 = root^H root."""
+        eye = torch.eye(len(self.lower), dtype=self.lower.dtype)
+        return torch.linalg.solve_triangular(self.lower, eye, upper=False)
+
+    @cached_property
+    def inverse(self) -> Tensor:
+        """K^-1 (n, n)."""
+        return torch.cholesky_inverse(self.lower)
+
+
+class Factor(Factored):
+    """A factored covariance of n complex rows."""
 
     @staticmethod
     def of(covariance: Tensor, target: Tensor) -> Factor:
@@ -154,17 +169,6 @@ class Factor:
         level = max(1.0, float(covariance.diagonal().real.mean()))
         covariance.diagonal().add_(noise + JITTER * level)
         return Factor.of(covariance, target)
-
-    @cached_property
-    def root(self) -> Tensor:
-        """(n, n), inverse of `lower`: K^-1 = root^H root."""
-        eye = torch.eye(len(self.lower), dtype=self.lower.dtype)
-        return torch.linalg.solve_triangular(self.lower, eye, upper=False)
-
-    @cached_property
-    def inverse(self) -> Tensor:
-        """K^-1 (n, n)."""
-        return torch.cholesky_inverse(self.lower)
 
     @cached_property
     def slope(self) -> Tensor:

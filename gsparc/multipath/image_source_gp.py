@@ -194,7 +194,7 @@ class ImageSourceGP(FramedMethod):
     def _described(self, found: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
         scene, notes = self.members[0].scene, []
-        counts = ", ".join(str(len(member.scene.words)) for member in self.members)
+        counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in found], self.noise_floor)
         ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
         ended += ", ended by the time budget" if budget.limited else ""
@@ -326,7 +326,7 @@ class ImageSourceGP(FramedMethod):
         frequency = data.site.tones()
         places = torch.from_numpy(measured_places(data, known).copy())
         places[..., :3] -= self.frame.middle
-        turned = orientations(scene.planes, scene.words)
+        turned = orientations(scene.planes, scene.sequences)
         away = ranges_at(places.flatten(0, 1), scene.sources, turned)
         waves = wave_over_band(away, torch.from_numpy(frequency))
         if gains.shape[1] == 1 or places.shape[1] > 1:
@@ -397,7 +397,7 @@ class ImageSourceGP(FramedMethod):
         self._fitted()
         each = torch.stack([member.left_out() for member in self.members])
         predicted = (self.weights[:, None, None] * each).sum(0)
-        return self._left_out(self.members[0].rows, predicted, self.offsets != "none")
+        return self._left_out(self.members[0].rows, predicted)
 
     # ---- reductions ----
     def knobs(self) -> tuple[str, ...]:
@@ -460,11 +460,11 @@ class ImageSourceGP(FramedMethod):
 
     def size(self) -> int:
         """Sources of the largest scene."""
-        return max((len(member.scene.words) for member in self.members), default=0) + len(self.edges)
+        return max((len(member.scene.sequences) for member in self.members), default=0) + len(self.edges)
 
 
 def _loudest(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:
-    """A search with the sources that contribute (K,) most, and the transmitter, where all words start."""
+    """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
     count = max(1, math.ceil(share * len(contribution)))
     kept = sorted({0, *contribution.topk(count).indices.tolist()})
     phased = member.phased

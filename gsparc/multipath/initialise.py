@@ -77,7 +77,7 @@ def diffuse(
 ) -> tuple[ConditionalField, FitReport]:
     """Leakage, a direct wave and waves from all around, without Gaussians."""
     budget = context.time_budget()
-    field, notes = waves.initialise(data, rows, ChannelSettings(), context.seed, budget)
+    field, notes = waves.initialise(data, rows, ChannelSettings(), budget)
     return field, FitReport(budget.counted.wall, notes, budget.limited_by)
 
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter
-from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene
+from gsparc.multipath.gp_likelihood import JITTER, Factored, Posterior, Scene
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
@@ -56,7 +56,7 @@ class PhasedScene:
         return {
             "transmitter": scene.transmitter,
             "planes": scene.planes,
-            "words": [list(word) for word in scene.words],
+            "sequences": [list(sequence) for sequence in scene.sequences],
             "log_amplitude": scene.log_amplitude,
             "log_noise": scene.log_noise,
             "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
@@ -70,9 +70,12 @@ class PhasedScene:
     @staticmethod
     def from_state(state: dict[str, Any]) -> PhasedScene:
         """Inverse of `state`."""
-        words, kernel = tuple(tuple(word) for word in state["words"]), KernelVisibility(*state["visibility"])
+        sequences, kernel = (
+            tuple(map(tuple, state.get("sequences") or state["words"])),
+            KernelVisibility(*state["visibility"]),
+        )
         clutter = Clutter(state["boxes"], state["patches"], tuple(state["patched"]))
-        sources = (words, state["log_amplitude"], float(state["log_noise"]))
+        sources = (sequences, state["log_amplitude"], float(state["log_noise"]))
         scene = Scene(state["transmitter"], state["planes"], *sources, kernel, clutter)
         return PhasedScene(scene, state["phase"], float(state["turning"]))
 
@@ -103,19 +106,8 @@ def add_source(covariance: Tensor, wave: Tensor, quadrature: float, correlation:
     )
 
 
-@dataclass(frozen=True)
-class RealFactor:
-    """A factored covariance of 2 n real numbers with R outputs.
-
-    Attributes:
-        lower: (2 n, 2 n) float32, Cholesky factor.
-        alpha: (2 n, R) float32, K^-1 y.
-        nll: negative log marginal likelihood up to a constant.
-    """
-
-    lower: Tensor
-    alpha: Tensor
-    nll: float
+class RealFactor(Factored):
+    """A factored covariance of 2 n real numbers: the real parts of n rows, then the imaginary ones."""
 
     @staticmethod
     def of(covariance: Tensor, target: Tensor) -> RealFactor:
@@ -127,16 +119,6 @@ class RealFactor:
         determinant = lower.diagonal().double().log().sum()
         nll = 0.5 * (flat * alpha).double().sum() + target.shape[1] * determinant
         return RealFactor(lower, alpha, float(nll))
-
-    @cached_property
-    def root(self) -> Tensor:
-        """(2 n, 2 n), inverse of `lower`: K^-1 = root^T root."""
-        return torch.linalg.solve_triangular(self.lower, torch.eye(len(self.lower)), upper=False)
-
-    @cached_property
-    def inverse(self) -> Tensor:
-        """K^-1 (2 n, 2 n)."""
-        return torch.cholesky_inverse(self.lower)
 
     @property
     def slope(self) -> Tensor:

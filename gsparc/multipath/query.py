@@ -50,7 +50,7 @@ class PackedSources:
         """All sources of the scenes, in order."""
         sources = torch.cat([scene.sources for scene in scenes])
         kernels = torch.cat([_kernel_parameters(scene) for scene in scenes])[:, :, None, None]
-        turned = torch.cat([orientations(scene.planes, scene.words) for scene in scenes])
+        turned = torch.cat([orientations(scene.planes, scene.sequences) for scene in scenes])
         towards = (directions(places[:, :3], sources) * -kernels[:, 1]).mT.contiguous()
         one, two, three = kernels.unbind(1)
         packed = PackedSources(sources, one, two, three, places, turned, towards, None, None)
@@ -60,7 +60,9 @@ class PackedSources:
         unfolding = Unfolding.concatenate(
             [scene.unfolding.with_offset(start) for scene, start in zip(scenes, first, strict=False)]
         )
-        obstacles = Obstacles.concatenate([Obstacles.of(s.clutter, s.planes, len(s.words)) for s in scenes])
+        obstacles = Obstacles.concatenate(
+            [Obstacles.of(s.clutter, s.planes, len(s.sequences)) for s in scenes]
+        )
         return replace(packed, unfolding=unfolding, obstacles=obstacles)
 
     def visible_share(self, queries: Tensor) -> Tensor | None:
@@ -98,7 +100,7 @@ class Query:
         rows, scenes = members[0].rows, [member.scene for member in members]
         places, place_of = torch.unique(rows.places, dim=0, return_inverse=True)
         self.pack = PackedSources.of(scenes, places)
-        self.counts = [len(scene.words) for scene in scenes]
+        self.counts = [len(scene.sequences) for scene in scenes]
         phases = torch.cat([member.phased.phase for member in members])
         dual = torch.cat([member.dual_weights for member in members])
         dual = dual * torch.polar(torch.ones(()), phases)[:, None, None]
@@ -186,4 +188,4 @@ def _kernel_parameters(scene: Scene) -> Tensor:
     """Of each source: constant, 6 / angle^2 and 3 / length^2."""
     kernel = scene.visibility
     numbers = [float(kernel.constant), 6 * float(kernel.angle) ** -2, 3 * float(kernel.length) ** -2]
-    return torch.tensor(numbers).expand(len(scene.words), 3)
+    return torch.tensor(numbers).expand(len(scene.sequences), 3)

@@ -62,7 +62,7 @@ def descend(
     best, lowest, correlation = values, math.inf, torch.empty(0)
     for step in range(steps + 1):
         if step % REFRESH == 0:
-            correlation = correlations(rows, images(values[0], values[1], scene.words), scene.visibility)
+            correlation = correlations(rows, images(values[0], values[1], scene.sequences), scene.visibility)
         value, gradient = objective(values, correlation)
         if value < lowest:
             lowest, best = value, values
@@ -117,19 +117,19 @@ def _likelihood(
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its gradient: `d nll = trace(G dK)`, `G = R K^-1 - alpha alpha^H`."""
     transmitter, planes = (v.detach().requires_grad_() for v in values[:2])
-    sources = images(rows.static_ends(transmitter), planes, scene.words)
+    sources = images(rows.static_ends(transmitter), planes, scene.sequences)
     waves = steering(rows, sources) * scene.visible_share(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
     n = len(rows)
     real, imag = torch.zeros(n, n), torch.zeros(n, n)
-    for k in range(len(scene.words)):
+    for k in range(len(scene.sequences)):
         add_covariance(real, imag, scaled[:, k], correlation[k])
     real.diagonal().add_(noise + noise_floor)
     factor = Factor.of(torch.complex(real, imag), rows.target)
     slope_re, slope_im = factor.slope.real.contiguous(), factor.slope.imag.contiguous()
     weighted = torch.empty_like(scaled)  # (G * C_k) s_k a_k
-    for k in range(len(scene.words)):
+    for k in range(len(scene.sequences)):
         pair = torch.stack([scaled[:, k].real, scaled[:, k].imag], 1)
         a = (slope_re * correlation[k]) @ pair
         b = (slope_im * correlation[k]) @ pair

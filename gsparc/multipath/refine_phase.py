@@ -45,22 +45,22 @@ def _likelihood(
     rows: Rows, phased: PhasedScene, values: list[Tensor], correlation: Tensor, noise_floor: float
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its derivatives by transmitter, planes, amplitudes, noise, phases."""
-    words, n = phased.scene.words, len(rows)
+    sequences, n = phased.scene.sequences, len(rows)
     transmitter, planes, phase = (values[i].detach().requires_grad_() for i in (0, 1, 4))
-    sources = images(rows.static_ends(transmitter), planes, words)
+    sources = images(rows.static_ends(transmitter), planes, sequences)
     waves = steering(rows, sources) * torch.polar(torch.ones(()), phase)
     waves = waves * phased.scene.visible_share(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
     covariance = torch.zeros(2, n, 2, n)
-    for k in range(len(words)):
+    for k in range(len(sequences)):
         add_source(covariance, scaled[:, k], phased.quadrature, correlation[k])
     covariance.view(2 * n, 2 * n).diagonal().add_((noise + noise_floor) / 2)
     factor = RealFactor.of(covariance, rows.target)
     slope = factor.slope
     blocks = slope.view(2, n, 2, n)
     weighted = torch.empty_like(scaled)
-    for k in range(len(words)):
+    for k in range(len(sequences)):
         pair = torch.stack(stacked(scaled[:, k]), 1) * shares(phased.quadrature)
         by = (blocks * correlation[k][None, :, None, :]).view(2 * n, 2 * n) @ pair
         # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both

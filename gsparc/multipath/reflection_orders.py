@@ -1,6 +1,6 @@
 """Explain the sources found by fewer mirror planes, and prune sources.
 
-A source is a word: the sequence of planes that mirror the transmitter into it, its length the reflection
+A source is a sequence of planes that mirror the transmitter into it, its length the reflection
 order. Each function maps a scene to a scene, kept when the likelihood allows it: a plane has three
 parameters, so removing one may cost a few nats.
 """
@@ -15,60 +15,60 @@ from torch import Tensor
 from gsparc.multipath.gp_likelihood import Posterior, Scene
 from gsparc.multipath.refine import Late, never, refine
 from gsparc.multipath.rows import Rows
-from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
+from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 
-LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two words at the same position the shorter is preferred
+LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
 MIN_IMAGE_SHIFT_M = 0.2  # [m], half the least distance of a source from its mirror image
-MANY_PLANES = 9  # beyond, third-order words are too many to try
+MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
 def drop_planes(
     rows: Rows, scene: Scene, tolerance: float, steps: int = 12, allowance: float = 10.0, late: Late = never
 ) -> Scene:
-    """Try to remove each plane until `late`: its words become the nearest over the others [tolerance: m]."""
-    letter = 0
-    while letter < len(scene.planes) and not late():
-        shorter = _without_plane(scene, letter, tolerance)
+    """Try to remove planes until `late`: their sequences become the nearest over others [tolerance: m]."""
+    index = 0
+    while index < len(scene.planes) and not late():
+        shorter = _without_plane(scene, index, tolerance)
         if shorter is not None:
             shorter = refine(rows, shorter, steps)
             if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + allowance:
                 scene = shorter
                 continue
-        letter += 1
+        index += 1
     return scene
 
 
-def _without_plane(scene: Scene, letter: int, tolerance: float) -> Scene | None:
-    """The scene without one plane; None when its strongest source has no other word."""
-    users = [i for i, word in enumerate(scene.words) if letter in word]
-    rest = {word for i, word in enumerate(scene.words) if i not in users}
+def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
+    """The scene without one plane; None when its strongest source has no other sequence."""
+    users = [i for i, sequence in enumerate(scene.sequences) if index in sequence]
+    rest = {sequence for i, sequence in enumerate(scene.sequences) if i not in users}
     order = 3 if len(scene.planes) <= MANY_PLANES else 2
-    letters = [i for i in range(len(scene.planes)) if i != letter]
-    sequences = [word for word in all_words(letters, order) if word not in rest]
-    if not sequences or not users:
+    indices = [i for i in range(len(scene.planes)) if i != index]
+    candidates = [sequence for sequence in all_sequences(indices, order) if sequence not in rest]
+    if not candidates or not users:
         return None
-    distance = _distances(scene, sequences, scene.sources[users], LENGTH_PENALTY_M)
+    distance = _distances(scene, candidates, scene.sources[users], LENGTH_PENALTY_M)
     nearest = distance.argmin(1).tolist()
     strength = (
         scene.log_amplitude[users] - (scene.sources[users] - scene.transmitter).norm(dim=1).clamp_min(1).log()
     )
     if distance[int(strength.argmax())].min() > tolerance:
         return None
-    words, kept = list(scene.words), set(range(len(scene.words)))
+    sequences, kept = list(scene.sequences), set(range(len(scene.sequences)))
     for row, i in enumerate(users):
-        sequence = sequences[nearest[row]]
-        if distance[row].min() < tolerance and sequence not in words:
-            words[i] = sequence
+        candidate = candidates[nearest[row]]
+        if distance[row].min() < tolerance and candidate not in sequences:
+            sequences[i] = candidate
         else:
             kept.discard(i)
-    return replace(scene, words=tuple(words)).only(sorted(kept))
+    return replace(scene, sequences=tuple(sequences)).only(sorted(kept))
 
 
-def _distances(scene: Scene, words: list[Word], places: Tensor, per_letter: float) -> Tensor:
-    """Distances (places, words) [m], plus a penalty on the order."""
-    position = images(scene.transmitter, scene.planes, words)
-    letters = torch.tensor([len(word) for word in words])
-    return (position[None] - places[:, None]).norm(dim=-1) + per_letter * letters
+def _distances(scene: Scene, sequences: list[Reflections], places: Tensor, per_reflection: float) -> Tensor:
+    """Distances (places, sequences) [m], plus a penalty on the order."""
+    position = images(scene.transmitter, scene.planes, sequences)
+    order = torch.tensor([len(sequence) for sequence in sequences])
+    return (position[None] - places[:, None]).norm(dim=-1) + per_reflection * order
 
 
 def find_walls(sources: Tensor, relative: float = 0.03, most: int = 10) -> Tensor | None:
@@ -103,9 +103,9 @@ def orthogonal_walls(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor 
     along one normal only gives a plane. None when no two planes are perpendicular.
 
     Args:
-        scene: sources; their words may be wrong.
+        scene: sources; their sequences may be wrong.
         most: planes.
-        near: tolerance between a source and its word [m], plus 1 % of its distance from the transmitter.
+        near: tolerance between a source and its sequence [m], plus 1 % of its distance from the transmitter.
     """
     triad = _triad(scene)
     if triad is None:
@@ -117,8 +117,8 @@ def orthogonal_walls(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor 
     for direction in triad:
         apart = sources[second] - sources[first]
         along = apart @ direction
-        concatenate = (apart - along[:, None] * direction).norm(dim=1)
-        fits = (concatenate < torch.maximum(allowed[first], allowed[second])) & (
+        across = (apart - along[:, None] * direction).norm(dim=1)
+        fits = (across < torch.maximum(allowed[first], allowed[second])) & (
             along.abs() > 2 * MIN_IMAGE_SHIFT_M
         )
         offsets = ((sources[first] + sources[second]) @ direction / 2)[fits]
@@ -136,7 +136,7 @@ def orthogonal_walls(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor 
 
 def _triad(scene: Scene) -> Tensor | None:
     """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
-    used = [sum(i in word for word in scene.words) for i in range(len(scene.planes))]
+    used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
     normals = scene.planes[:, :3] / scene.planes[:, :3].norm(dim=1, keepdim=True)
     best: tuple[int, Tensor] | None = None
     for i in range(len(used)):
@@ -150,36 +150,38 @@ def _triad(scene: Scene) -> Tensor | None:
 
 
 def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
-    """Number of sources with a word over the planes, weighted by distance and order."""
-    words: list[Word] = [(), *all_words(list(range(len(planes))), 2)]
-    position = images(scene.transmitter, planes, words)
+    """Number of sources with a sequence over the planes, weighted by distance and order."""
+    sequences: list[Reflections] = [(), *all_sequences(list(range(len(planes))), 2)]
+    position = images(scene.transmitter, planes, sequences)
     distance = torch.cdist(scene.sources, position) / allowed[:, None]
-    worth = (1 - 0.5 * distance.square()).clamp_min(0) * torch.tensor([0.95 ** len(word) for word in words])
+    worth = (1 - 0.5 * distance.square()).clamp_min(0) * torch.tensor(
+        [0.95 ** len(sequence) for sequence in sequences]
+    )
     return float(worth.amax(1).sum())
 
 
 def reassign(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
-    """New words over `walls` for all sources; one without a word gets a plane of its own."""
+    """New sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
     sources = scene.sources
     tolerance = 2.5 * (relative * (sources - sources[0]).norm(dim=1) + 0.02)
     base = replace(scene, planes=walls)
-    sequences = all_words(list(range(len(walls))), 3)
-    distance = _distances(base, sequences, sources, 1.5 * LENGTH_PENALTY_M)
+    candidates = all_sequences(list(range(len(walls))), 3)
+    distance = _distances(base, candidates, sources, 1.5 * LENGTH_PENALTY_M)
     planes, kept, taken = [*walls], [0], set()
-    words: list[Word] = [()]
+    sequences: list[Reflections] = [()]
     for i in range(1, len(sources)):
         near = [j for j in distance[i].argsort()[:6].tolist() if distance[i, j] < tolerance[i]]
-        free = next((sequences[j] for j in near if sequences[j] not in taken), None)
+        free = next((candidates[j] for j in near if candidates[j] not in taken), None)
         if free is not None:
             taken.add(free)
-            words.append(free)
+            sequences.append(free)
             kept.append(i)
         elif not near:  # else a duplicate of an assigned source
             planes.append(bisector(sources[0], sources[i]))
-            words.append((len(planes) - 1,))
+            sequences.append((len(planes) - 1,))
             kept.append(i)
     explained = replace(
-        scene, planes=torch.stack(planes), words=tuple(words), log_amplitude=scene.log_amplitude[kept]
+        scene, planes=torch.stack(planes), sequences=tuple(sequences), log_amplitude=scene.log_amplitude[kept]
     )
     return explained.only(list(range(len(kept))))
 
@@ -187,15 +189,15 @@ def reassign(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
 def prune(rows: Rows, scene: Scene, least: float, late: Late = never) -> Scene:
     """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
     posterior = Posterior(rows, scene)
-    weakest_first: list[Word] = sorted(
-        scene.words[1:], key=lambda word: float(scene.log_amplitude[scene.words.index(word)])
+    weakest_first: list[Reflections] = sorted(
+        scene.sequences[1:], key=lambda sequence: float(scene.log_amplitude[scene.sequences.index(sequence)])
     )
-    kept = set(range(len(scene.words)))
-    for word in weakest_first:
+    kept = set(range(len(scene.sequences)))
+    for sequence in weakest_first:
         if late():
             break
-        i = scene.words.index(word)
-        sole_user = any(sum(letter in scene.words[j] for j in kept) == 1 for letter in word)
+        i = scene.sequences.index(sequence)
+        sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in sequence)
         current = scene.only(sorted(kept))
         position = sorted(kept).index(i)
         if posterior.without(position) - posterior.nll < (2 * least if sole_user else least):

@@ -10,59 +10,46 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsparc.multipath.backprojection import Effort, pick_apart, score, search_box
+from gsparc.multipath.backprojection import pick_apart, score, search_box
 from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
 from gsparc.multipath.refine import Late, learn_visibility, never, refine
 from gsparc.multipath.reflection_orders import drop_planes, find_walls, orthogonal_walls, prune, reassign
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.source_types import box_of
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
+from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
 
 PARENTS = 4  # of a new source, tried in turn until one is found
+SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
+SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
+STEPS = 12  # of refinement after each round
+PRUNE = 5.0  # least gain of a source kept [nats]
+PATIENCE, PROGRESS = 3, 8.0  # rounds without a gain of so many nats before the search ends
+LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Acceptance thresholds and effort of a search.
+    """How far a search goes, and what it starts from.
 
     Attributes:
         margin: of the search box around receivers and transmitter [m].
         order: largest reflection order of a source.
         max_sources: that end the search.
-        word_score: least score of a word over known planes.
-        free_score: least score of a source with a plane of its own.
-        words_per_round, free_per_round: most new sources in a round.
-        steps: of refinement after each round.
         final_steps: of refinement at the end.
-        prune: least gain of a source kept [nats].
-        patience: rounds without a gain of `progress` nats before the search ends.
-        progress: [nats].
-        learn_visibility_from: sources from which on the visibility's lengths are learned.
         noise: variance at the start, of unit signal power.
         visibility: initial kernel and centre of its prior.
-        effort: of each search in free space.
     """
 
     margin: float = 8.0
     order: int = 3
     max_sources: int = 60
-    word_score: float = 8.0
-    free_score: float = 15.0
-    words_per_round: int = 4
-    free_per_round: int = 2
-    steps: int = 12
     final_steps: int = 80
-    prune: float = 5.0
-    patience: int = 3
-    progress: float = 8.0
-    learn_visibility_from: int = 12
     noise: float = 0.1
     visibility: KernelVisibility = field(default_factory=KernelVisibility)
-    effort: Effort = field(default_factory=Effort)
 
 
 class Search:
@@ -99,76 +86,75 @@ class Search:
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
-        self._refine(s.steps)
+        self._refine(STEPS)
         for number in range(60):
-            added = self._add_words()
+            added = self._add_sequences()
             free = not added
             if free:
                 added = self._add_free()
             if not added or self.late():
                 break
-            self._refine(s.steps)
+            self._refine(STEPS)
             if free or number % 2:
                 self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength, late=self.over)
             if number >= 4 and number % 3 == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = prune(self.rows, self.scene, s.prune, self.over)
+                self.scene = prune(self.rows, self.scene, PRUNE, self.over)
             if number % 3 == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
             log.debug(
                 "round %d: %d sources, %d planes, nll %.1f, %s",
-                number, len(self.scene.words), len(self.scene.planes), nll, self.scene.visibility,
+                number, len(self.scene.sequences), len(self.scene.planes), nll, self.scene.visibility,
             )  # fmt: skip
-            if len(self.scene.words) >= s.max_sources:
+            if len(self.scene.sequences) >= s.max_sources:
                 break
-            stale, best = (0, nll) if nll < best - s.progress else (stale + 1, best)
-            if stale >= s.patience:
+            stale, best = (0, nll) if nll < best - PROGRESS else (stale + 1, best)
+            if stale >= PATIENCE:
                 break
         return self._finish()
 
     def _finish(self) -> Scene:
-        s = self.settings
         self._refine(20)
         self._find_walls()
         self._reassign(orthogonal_walls(self.scene))
         self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength, late=self.over)
-        self._add_words()
-        self._refine(s.steps)
-        self.scene = prune(self.rows, self.scene, s.prune, self.over)
+        self._add_sequences()
+        self._refine(STEPS)
+        self.scene = prune(self.rows, self.scene, PRUNE, self.over)
         self._learn_visibility(10)
-        self._refine(s.final_steps)
+        self._refine(self.settings.final_steps)
         return self.scene
 
     def _refine(self, steps: int) -> None:
         self.scene = refine(self.rows, self.scene, steps, late=self.over)
 
     def _learn_visibility(self, steps: int) -> None:
-        if len(self.scene.words) >= self.settings.learn_visibility_from:
+        if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
             self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, self.over)
 
-    def _add_words(self, most: int | None = None) -> int:
+    def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
         s, scene = self.settings, self.scene
-        letters = list(range(len(scene.planes)))
-        longer: list[Word] = [
-            (*w, i) for w in scene.words if len(w) < s.order for i in letters if not w or w[-1] != i
+        indices = list(range(len(scene.planes)))
+        longer: list[Reflections] = [
+            (*w, i) for w in scene.sequences if len(w) < s.order for i in indices if not w or w[-1] != i
         ]
-        known = set(scene.words)
-        words = [w for w in dict.fromkeys(longer + all_words(letters, 2)) if w not in known]
-        if not words:
+        known = set(scene.sequences)
+        sequences = [w for w in dict.fromkeys(longer + all_sequences(indices, 2)) if w not in known]
+        if not sequences:
             return 0
-        position = images(scene.transmitter, scene.planes, words)
-        candidates = replace(scene, words=tuple(words)).images(self.rows)
+        position = images(scene.transmitter, scene.planes, sequences)
+        candidates = replace(scene, sequences=tuple(sequences)).images(self.rows)
         scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).factor)
         clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(
-            position, scores * clear, 0.5 * self.wavelength, most or s.words_per_round, s.word_score
+            position, scores * clear, 0.5 * self.wavelength, most or SEQUENCES_PER_ROUND, SEQUENCE_SCORE
         )
         if chosen:
-            self.scene = scene.with_words([words[i] for i in chosen], amplitude[chosen])
+            self.scene = scene.with_sequences([sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
 
     def _add_free(self) -> int:
@@ -176,22 +162,22 @@ class Search:
 
         Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
         """
-        s, posterior = self.settings, Posterior(self.rows, self.scene)
-        parents: list[Word | None] = [None] if self.rows.array is None else [*self._strong_parents()]
+        posterior = Posterior(self.rows, self.scene)
+        parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
         for parent in parents:
             spread = partial(self._spread, parent)
             found = search_box(
-                self.rows, posterior.factor, self.box, 0.5 * self.wavelength, s.free_per_round,
-                self.generator, s.effort, spread,
+                self.rows, posterior.factor, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
+                self.generator, spread,
             )  # fmt: skip
             added = 0
             for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
-                if gained < s.free_score:
+                if gained < FREE_SCORE:
                     continue
-                word, plane = self._parent(position, posterior)
+                sequence, plane = self._parent(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
-                self.scene = replace(self.scene, planes=planes).with_words(
-                    [(*word, len(planes) - 1)], amplitude[None]
+                self.scene = replace(self.scene, planes=planes).with_sequences(
+                    [(*sequence, len(planes) - 1)], amplitude[None]
                 )
                 added += 1
             if added:
@@ -200,22 +186,22 @@ class Search:
 
     def _able(self, scene: Scene) -> list[int]:
         """Sources that may be reflected once more."""
-        return [i for i, word in enumerate(scene.words) if len(word) < self.settings.order]
+        return [i for i, sequence in enumerate(scene.sequences) if len(sequence) < self.settings.order]
 
-    def _strong_parents(self) -> list[Word]:
-        """The static end, then the words of the loudest sources that may be reflected once more."""
+    def _strong_parents(self) -> list[Reflections]:
+        """The static end, then the sequences of the loudest sources that may be reflected once more."""
         loudness = self.scene.log_amplitude
         louder = sorted((i for i in self._able(self.scene) if i), key=lambda i: -float(loudness[i]))
-        return [self.scene.words[i] for i in (0, *louder[: PARENTS - 1])]
+        return [self.scene.sequences[i] for i in (0, *louder[: PARENTS - 1])]
 
-    def _spread(self, parent: Word | None, points: Tensor) -> Tensor:
+    def _spread(self, parent: Reflections | None, points: Tensor) -> Tensor:
         """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
         if parent is None:
             return points
-        scene = replace(self.scene, words=(parent,))
+        scene = replace(self.scene, sequences=(parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
-    def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Word, Tensor]:
+    def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
         """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
         scene, able = posterior.scene, self._able(posterior.scene)
         planes = bisector(scene.sources[able], position)
@@ -225,16 +211,16 @@ class Search:
         taken = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, taken).amin(1) > 0.5 * self.wavelength
         scores = score(self.rows, candidates, posterior.factor)[0].reshape(mirrored.shape[:2])
-        letters = torch.tensor([len(scene.words[i]) for i in able])
-        gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * letters
+        order = torch.tensor([len(scene.sequences[i]) for i in able])
+        gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas
             gain = gain + scores[torch.arange(len(able)), able]
         best = int(gain.argmax())
-        return scene.words[able[best]], planes[best]
+        return scene.sequences[able[best]], planes[best]
 
     def _find_walls(self) -> None:
         """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
-        if len(self.scene.words) < 6:
+        if len(self.scene.sequences) < 6:
             return
         self._reassign(find_walls(self.scene.sources))
 
@@ -246,8 +232,8 @@ class Search:
         self.scene = reassign(before, walls)
         self._refine(20)
         for _ in range(2):
-            if self._add_words(6):
-                self._refine(self.settings.steps)
+            if self._add_sequences(6):
+                self._refine(STEPS)
         saved = len(before.planes) - len(self.scene.planes)
         allowed = Posterior(self.rows, before).nll + 4 * saved
         if Posterior(self.rows, self.scene).nll >= allowed:

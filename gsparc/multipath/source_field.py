@@ -1,6 +1,6 @@
 """Image sources as the Gaussians of a field: mirror planes by gradient, gains in closed form.
 
-A Gaussian here is a virtual source, the image of the static end in a word of mirror planes; what steps of
+A Gaussian here is a virtual source, the image of the static end in a sequence of mirror planes; what steps of
 gradient move are the planes, of which many sources share each, and the sources' powers. The gains given the
 rows are those of `phased_gp`.
 """

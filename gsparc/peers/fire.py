@@ -95,8 +95,8 @@ class Fire(UplinkMethod):
         return FitReport(time.perf_counter() - started)
 
     @torch.no_grad()
-    def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """See `UplinkMethod.listen`."""
+    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+        """See `UplinkMethod.from_uplink`."""
         scale = rms(uplink)[:, None, None]
         own = self.own(uplink) / scale
         guess = self.network(own.flatten(0, 1))[0]

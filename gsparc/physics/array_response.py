@@ -103,19 +103,8 @@ class Lags:
     imag_pairs: Tensor
     elements: int
 
-    @property
-    def count(self) -> int:
-        """Real numbers that determine a squared spectrum: 2 L - 1."""
-        return 2 * len(self.difference) - 1
-
-    def of(self, vectors: Tensor) -> Tensor:
-        """Lag numbers r (B, 2 L - 1) of vectors (B, M): the zero lag, real parts, imaginary parts."""
-        products = (vectors[:, :, None] * vectors[:, None, :].conj()).flatten(1)
-        real, imag = (pairs.to(products.real.dtype) for pairs in (self.real_pairs, self.imag_pairs))
-        return torch.addmm(products.real @ real, products.imag, imag)
-
     def basis(self, grid: SphereGrid, wavelength: float) -> Tensor:
-        """B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`."""
+        """B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`, r the zero lag, real parts, imaginary parts."""
         phase = grid.directions().reshape(-1, 3) @ torch.from_numpy(self.difference[1:].T)
         phase = 2 * math.pi / wavelength * phase
         return torch.cat([torch.ones(len(phase), 1, dtype=torch.float64), phase.cos(), phase.sin()], 1)

@@ -1,7 +1,8 @@
 """Mirror planes and the images they make of a transmitter.
 
-A plane is (n, b): all p with n.p = b, n normalised on use. A word (i, j, ...) is the transmitter mirrored in
-plane i, then in plane j, and so on: a plane costs three numbers and gives many sources.
+A plane is (n, b): all p with n.p = b, n normalised on use. A reflection sequence (i, j, ...) is the
+transmitter mirrored in plane i, then in plane j, and so on: a plane costs three numbers and gives many
+sources.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from itertools import pairwise, product
 import torch
 from torch import Tensor
 
-Word = tuple[int, ...]
+Reflections = tuple[int, ...]  # indices of planes, in the order in which they mirror
 
 
 def reflect(points: Tensor, planes: Tensor) -> Tensor:
@@ -29,34 +30,36 @@ def bisector(first: Tensor, second: Tensor) -> Tensor:
     return torch.cat([normal, (normal * (first + second) / 2).sum(-1, keepdim=True)], -1)
 
 
-def images(transmitter: Tensor, planes: Tensor, words: tuple[Word, ...] | list[Word]) -> Tensor:
-    """Positions (..., K, 3) [m] of the words; differentiable in transmitter (..., 3) and planes (P, 4)."""
-    order = max(map(len, words), default=0)
-    place = transmitter[..., None, :].expand(*transmitter.shape[:-1], len(words), 3)
-    letters = torch.tensor([[*w, *[-1] * (order - len(w))] for w in words], dtype=torch.long)
+def images(
+    transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]
+) -> Tensor:
+    """Positions (..., K, 3) [m] of sequences; differentiable in transmitter (..., 3) and planes (P, 4)."""
+    order = max(map(len, sequences), default=0)
+    place = transmitter[..., None, :].expand(*transmitter.shape[:-1], len(sequences), 3)
+    indices = torch.tensor([[*w, *[-1] * (order - len(w))] for w in sequences], dtype=torch.long)
     for step in range(order):
-        index = letters[:, step]
+        index = indices[:, step]
         mirrored = reflect(place, planes[index.clamp_min(0)])
         place = torch.where((index >= 0)[:, None], mirrored, place)
     return place
 
 
-def orientations(planes: Tensor, words: tuple[Word, ...] | list[Word]) -> Tensor:
-    """Orthogonal parts Q (K, 3, 3) of the words: the image of t + a is that of t, plus Q a.
+def orientations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]) -> Tensor:
+    """Orthogonal parts Q (K, 3, 3) of the sequences: the image of t + a is that of t, plus Q a.
 
     One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J. Acoust.
-    Soc. Am. 65 (1979)); a word is their product, the first letter rightmost.
+    Soc. Am. 65 (1979)); a sequence is their product, the first plane rightmost.
     """
     ends = torch.cat([torch.zeros(1, 3, dtype=planes.dtype), torch.eye(3, dtype=planes.dtype)])
-    placed = images(ends, planes, words)  # (4, K, 3)
+    placed = images(ends, planes, sequences)  # (4, K, 3)
     return (placed[1:] - placed[:1]).permute(1, 2, 0)
 
 
-def all_words(letters: list[int], order: int) -> list[Word]:
-    """Words of 1 to `order` letters in which no letter follows itself (a mirror twice is no mirror)."""
+def all_sequences(indices: list[int], order: int) -> list[Reflections]:
+    """Sequences of 1 to `order` planes in which none follows itself (a mirror twice is no mirror)."""
     return [
-        word
+        sequence
         for length in range(1, order + 1)
-        for word in product(letters, repeat=length)
-        if all(a != b for a, b in pairwise(word))
+        for sequence in product(indices, repeat=length)
+        if all(a != b for a, b in pairwise(sequence))
     ]

@@ -39,10 +39,6 @@ class Aperture:
         """Factor (K,) of the derivative by the delay."""
         return -2j * math.pi * self.tones
 
-    def at(self, tones: Tensor) -> Aperture:
-        """The same array at other tones."""
-        return Aperture(self.places, tones.to(self.places))
-
 
 def flat_places(array: np.ndarray, wavelength: float) -> Tensor:
     """Antennas (A, 3) [m] as (A, 2) float32 wavelengths along their two widest axes."""

@@ -27,11 +27,6 @@ class Separable:
     columns: Tensor
 
     @property
-    def count(self) -> int:
-        """Numbers per image."""
-        return self.rows.shape[1] * len(self.columns)
-
-    @property
     def image(self) -> tuple[int, int]:
         """Height and width [pixels]."""
         return len(self.rows), self.columns.shape[1]

@@ -113,7 +113,7 @@ class StopBetweenSteps(L.Callback):
             raise _Stopped
 
     @contextmanager
-    def listening(self) -> Iterator[None]:
+    def handling_interrupts(self) -> Iterator[None]:
         """Take interrupts while training runs; outside the main thread there are none to take."""
         if threading.current_thread() is not threading.main_thread():
             yield
@@ -197,7 +197,7 @@ def run_stage(
     if trainer.world_size > 1 and processes is None:
         raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
     try:
-        with stop.listening():
+        with stop.handling_interrupts():
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
     except (_Stopped, SystemExit, ProcessException) as ended:
         # Lightning's answer to a KeyboardInterrupt is SystemExit.

@@ -8,38 +8,36 @@ steps of gradient refine it as long as validation gains.
 from __future__ import annotations
 
 import copy
-import functools
 import logging
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.inner_folds import NOT_TESTED, InnerFolds, cut_inside
+from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
-from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
-from gsparc.field.initial import InitSettings
+from gsparc.field.conditional import CompletedField, ConditionalField, StackedField, learns
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.pareto import Settings
 from gsparc.methods.power_process import PowerProcess, approximated, exact
-from gsparc.methods.reduced import View, contributions, knobs, reduced
-from gsparc.methods.registry import field_initialiser, method_class
+from gsparc.methods.reduced import contributions, knobs, reduced
+from gsparc.methods.registry import method_class
 from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
 from gsparc.ops import Pose
-from gsparc.training import weighing
+from gsparc.training import process_average, solution_weights, solutions
 from gsparc.training.auto_settings import resolve
-from gsparc.training.beside import averaged, mean_alone
 from gsparc.training.checkpoint_io import GsparcCheckpointIO
 from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.keep_best import SHORT, KeepBest
 from gsparc.training.lightning_module import GaussianModule
+from gsparc.training.process_average import Summed, averaged, mean_alone
+from gsparc.training.solution_weights import comparable
 from gsparc.training.splatting import QUERY_CHUNK, LearnedField
 from gsparc.training.stored_field import as_today, restored, stored
 from gsparc.training.terms import EffectSettings, Plan, plan
@@ -48,15 +46,8 @@ from gsparc.training.time_budget import Pace
 log = logging.getLogger(__name__)
 
 DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
-GROUPS = 3  # of training rows, that solutions are weighed by
-FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8, "edges": False}
-FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
-LEAST_HELD = 4  # rows, for weights to mean anything
-MOST_HELD = 1_000  # validation rows that a process beside rendered Gaussians is weighed on: memory
-OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
-SEARCHES = ("sources", "bearings")  # of them, those that also give an answer of few sources
 
 
 class Gsparc(LearnedField):
@@ -74,8 +65,8 @@ class Gsparc(LearnedField):
         self.plan: Plan | None = None
         self.explained: float | None = None
         self.started = ""  # initialisers of what was fitted
-        self._beside: tuple[Method, float] | None = None
-        self._lean: Method | None = None  # the process beside, made when it is first asked
+        self._average: tuple[Method, float] | None = None  # a process and its weight in the mean
+        self._average_mean: Method | None = None  # that process without its variance, made when first asked
 
     @property
     def label(self) -> str:
@@ -93,13 +84,13 @@ class Gsparc(LearnedField):
         if self.field is not None:
             return "+".join(self.field.terms) or "residual"
         base = "array" if self.settings.response.array else "image"
-        return base + ("+residual" if self._beside is not None else "")
+        return base + ("+residual" if self._average is not None else "")
 
     # -- learning ----------------------------------------------------------------------------------
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the terms, initialise, weigh, take the steps that pay."""
-        self.site, self.field, self._beside, self._lean = data.site, None, None, None
+        self.site, self.field, self._average, self._average_mean = data.site, None, None, None
         count = self.settings.field.count
         self.plan = plan(self.switches, self.init, data, self.settings.emission.hidden, count)
         for reason in self.plan.reasons:
@@ -126,57 +117,20 @@ class Gsparc(LearnedField):
         report = super().fit(data, fold, context)
         self.started = self.choices.init if self.choices is not None else ""
         spent = dict(self.spent)
-        if self._beside is not None:
-            method = self._beside[0]
+        if self._average is not None:
+            method = self._average[0]
             known = np.sort(np.concatenate([fold.train, fold.val]))
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             report = replace(report, seconds=report.seconds + more.seconds)
-            spent["process beside"] = more.seconds
+            spent["averaged process"] = more.seconds
         log.info("%d Gaussians, %d gradient steps kept", self.size(), self.steps)
-        _say_cost(spent, report.seconds)
+        _log_cost(spent, report.seconds)
         return report
 
-    def _weigh_beside(self, data: Measurements, fold: Fold) -> None:
-        """What a plain process on whole targets is worth beside the field, on rows that neither learned from.
-
-        Those are validation rows and, of spectra, training rows that both predict without their neighbours:
-        a dozen rows alone decide by chance.
-        """
-        if self.plan is None or not self.plan.plain:
-            return
-        spectra = data.site.kind == "spectrum"
-        left = self._left_out if spectra else None  # as the start predicts them, before any step
-        if self.size() and left is None and len(fold.val) < LEAST_HELD:
-            log.info("no Gaussian process beside the field: too few rows are held out to weigh it")
-            return
-        process = method_class("gp")()
-        process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
-        if not self.size():
-            log.info("no Gaussians: a Gaussian process alone")
-            self._beside = process, 1.0
-            return
-        held = []
-        val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
-        if len(val):
-            batch = data.batch(val)
-            target = _comparable(batch.target, data.site)
-            own, plain = (
-                _comparable(found.mean, data.site)
-                for found in (super().predict(batch.tx, batch.rx), process.predict(batch.tx, batch.rx))
-            )
-            held.append((own, plain, target))
-            self.explained = weighing.explained(own, target, data.site.kind != "csi")
-        if spectra:
-            rows = [weighing.Rows(*(_flat(values) for values in triple)) for triple in held]
-            rows += [] if left is None else [_left_out(left, self._apart)]
-            theirs = weighing.share_of_second(rows)
-        else:
-            theirs = weighing.weights(list(held[0][:2]), held[0][2], np.arange(len(val)))[1]
-        log.info(
-            "held out, %d rows and %d of training without their neighbours: a Gaussian process weighs %.2f",
-            len(val), 0 if left is None else len(left.centres), theirs,
-        )  # fmt: skip
-        self._beside = (process, theirs) if theirs > 0 else None
+    def _weigh_process(self, data: Measurements, fold: Fold) -> None:
+        if self.plan is not None and self.plan.plain:
+            self._average, explained = process_average.weigh(self, data, fold, self._left_out, self._apart)
+            self.explained = self.explained if explained is None else explained
 
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
@@ -191,9 +145,14 @@ class Gsparc(LearnedField):
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
         several = len(chosen.parts) > 1
-        held = cut_inside(data, fold, context.split, GROUPS, context.seed) if several else None
-        solutions, reports = self._solutions(chosen.parts, data, fold, context, budget, held)
-        self.field = self._stacked(solutions, data, fold, held)
+        held = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
+        init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
+        until_s = budget.seconds * (1 - STEPS_SHARE)
+        found, reports = solutions.find(
+            chosen.parts, init, self.switches, data, fold, context, budget, until_s, held
+        )
+        kept = solutions.weighed(found, data, fold, held)
+        self.field, self.started = solutions.joined(kept), "+".join(kept)
         self.field.site = data.site
         self.init_s = budget.counted.wall
         log.info(
@@ -207,109 +166,12 @@ class Gsparc(LearnedField):
         seconds = budget.counted.wall
         stages = {name: report.seconds for name, report in reports.items()}
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
-        _say_cost(stages, seconds)
+        _log_cost(stages, seconds)
         notes = [note for name in self.started.split("+") for note in reports[name].notes]
         limited: Clock | None = None
         for report in reports.values():
             limited = less_repeatable(limited, report.limited_by)
         return FitReport(seconds, tuple(notes), limited)
-
-    def _solutions(
-        self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget,
-        held: InnerFolds | None,
-    ) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:  # fmt: skip
-        """What initialisers find, and what each cost.
-
-        Where they are several, training rows are cut into groups as the test was cut, and each solution
-        predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
-        few sources is a solution of its own beside the one that takes what seconds are left: many sources fit
-        rows near others better, few of them what is far.
-        """
-        weighed = held is not None
-        rows = fold.train if weighed else np.sort(np.concatenate([fold.train, fold.val]))
-        groups = () if held is None else _groups(held, fold.train)
-        plans = [(part, self.init, 1.0) for part in parts if part not in OPEN_ENDED]
-        for part in (part for part in parts if part in OPEN_ENDED):
-            if weighed and part in SEARCHES:
-                plans.append((f"few {part}", replace(self.init, **FEW), FEW_SHARE))
-            plans.append((part, self.init, 1.0))
-        found: dict[str, ConditionalField] = {}
-        reports: dict[str, FitReport] = {}
-        for name, init, share in plans:
-            left = max(budget.seconds * (1 - STEPS_SHARE) - budget.spent, 1.0)
-            within = replace(context, budget_s=share * left)
-            if name.startswith("few "):
-                within = replace(within, run_dir=Path(), resume=None)
-            part = name.split()[-1]
-            try:
-                leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
-                within = replace(within, leave_out=leave_out)
-                found[name], report = self._initialise(part, init, data, rows, within)
-                if part not in OPEN_ENDED:
-                    found[name].held = _held(found[name], data, rows, groups)
-            except KeyboardInterrupt:
-                if not name.startswith("few "):
-                    raise
-                raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
-            except ValueError as error:
-                if len(parts) == 1 or name == self.init.name:
-                    raise
-                log.info("init=%s is left out: %s", name, error)
-                found.pop(name, None)
-                continue
-            reports[name] = report
-        return found, reports
-
-    def _initialise(
-        self, part: str, init: InitSettings, data: Measurements, rows: np.ndarray, context: FitContext
-    ) -> tuple[ConditionalField, FitReport]:
-        clutter = self.switches.visibility is not False
-        init = init if self.settings.field.count else replace(init, name="diffuse")
-        field, report = field_initialiser(part)(data, rows, init, clutter, context)
-        if self.switches.residual is False and isinstance(field, CompletedField):
-            field = field.field
-        return field, report
-
-    def _stacked(
-        self, solutions: dict[str, ConditionalField], data: Measurements, fold: Fold, cut: InnerFolds | None
-    ) -> ConditionalField:
-        """The solutions by the weights that rows give them which they were not conditioned on."""
-        self.started = "+".join(solutions)
-        if len(solutions) == 1:
-            return next(iter(solutions.values()))
-        held = [field.held for field in solutions.values() if field.held is not None]
-        rows = np.zeros(0, np.int64)
-        if len(held) == len(solutions):
-            rows = np.asarray(functools.reduce(np.intersect1d, [one.rows for one in held]), np.int64)
-        batch = data.batch(fold.val)
-        predicted = []
-        for field in solutions.values():
-            said = field(batch.tx, batch.rx).mean
-            if len(rows):
-                assert field.held is not None
-                order = {row: place for place, row in enumerate(field.held.rows.tolist())}
-                said = torch.cat([field.held.mean[[order[row] for row in rows.tolist()]], said])
-            predicted.append(_comparable(said, data.site))
-        rows = np.concatenate([rows, fold.val])
-        if len(rows) < LEAST_HELD:
-            name = next(iter(solutions))
-            log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), name)
-            self.started = name
-            return solutions[name]
-        target = _comparable(data.batch(rows).target, data.site)
-        assert cut is not None
-        alone = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
-        unit = np.where(cut.unit == NOT_TESTED, alone, cut.unit)[rows]
-        found = weighing.weights(predicted, target, unit)
-        for name, one, weight in zip(solutions, predicted, found, strict=True):
-            log.info(
-                "%d held-out rows: %s misses %.3f of the energy, weight %.2f", len(rows), name,
-                weighing.error(one, target), weight,
-            )  # fmt: skip
-        kept = {name: weight for name, weight in zip(solutions, found, strict=True) if weight > 0}
-        self.started = "+".join(kept)
-        fields = [solutions[name] for name in kept]
-        return fields[0] if len(fields) == 1 else StackedField(fields, list(kept.values()))
 
     def _take_steps(
         self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
@@ -327,10 +189,10 @@ class Gsparc(LearnedField):
         if field.count:
             field.condition(data, fold.train)
             batch = data.batch(fold.val)
-            target, found = _comparable(batch.target, data.site), field(batch.tx, batch.rx)
+            target, found = comparable(batch.target, data.site), field(batch.tx, batch.rx)
             assert found.explained is not None
-            own = _comparable(found.explained, data.site)
-            self.explained = weighing.explained(own, target, data.site.kind != "csi")
+            own = comparable(found.explained, data.site)
+            self.explained = solution_weights.explained(own, target, data.site.kind != "csi")
         if isinstance(getattr(field, "process", None), NearestProcess):
             log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
             return 0, field.count > 0
@@ -383,15 +245,15 @@ class Gsparc(LearnedField):
                 torch.cat([getattr(part, name) for part in parts]) for name in ("mean", "variance", "unknown")
             )
             return Prediction(mean, (1 - unknown).clamp(0, 1), variance)
-        if self._beside is not None and not self.size():
-            return self._beside[0].predict(tx, rx)
+        if self._average is not None and not self.size():
+            return self._average[0].predict(tx, rx)
         own = super().predict(tx, rx)
-        if self._beside is None:
+        if self._average is None:
             return own
-        if self._lean is None:
-            self._lean = mean_alone(self._beside[0])
-        mean = self._lean.predict(tx, rx).mean
-        return replace(own, mean=own.mean.lerp_(mean, self._beside[1]))
+        if self._average_mean is None:
+            self._average_mean = mean_alone(self._average[0])
+        mean = self._average_mean.predict(tx, rx).mean
+        return replace(own, mean=own.mean.lerp_(mean, self._average[1]))
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -408,7 +270,7 @@ class Gsparc(LearnedField):
         return found
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """See `Differentiable`; of rasterized Gaussians, without a process beside them."""
+        """See `Differentiable`; of rasterized Gaussians, without an averaged process."""
         if self.field is not None:
             raise ValueError(f"{self.name}: its mean has no gradients by position")
         return super().mean_at(tx, rx)
@@ -439,7 +301,7 @@ class Gsparc(LearnedField):
         """See `Reducible`; `hybrid=false` and `beside=0` are the Gaussians alone."""
         if self.field is None:
             own = super().knobs()
-            return own if self._beside is None else (*own, "beside")
+            return own if self._average is None else (*own, "beside")
         method = self._method()
         own = () if method is None or isinstance(self.field, StackedField) else knobs(method)
         return (*own, "hybrid") if isinstance(self.field, CompletedField) else own
@@ -457,10 +319,10 @@ class Gsparc(LearnedField):
         keep, method = settings.get("hybrid", True), self._method()
         if self.field is None:
             twin = copy.copy(self)
-            twin._beside = None
+            twin._average = None
             found = LearnedField.reduced(twin, own, measured)
             share = float(settings.get("beside", 1.0)) if keep else 0.0  # earlier fronts say hybrid=false
-            return averaged(found, *self._beside, share) if share and self._beside is not None else found
+            return averaged(found, *self._average, share) if share and self._average is not None else found
         if method is None or isinstance(self.field, StackedField):
             return self
         found = reduced(method, own, measured)
@@ -469,10 +331,10 @@ class Gsparc(LearnedField):
     # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Field, process beside it, and what was found out."""
+        """Field, averaged process, and what was found out."""
         beside = None
-        if self._beside is not None:
-            method, weight = self._beside
+        if self._average is not None:
+            method, weight = self._average
             beside = {"name": method.name, "state": method.state(), "weight": weight}
         return {
             "inner": super().state() if self.field is None else None,
@@ -490,7 +352,7 @@ class Gsparc(LearnedField):
             ValueError: an earlier version's, in which another method had been chosen.
         """
         state = as_today(state)
-        self.site, self.field, self._beside, self._lean = site, None, None, None
+        self.site, self.field, self._average, self._average_mean = site, None, None, None
         response = replace(
             self.settings.response, array=bool(state.get("array", self.switches.array is True))
         )
@@ -502,7 +364,7 @@ class Gsparc(LearnedField):
         if state.get("beside") is not None:
             method = method_class(state["beside"]["name"])()
             method.restore(site, state["beside"]["state"])
-            self._beside = method, float(state["beside"]["weight"])
+            self._average = method, float(state["beside"]["weight"])
         facts = state.get("facts", {})
         self.explained, self.steps = facts.get("explained"), int(facts.get("steps", 0))
         self.started = str(state.get("init", ""))
@@ -522,58 +384,7 @@ class Gsparc(LearnedField):
         }
 
 
-class Summed(View):
-    """A reduced field with the residual of the whole one."""
-
-    def __init__(self, inner: Method, whole: CompletedField) -> None:
-        super().__init__(inner)
-        self.residual, self.weight = whole.residual, whole.weight
-
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`."""
-        found = self.inner.predict(tx, rx)
-        return replace(found, mean=found.mean + self.weight * self.residual(tx, rx).mean)
-
-
-def _say_cost(stages: dict[str, float], seconds: float) -> None:
+def _log_cost(stages: dict[str, float], seconds: float) -> None:
     """The log's last line of a fit: seconds of each stage, and of all."""
     said = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
     log.info("cost: %s; %.1f s in all", said, seconds)
-
-
-def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Training rows (n,) of each group."""
-    found = [np.intersect1d(one.test, train) for one in cut.folds]
-    return tuple(group for group in found if 0 < len(group) < len(train))
-
-
-def _held(
-    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
-) -> LeftOutRows | None:
-    """Rows of every group, predicted from the others with the parameters of all."""
-    if not groups:
-        return None
-    found = []
-    for group in groups:
-        field.condition(data, np.setdiff1d(rows, group))
-        batch = data.batch(group)
-        found.append(field(batch.tx, batch.rx))
-    field.condition(data, rows)
-    mean, variance = (torch.cat([getattr(one, name) for one in found]) for name in ("mean", "variance"))
-    return LeftOutRows(np.concatenate(groups), mean, variance)
-
-
-def _flat(values: Tensor) -> np.ndarray:
-    return values.detach().double().flatten(1).numpy()
-
-
-def _left_out(left: Any, distance: float | None) -> weighing.Rows:
-    """Training rows as far from what is left as held-out rows are, as field and process predict them."""
-    gap = left.as_far_as(distance)
-    own, target = left.at(gap, left.predicted)
-    return weighing.Rows(own, left.at(gap, left.by_process())[0], target)
-
-
-def _comparable(values: Tensor, site: Site) -> Tensor:
-    """Values in the unit that errors are counted in: powers in decibels."""
-    return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values

@@ -141,13 +141,13 @@ class LearnedField(Method):
             if self.refit:
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             seconds = self._stage("train", origin, data, fold, context, budget, seconds)
-            self._weigh_beside(data, fold)
+            self._weigh_process(data, fold)
             self.frozen = None
             return FitReport(seconds, limited_by=self._limited_by)
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
-            self._weigh_beside(data, fold)
+            self._weigh_process(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
         if self.refit and len(fold.val):
@@ -244,8 +244,8 @@ class LearnedField(Method):
             self._paying = ran.position
         return prepared + ran.seconds
 
-    def _weigh_beside(self, data: Measurements, fold: Fold) -> None:
-        """A hook between the stages: what validation rows say of a process beside the field."""
+    def _weigh_process(self, data: Measurements, fold: Fold) -> None:
+        """A hook between the stages: what a process averaged with the field would gain."""
 
     def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
         """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
@@ -305,7 +305,7 @@ class LearnedField(Method):
         if len(tx) > QUERY_CHUNK:
             chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
             parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
-            return joined(parts)
+            return Prediction.joined(parts)
         frozen = self.frozen_at(rx)
         found = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
         mean = found.mean.clamp_(0, 1) if model.site.kind == "spectrum" else found.mean
@@ -393,16 +393,6 @@ def _choices(stored: dict[str, Any]) -> Choices:
     if known.pop("warm_start", False):
         known["init"] = "images"
     return Choices(**known)
-
-
-def joined(parts: Sequence[Prediction]) -> Prediction:
-    """Predictions of one method, one after the other."""
-
-    def both(each: list[Tensor | None]) -> Tensor | None:
-        return None if each[0] is None else torch.cat(each)  # type: ignore[arg-type]
-
-    mean = torch.cat([part.mean for part in parts])
-    return Prediction(mean, both([p.confidence for p in parts]), both([p.variance for p in parts]))
 
 
 def _apart(data: Measurements, fold: Fold) -> float | None:

@@ -17,6 +17,7 @@ from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import open_files
 from gsparc.maps import levels
 from gsparc.methods import checkpoint
+from gsparc.methods.confidence import Trusted
 from gsparc.methods.confidence import kept as trusted_of
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import reduced
@@ -212,22 +213,18 @@ def open_viewed(
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
     site, trusted = stored.site, trusted_of(stored.extra)
     points, measured = kept(stored.extra)
-    ways = [
-        Way(
-            point.label,
-            Predictor(
-                reduced(method, point.settings, measured), site, method, point, trusted, None, stored.extra
-            ),
-            point.threads,
-            (point.figure[1], point.p50_ms),
-            point.figure[0],
+    ways = []
+    for point in sorted((point for point in points if point.settings), key=lambda point: point.p50_ms):
+        lean, whole, sure = reduced(method, point.settings, measured), method, trusted
+        if point.settings.get("confidence") is False:
+            whole, sure = lean, Trusted()
+        predictor = Predictor(lean, site, whole, point, sure, None, stored.extra)
+        ways.append(
+            Way(point.label, predictor, point.threads, (point.figure[1], point.p50_ms), point.figure[0])
         )
-        for point in sorted(points, key=lambda point: point.p50_ms)
-        if point.settings
-    ]
-    whole = [(point.figure[1], point.p50_ms) for point in points if not point.settings]
+    complete = [(point.figure[1], point.p50_ms) for point in points if not point.settings]
     figure = points[0].figure[0] if points else ""
-    known = min(whole, key=lambda one: one[1]) if whole else None
+    known = min(complete, key=lambda one: one[1]) if complete else None
     trained = Predictor(method, site, trusted=trusted, extra=stored.extra)
     ways.append(Way("as trained", trained, None, known, figure))
     return Viewed(

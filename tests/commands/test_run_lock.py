@@ -7,9 +7,11 @@ import sys
 
 import pytest
 from doors import assert_refused, knock
+from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.run_lock import HOLDER, LOCK, InUse, hold, release
+from gsparc.commands.run_lock import HOLDER, LOCK, InUse, held, hold, release
+from gsparc.commands.train import train
 
 HOLDS = "import sys, time; from gsparc.commands.run_lock import hold; from pathlib import Path; "
 HOLDS += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
@@ -40,6 +42,19 @@ def test_two_runs_in_one_directory(other, tmp_path):
 def test_a_folder_of_a_multirun_is_held_too(other, tmp_path):
     given = ["-m", "ckpt=none.ckpt", "eval_on=val,test", f"hydra.sweep.dir={tmp_path}"]
     assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), "another run writes here")
+
+
+def test_training_from_python_took_no_lock(other, tmp_path):
+    with pytest.raises(ValueError, match=f"another run writes here .process {other.pid}"):
+        train(OmegaConf.create({}), tmp_path)
+    other.kill()
+    other.wait()
+    with held(tmp_path), pytest.raises(ValueError, match="another run writes here"), held(tmp_path):
+        pass
+    hold(tmp_path)  # as a command does before it trains
+    with held(tmp_path):
+        pass
+    release()
 
 
 def test_a_released_folder_is_free(tmp_path):

@@ -72,7 +72,7 @@ def test_silent_rows_bound_errors_from_below():
     found = calibrate(Evidence(**{**vars(known), "silent": silent, "level_db": level}))
     assert found.tail is None and found.half[0] > 0
     high = Evidence(**{**vars(known), "silent": silent, "level_db": level, "mean_db": known.mean_db - 10})
-    assert high.tells[~silent].all() and not high.tells[silent].any()
+    assert high.informative[~silent].all() and not high.informative[silent].any()
     assert (high.error[silent] == 0).all()
 
 

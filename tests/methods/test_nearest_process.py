@@ -52,6 +52,13 @@ def test_given_all_rows_as_neighbours_it_is_the_exact_process(monkeypatch):
     assert np.allclose(near.mean_at(torch.from_numpy(queries)), whole.mean_at(torch.from_numpy(queries)))
 
 
+def test_the_only_place_was_its_own_neighbour():
+    one = neighbourhood.Neighbourhood.of(np.zeros((1, 3)), 0)
+    row, far = one.nearest(np.zeros((2, 3)), np.zeros(2, int))
+    assert row.shape == (2, 0) and np.isinf(far).all()
+    assert one.nearest(np.ones((1, 3)))[0].tolist() == [[0]]
+
+
 def test_rows_of_one_place_are_its_mean_and_lose_nothing(monkeypatch):
     monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
     data, rng = town(60), np.random.default_rng(0)

@@ -150,7 +150,7 @@ def test_paths_are_the_same(name):
 def test_predictions_from_an_uplink_of_unknown_noise_are_the_same(name):
     known = everything()[name]
     method, _ = load(FIXTURES / f"{name}.ckpt")
-    check_prediction(method.listen(torch.from_numpy(known["uplink"])), known, "unknown_noise/")
+    check_prediction(method.from_uplink(torch.from_numpy(known["uplink"])), known, "unknown_noise/")
 
 
 @pytest.mark.parametrize("name", holding("accepts"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.methods.stacking import best_weights, choose, hopeless, paired, squared, variance_scale
+from gsparc.methods.stacking import best_weights, choose, clearly_worse, paired, squared, variance_scale
 
 
 def gram_of(errors: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def test_small_weights_are_left_out():
 )
 def test_hopeless_is_what_is_clearly_worse_and_adds_nothing(deviations, given_up):
     own, best = drawn(deviations, 100).T
-    assert hopeless(own**2, best**2, own * best, np.arange(100)) == given_up
+    assert clearly_worse(own**2, best**2, own * best, np.arange(100)) == given_up
 
 
 def test_variances_are_scaled_to_the_errors():

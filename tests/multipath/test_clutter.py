@@ -8,20 +8,20 @@ import torch
 from gains import gains
 from rooms import PILLAR, WAVELENGTH, shoebox
 
-from gsparc.multipath.clutter import finite_mirrors
+from gsparc.multipath.clutter import finite_mirrors, search
 from gsparc.multipath.clutter.blocking import Clutter, Obstacles, tangents, visible_share
 from gsparc.multipath.clutter.boxes import find_box
 from gsparc.multipath.clutter.finite_mirrors import find_mirrors, find_patch, walls
 from gsparc.multipath.clutter.refine import ReflectionPhasePrior
 from gsparc.multipath.clutter.residual import Residual
-from gsparc.multipath.clutter.search import ClutterSearch, find_clutter
+from gsparc.multipath.clutter.search import find_clutter
 from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import all_words
+from gsparc.physics.mirror_planes import all_sequences
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
@@ -32,16 +32,16 @@ WALLS = torch.tensor(
 TABLE = torch.tensor([0.0, 0, 1, 0.75], dtype=torch.float64)
 
 
-def _words(order: int) -> tuple:
+def _sequences(order: int) -> tuple:
     """Every image of the shoebox once: of both orders of perpendicular walls the sorted one."""
-    words = all_words(list(range(6)), order)
-    kept = [w for w in words if len(w) < 2 or w[0] // 2 == w[1] // 2 or w[0] < w[1]]
+    sequences = all_sequences(list(range(6)), order)
+    kept = [w for w in sequences if len(w) < 2 or w[0] // 2 == w[1] // 2 or w[0] < w[1]]
     return ((), *kept)
 
 
 def _scene(clutter: Clutter, order: int = 1) -> Scene:
-    words, law = _words(order), KernelVisibility(0.95, 0.6, 1.5)
-    return Scene(TRANSMITTER, WALLS, words, torch.zeros(len(words)), -4.0, law, clutter)
+    sequences, law = _sequences(order), KernelVisibility(0.95, 0.6, 1.5)
+    return Scene(TRANSMITTER, WALLS, sequences, torch.zeros(len(sequences)), -4.0, law, clutter)
 
 
 def _rows(count: int, seed: int = 0) -> Rows:
@@ -79,7 +79,7 @@ def test_a_box_hides_what_the_exact_simulator_says():
     for k, source in enumerate(scene.sources.numpy()):
         image = np.linalg.norm(true - source, axis=1).argmin()
         assert np.linalg.norm(true[image] - source) < 1e-6
-        at_noise_floor += ((seen[:, k] > 0.5) == told.visible[:, image]).mean() / len(scene.words)
+        at_noise_floor += ((seen[:, k] > 0.5) == told.visible[:, image]).mean() / len(scene.sequences)
     assert at_noise_floor > 0.98  # the rest are chords shorter than the margin
 
 
@@ -96,7 +96,7 @@ def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
     torch.testing.assert_close(length.double(), straight, rtol=1e-4, atol=1e-4)
 
 
-def test_a_word_beyond_its_mirror_is_not_valid():
+def test_a_sequence_beyond_its_mirror_is_not_valid():
     behind = torch.tensor([[-1.0, 1.0, 1.0]], dtype=torch.float64)
     assert not Unfolding.of(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
 
@@ -118,7 +118,9 @@ def test_concatenated_scenes_do_not_interact():
     one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
     two = _scene(_boxed(_box()))
     unfolding = Unfolding.concatenate([one.unfolding, two.unfolding.with_offset(len(planes))])
-    obstacles = Obstacles.concatenate([Obstacles.of(s.clutter, s.planes, len(s.words)) for s in (one, two)])
+    obstacles = Obstacles.concatenate(
+        [Obstacles.of(s.clutter, s.planes, len(s.sequences)) for s in (one, two)]
+    )
     together = obstacles.visible_share(unfolding.paths(places))
     torch.testing.assert_close(
         together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
@@ -199,13 +201,13 @@ def test_the_pillar_is_found_by_its_shadow():
 def _beside_a_table(count: int) -> tuple:
     """Rows of a room with a table, what its walls alone leave unexplained, the table, and the walls."""
     planes, clutter = _table()
-    words = (*_words(1), (6,), (6, 5), (2, 6))
-    true = Scene(TRANSMITTER, planes, words, torch.zeros(len(words)), -4.0, clutter=clutter)
+    sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
+    true = Scene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
     rows = _truth(true, _rows(count))
     residual = Residual(rows, PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2))
     scene = residual.phased.scene
     scorer = residual.scorer(torch.ones(7, count), scene.log_amplitude)
-    return rows, scorer, clutter, walls(scene.planes, scene.words)
+    return rows, scorer, clutter, walls(scene.planes, scene.sequences)
 
 
 def test_a_table_top_is_found_by_its_reflections():
@@ -235,8 +237,8 @@ def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
 
 def test_an_infinite_mirror_becomes_finite():
     planes, clutter = _table()
-    words = (*_words(1), (6,), (6, 5), (2, 6))
-    true = Scene(TRANSMITTER, planes, words, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
+    sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
+    true = Scene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
     rows = _truth(true, _rows(250))
     phased = PhasedScene(replace(true, clutter=Clutter.none()), torch.zeros(10), 0.2)
     residual = Residual(rows, phased)
@@ -244,7 +246,7 @@ def test_an_infinite_mirror_becomes_finite():
     scorer = residual.scorer(torch.ones(10, 250), scene.log_amplitude)
     generator = torch.Generator().manual_seed(0)
     patch, score = find_patch(
-        scorer, paths, words, 6, TABLE, phased.unobstructed(rows), _room(), generator
+        scorer, paths, sequences, 6, TABLE, phased.unobstructed(rows), _room(), generator
     )  # fmt: skip
     assert score > 10
     learned, told = (
@@ -254,13 +256,14 @@ def test_an_infinite_mirror_becomes_finite():
     assert (learned == told).float().mean() > 0.85
 
 
-def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room():
+def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room(monkeypatch):
     generator = torch.Generator().manual_seed(0)
-    few = ClutterSearch(epochs=1, boxes=2, mirrors=1)
+    for name, value in {"EPOCHS": 1, "BOXES": 2, "MIRRORS": 1}.items():
+        monkeypatch.setattr(search, name, value)
     for clutter, boxes in ((_boxed(_box()), True), (Clutter.none(), False)):
         rows = _truth(_scene(clutter), _rows(150))
         start = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
-        found = find_clutter(rows, start, generator, few)
+        found = find_clutter(rows, start, generator)
         assert bool(len(found.scene.clutter.boxes)) == boxes
         bare, learned = (PhasedPosterior(rows, each).factor.nll for each in (start, found))
         assert learned <= bare

@@ -32,7 +32,7 @@ def _scene() -> Scene:
     return Scene(
         transmitter=torch.tensor([4.0, 1.0, 1.0], dtype=torch.float64),
         planes=torch.tensor([[1.0, 0, 0, -1], [0, 1, 0.1, 4]], dtype=torch.float64),
-        words=((), (0,), (0, 1)),
+        sequences=((), (0,), (0, 1)),
         log_amplitude=torch.tensor([0.5, 0.2, -0.1]),
         log_noise=-1.0,
         visibility=KernelVisibility(0.7, 0.6, 1.5),
@@ -63,7 +63,7 @@ def test_without_a_source_is_the_scene_less_that_source():
 
 def test_dropping_a_source_drops_its_plane():
     less = _scene().only([0, 1])
-    assert less.words == ((), (0,))
+    assert less.sequences == ((), (0,))
     assert len(less.planes) == 1
 
 

@@ -254,7 +254,7 @@ def learned_and_true_visibility(method, told, data, index, most=6):
 
 
 def test_zero_training_channels_are_refused(tmp_path):
-    """The library's words about a matrix that is not positive definite came."""
+    """The library's sequences about a matrix that is not positive definite came."""
     _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
     silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
     with pytest.raises(ValueError, match="every training channel is zero"):

@@ -10,7 +10,7 @@ from rooms import WAVELENGTH, nmse
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.multipath.waves.columns import gather
-from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, disturbance, mirrored, told
+from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, disturbance, mirrored, specular
 from gsparc.multipath.waves.evidence import compressed, normalised
 from gsparc.multipath.waves.field import ChannelField, restored
 from gsparc.multipath.waves.initial import initialise
@@ -62,17 +62,17 @@ def _bare(data):
     """Groups, shape and values of a direct wave in a diffuse field."""
     groups = tuple(normalised(group) for group in gather(data, np.arange(len(data)), True))
     none, middle = torch.zeros(0, 3, dtype=torch.float64), torch.from_numpy(data.moving).mean(0)
-    shape = Shape(none, 8.0, False, True, False, 0, middle, 20.0)
+    shape = Shape(none, 8.0, False, True, False, middle, 20.0)
     power = torch.tensor([0.3, 0.5, 0.02, 0.01], dtype=torch.float64)
     lengths = torch.tensor([2.0, 0.8], dtype=torch.float64)
-    return groups, shape, Values(power, lengths[0], lengths[1], torch.zeros(3).double(), none)
+    return groups, shape, Values(power, lengths[0], lengths[1], torch.zeros(3).double())
 
 
 def _covariance(group, shape, values):
     fields = diffuse_fields((group,), shape, values)[0]
     return (
         fields
-        + told(shape, values, group.slot, group.places, group.places)
+        + specular(shape, values, group.slot, group.places, group.places)
         + disturbance(shape, values, group)
     )
 
@@ -111,7 +111,7 @@ def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
 def test_no_wall_is_kept_where_there_is_none():
     data = _data(*_site([], ends=4, count=50, side=0.4, turned=2.0))
     field, _ = initialise(data, np.arange(len(data)), ChannelSettings(mirrors=2, directions=False))
-    assert field.shape.words == () and not len(field.objects().planes)
+    assert field.shape.sequences == () and not len(field.objects().planes)
 
 
 def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
@@ -123,7 +123,7 @@ def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
 def test_planes_outlive_storing():
     data = _data(*_site([WALL], count=40))
     _, shape, values = _bare(data)
-    shape = replace(shape, words=((0,),))
+    shape = replace(shape, sequences=((0,),))
     wall = torch.from_numpy(WALL - np.r_[0, 0, 0, WALL[:3] @ data.site.origin])[None]
     power = torch.tensor([0.1, 0.5, 0.02, 0.3, 0.01, 0.01], dtype=torch.float64)
     field = ChannelField(data.site, shape, replace(values, power=power, planes=wall), (1, 1))

@@ -58,6 +58,6 @@ def test_objects_mirror_the_transmitter_into_its_images(field):
         torch.ones(len(planes), dtype=planes.dtype)
     )
     end = scene.transmitter + method.frame.middle
-    for word, place in zip(scene.words, scene.sources, strict=True):
-        if len(word) == 1:
-            assert torch.allclose(reflect(end, planes[word[0]]), place + method.frame.middle, atol=1e-6)
+    for sequence, place in zip(scene.sequences, scene.sources, strict=True):
+        if len(sequence) == 1:
+            assert torch.allclose(reflect(end, planes[sequence[0]]), place + method.frame.middle, atol=1e-6)

@@ -116,9 +116,13 @@ def test_both_directions_have_the_same_channels(fitted):
     scene, middle = method.members[0].scene, method.frame.middle
     antennas = torch.from_numpy(static_array(data.site, 4)) + scene.transmitter
     place = torch.from_numpy(data.moving[fold.test[:3]]) - middle
-    there = torch.cdist(images(antennas, scene.planes, scene.words).flatten(0, 1), place)  # antenna's images
-    reversed_words = [word[::-1] for word in scene.words]
-    back = torch.stack([torch.cdist(images(p, scene.planes, reversed_words), antennas) for p in place], -1)
+    there = torch.cdist(
+        images(antennas, scene.planes, scene.sequences).flatten(0, 1), place
+    )  # antenna's images
+    reversed_sequences = [sequence[::-1] for sequence in scene.sequences]
+    back = torch.stack(
+        [torch.cdist(images(p, scene.planes, reversed_sequences), antennas) for p in place], -1
+    )
     torch.testing.assert_close(there.view(4, -1, 3), back.transpose(0, 1))
 
 
@@ -127,17 +131,19 @@ def test_orientation_of_first_and_second_order():
     draws = torch.Generator().manual_seed(0)
     planes = torch.randn(3, 4, generator=draws, dtype=torch.float64)
     centre, antenna = torch.randn(2, 3, generator=draws, dtype=torch.float64)
-    words = [(), (0,), (2,), (0, 1), (2, 1)]
-    turned = orientations(planes, words)
+    sequences = [(), (0,), (2,), (0, 1), (2, 1)]
+    turned = orientations(planes, sequences)
     torch.testing.assert_close(
-        images(centre + antenna, planes, words), images(centre, planes, words) + turned @ antenna
+        images(centre + antenna, planes, sequences), images(centre, planes, sequences) + turned @ antenna
     )
     normal = planes[0, :3] / planes[0, :3].norm()
     householder = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
     torch.testing.assert_close(turned[1], householder)
     torch.testing.assert_close(torch.linalg.det(turned), torch.tensor([1.0, -1, -1, 1, 1]).double())
-    halfway = bisector(centre, images(centre, planes, words)[1])
-    torch.testing.assert_close(reflect(centre + antenna, halfway), images(centre + antenna, planes, words)[1])
+    halfway = bisector(centre, images(centre, planes, sequences)[1])
+    torch.testing.assert_close(
+        reflect(centre + antenna, halfway), images(centre + antenna, planes, sequences)[1]
+    )
 
 
 def _rows_and_scene():

@@ -43,7 +43,7 @@ def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
         near = (found.delay[0] - truth.delay[0, which]).abs().argmin()
         assert (found.direction[0, near] - truth.direction[0, which]).abs().max() < 1e-2
         assert (found.gain[0, near] - truth.gain[0, which]).abs() < 1e-2
-    other = aperture.at(aperture.tones + 27)
+    other = replace(aperture, tones=aperture.tones + 27)
     miss = (found.response(other) - truth.response(other)).abs().square().mean()
     assert miss < 1e-3 * truth.response(other).abs().square().mean()
 
@@ -82,9 +82,9 @@ def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:
     method, data = fitted
     uplink = data.batch(fold().test[:4]).uplink
     noise = torch.full((4,), float(data.noise_variance[0]))
-    plain = method.listen(uplink, noise).mean
+    plain = method.from_uplink(uplink, noise).mean
     up, down = method.search.aperture.tones, method._downlink.tones
-    turned = method.listen(uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up), noise).mean
+    turned = method.from_uplink(uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up), noise).mean
     expected = plain * torch.polar(torch.ones(26), 0.4 - 0.15 * down)
     close = (turned - expected).abs().square().sum() / expected.abs().square().sum()
     assert close < 1e-2
@@ -117,13 +117,13 @@ def test_peers_answer_and_keep(make, tmp_path) -> None:
 
 @pytest.mark.parametrize("inputs", ["own", pytest.param("all", marks=pytest.mark.slow)])
 def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
-    """A Gram matrix of zeros ended in the library's words about singular matrices."""
+    """A Gram matrix of zeros ended in the library's sequences about singular matrices."""
     data = city("all")
     uplink = data.uplink.copy()
     uplink[:, 0] = 0
     method = Ridge(inputs)
     method.fit(replace(data, uplink=uplink), fold(), FitContext())
-    predicted = method.listen(torch.from_numpy(uplink[fold().test])).mean
+    predicted = method.from_uplink(torch.from_numpy(uplink[fold().test])).mean
     assert torch.isfinite(torch.view_as_real(predicted)).all() and predicted[:, 1:].abs().min() > 0
     assert inputs == "all" or (predicted[:, 0] == 0).all()
 
@@ -191,7 +191,7 @@ def test_posterior_tells_the_error_of_the_other_band() -> None:
     heard = heard + noise**0.5 * torch.randn(heard.shape, dtype=torch.complex64, generator=generator)
     search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
     found, _ = search(heard, torch.full((count,), noise))
-    other = aperture.at(aperture.tones + 27)
+    other = replace(aperture, tones=aperture.tones + 27)
     for where in (other, Aperture(other.places[:1], other.tones[:5])):
         miss = (found.response(where) - truth.response(where)).abs().square().mean((1, 2))
         assert 0.6 < float(miss.median() / found.error_variance(where).median()) < 1.6
@@ -203,7 +203,7 @@ def test_expected_errors_hold_on_a_narrow_grid_of_one_antenna(fitted) -> None:
     rows = np.concatenate([fold().val, fold().test])
     batch = data.batch(rows)
     few = torch.from_numpy(data.site.subcarriers_hz[11:15])
-    found = method.listen_at(batch.uplink, few, batch.noise_variance, slice(0, 1))
+    found = method.from_uplink_at(batch.uplink, few, batch.noise_variance, slice(0, 1))
     error = (found.mean - batch.target[:, :1, 11:15]).abs().square().mean((1, 2))
     sure = found.confidence > found.confidence.median()
     share = error / batch.target[:, :1, 11:15].abs().square().mean((1, 2))

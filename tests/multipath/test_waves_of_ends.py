@@ -59,11 +59,11 @@ def _known(fold):
 def _tied(data, rows):
     middle = torch.from_numpy(data.moving).mean(0)
     angles = sphere(16)[:8]
-    shape = Shape(angles, 5.0, True, True, False, 0, middle, 20.0)
+    shape = Shape(angles, 5.0, True, True, False, middle, 20.0)
     power = torch.rand(len(shape.names), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
     lengths = torch.tensor([0.6, 0.4], dtype=torch.float64)
-    none, tilt = torch.zeros(0, 3, dtype=torch.float64), torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
-    values = Values(power, lengths[0], lengths[1], torch.tensor([0.01, -0.02, 0.0]).double(), none, tilt)
+    tilt = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
+    values = Values(power, lengths[0], lengths[1], torch.tensor([0.01, -0.02, 0.0]).double(), tilt)
     field = ChannelField(data.site, shape, values, (1, 1))
     field.condition(data, rows)
     return field
@@ -73,7 +73,7 @@ def test_knots_add_up_and_mirrored_directions_count_alike():
     middle = torch.zeros(3, dtype=torch.float64)
     half = sphere(800)
     half = half[half[:, 2] > 0]
-    shape = Shape(half, 8.0, False, False, False, 0, middle, 10.0)
+    shape = Shape(half, 8.0, False, False, False, middle, 10.0)
     ends = torch.tensor([[1.0, 0.5, 2.0], [1.0, 0.5, -2.0]], dtype=torch.float64)
     found = ways(shape, ends, 5)
     torch.testing.assert_close(found.sum(-1), torch.ones(2, len(half)).double())

@@ -30,14 +30,14 @@ def test_squared_spectrum_is_linear_in_the_lags(array):
     grid, h = SphereGrid.hemisphere(7, 12), _vectors(3, len(array))
     lags = array_response.lags(array, WAVELENGTH)
     direct = array_response.bartlett(h, array_response.steering(array, grid, WAVELENGTH)) ** 2
-    torch.testing.assert_close(lags.of(h) @ lags.basis(grid, WAVELENGTH).T, direct)
     v = torch.cat([h.real, h.imag], 1)
-    torch.testing.assert_close(torch.einsum("bi,kij,bj->bk", v, lags.forms(), v), lags.of(h))
+    numbers = torch.einsum("bi,kij,bj->bk", v, lags.forms(), v)
+    torch.testing.assert_close(numbers @ lags.basis(grid, WAVELENGTH).T, direct)
 
 
 def test_a_square_array_has_49_lags():
-    assert array_response.lags(planar_array(), WAVELENGTH).count == 49
-    assert array_response.lags(planar_array(2, 3), WAVELENGTH).count == 15
+    assert len(array_response.lags(planar_array(), WAVELENGTH).forms()) == 49
+    assert len(array_response.lags(planar_array(2, 3), WAVELENGTH).forms()) == 15
 
 
 def test_array_output_is_the_weighted_sum_over_directions():

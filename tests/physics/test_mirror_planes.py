@@ -5,7 +5,7 @@ import torch
 
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.reflection_orders import find_walls, orthogonal_walls, reassign
-from gsparc.physics.mirror_planes import all_words, bisector, images, reflect
+from gsparc.physics.mirror_planes import all_sequences, bisector, images, reflect
 
 WALLS = torch.tensor(
     [[1.0, 0, 0, 0], [2.0, 0, 0, 4.0], [0, 1, 0, 0], [0, 1, 0, 3.0]], dtype=torch.float64
@@ -22,7 +22,7 @@ def test_bisector_mirrors_one_point_into_the_other():
     torch.testing.assert_close(reflect(TX, bisector(TX, other)), other)
 
 
-def test_words_are_mirrors_one_after_the_other():
+def test_sequences_are_mirrors_one_after_the_other():
     place = images(TX, WALLS, [(), (1,), (1, 0), (2, 3, 1)])
     by_hand = [TX, reflect(TX, WALLS[1]), reflect(reflect(TX, WALLS[1]), WALLS[0])]
     by_hand.append(reflect(reflect(reflect(TX, WALLS[2]), WALLS[3]), WALLS[1]))
@@ -30,15 +30,15 @@ def test_words_are_mirrors_one_after_the_other():
     assert place[1].tolist() == pytest.approx([8 - 0.6, 0.8, 1.9])
 
 
-def test_words_have_no_letter_after_itself():
-    words = all_words([0, 1, 2], 3)
-    assert len(words) == len(set(words)) == 3 + 6 + 12
-    assert all(a != b for word in words for a, b in itertools.pairwise(word))
+def test_sequences_have_no_letter_after_itself():
+    sequences = all_sequences([0, 1, 2], 3)
+    assert len(sequences) == len(set(sequences)) == 3 + 6 + 12
+    assert all(a != b for sequence in sequences for a, b in itertools.pairwise(sequence))
 
 
 def test_walls_are_found_by_the_sources_they_explain():
-    words = [(), *all_words([0, 1, 2, 3], 2)]
-    sources = images(TX, WALLS, words)
+    sequences = [(), *all_sequences([0, 1, 2, 3], 2)]
+    sources = images(TX, WALLS, sequences)
     sources = sources + 0.002 * torch.randn(
         sources.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
@@ -56,8 +56,8 @@ def test_two_sources_make_no_wall():
 def test_walls_of_a_box_are_told_from_sources_spelled_badly():
     walls = torch.tensor([[1.0, 0, 0, 4], [0, 1, 0, 0], [0, 1, 0, 3], [0, 0, 1, 2.5]], dtype=torch.float64)
     transmitter = torch.tensor([0.0, 0.8, 1.9], dtype=torch.float64)
-    words = ((), (0,), (1,), (2,), (3,), (0, 3), (1, 3), (0, 1))
-    good = Scene(transmitter, walls, words, torch.zeros(len(words)), 0.0)
+    sequences = ((), (0,), (1,), (2,), (3,), (0, 3), (1, 3), (0, 1))
+    good = Scene(transmitter, walls, sequences, torch.zeros(len(sequences)), 0.0)
     # the far wall's images hang on tilted planes of their own
     tilted = bisector(good.sources[3].expand(2, 3), good.sources[[1, 5]])
     planes = torch.cat([walls[1:], tilted])

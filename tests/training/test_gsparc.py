@@ -28,7 +28,7 @@ from gsparc.methods.per_station import PerStation, for_links
 from gsparc.methods.registry import build, method_class
 from gsparc.multipath import initialise
 from gsparc.ops import Pose
-from gsparc.training import weighing
+from gsparc.training import solution_weights, solutions
 from gsparc.training.gsparc import Gsparc
 
 SMALL = (
@@ -180,7 +180,7 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 
 
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
-    monkeypatch.setattr(weighing, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
+    monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(initialise, "LEAST_GAIN", -math.inf)
     fitted = fit("channels")
     field = fitted.method.field
@@ -267,7 +267,8 @@ def test_a_search_that_ends_early_says_so():
 def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     """Twelve stations of a city that shared 60 s took 419 s: their searches were given no seconds."""
     given = []
-    monkeypatch.setattr(Gsparc, "_initialise", lambda self, *args: given.append(args[-1].budget_s) or 1 / 0)
+    initialiser = lambda *args: given.append(args[-1].budget_s) or 1 / 0  # noqa: E731
+    monkeypatch.setattr(solutions, "field_initialiser", lambda part: initialiser)
     data = KINDS["powers"](tmp_path)
     fold = split_for({"name": "random"}, data).folds[0]
     with pytest.raises(ZeroDivisionError):

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+import shutil
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
+from gsparc.methods import checkpoint
+from gsparc.methods.stored_front import KEY, Operating
 from gsparc.view.answer import Answer, Rays, ask, rays
 from gsparc.view.building import rays_of
 from gsparc.view.crossed import Obstacles, crossed_losses
 from gsparc.view.reasons import Surroundings, reasons, usual
+from gsparc.view.viewed import open_viewed
 
 HERE = np.zeros(3)
 NO_BOXES = np.zeros((0, 2, 3))
@@ -128,3 +132,13 @@ def test_rays_are_as_long_as_their_delays():
     length = np.linalg.norm(ends.places - 1, axis=1)
     np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
     assert lines.segments.shape == (2, 2, 3)
+
+
+def test_an_operating_point_without_confidence_showed_that_of_the_whole_model(spectrum_view, tmp_path):
+    file = tmp_path / "model.ckpt"
+    shutil.copy(spectrum_view.viewed.name, file)
+    point = Operating("no confidence", {"confidence": False}, 1, 0.0, ("psnr_db", 20.0), 0.5)
+    checkpoint.amend(file, {KEY: {"points": [asdict(point)], "measured": {}}})
+    lean, trained = (way.predictor for way in open_viewed(file).ways)
+    place = {end: np.full(3, 0.5) for end in spectrum_view.viewed.moving}
+    assert ask(lean, place).confidence is None and ask(trained, place).confidence is not None

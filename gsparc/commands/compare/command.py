@@ -178,7 +178,7 @@ def fill_all(
         number = prepared.index(one) + 1
         log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
         try:
-            _say_filled(fill(one))
+            _log_filled(fill(one))
         except KeyboardInterrupt:
             kept = "interrupted; finished cells are kept: the same command goes on with the others"
             raise KeyboardInterrupt(kept) from None
@@ -196,7 +196,7 @@ def fill_all(
     return [one for one in found if one is not None]
 
 
-def _say_filled(found: Filled) -> None:
+def _log_filled(found: Filled) -> None:
     scored = found.scored()
     score = f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB" if scored else "-"
     log.info("%s: %s after %.1f s", found.cell, score, found.facts["time/train_s"])

@@ -106,7 +106,7 @@ class Adaptation:
             chosen = self._highest(self._fails(guess - care))
             regret = torch.full((len(chosen),), torch.nan, dtype=torch.float64)
         else:
-            chosen, regret = self._carries_most(guess, care * self._doubt_db(band))
+            chosen, regret = self._carries_most(guess, care * self._uncertainty_db(band))
         delivered = self.full_bps * (1 - fails.clamp_max(1))
 
         def of(table: Tensor, mcs: Tensor) -> np.ndarray:
@@ -126,7 +126,7 @@ class Adaptation:
         )
 
     @staticmethod
-    def _doubt_db(band: Band) -> Tensor:
+    def _uncertainty_db(band: Band) -> Tensor:
         """`SLOW_DECIBEL` times the root of the expected relative error (n,)."""
         loud = band.expected_power.mean(1).clamp_min(1e-30)
         return SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()

@@ -68,7 +68,7 @@ def channels(
         batch = data.batch(rows[start : start + CHUNK])
         if isinstance(method, SeparatesPaths) and batch.uplink is not None:
             wanted = torch.from_numpy(frequency_hz)
-            found = method.listen_at(batch.uplink, wanted, batch.noise_variance, antennas)
+            found = method.from_uplink_at(batch.uplink, wanted, batch.noise_variance, antennas)
         else:
             found = method.answer(batch)
             mean = interpolated(found.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)

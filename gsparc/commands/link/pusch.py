@@ -74,7 +74,7 @@ class Pusch:
             "ls": nr.PUSCHLSChannelEstimator(self.grid, *shape, interpolation_type="lin"),
             "lmmse": _Wiener(self.grid, correlation),
             "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
-            **{name: self._told(name) for name in ("perfect", "predicted", "predicted_variance")},
+            **{name: self._known_channel(name) for name in ("perfect", "predicted", "predicted_variance")},
         }
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
         how = {"tb_decoder": decoder, "return_tb_crc_status": True}
@@ -88,7 +88,7 @@ class Pusch:
         """Share of a slot's resource elements that pilots occupy."""
         return float(self.grid.num_pilot_symbols) / float(self.grid.num_resource_elements)
 
-    def _told(self, name: str) -> Estimator:
+    def _known_channel(self, name: str) -> Estimator:
         """An estimator that was told the channel beforehand."""
         return lambda y, no: self._known[name]
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from gsparc.data.errors import DataError
 from gsparc.data.query_places import QueryPlaces
@@ -83,12 +84,8 @@ def answers(
         raise DataError(silent[0])
     rows = np.concatenate([rows for rows, _ in parts])
     order = np.argsort(rows, kind="stable")
-
-    def joined(name: str) -> np.ndarray | None:
-        values = [getattr(said, name) for _, said in parts]
-        return None if any(v is None for v in values) else np.concatenate([v.numpy() for v in values])[order]
-
-    rows, mean = rows[order], joined("mean")
-    assert mean is not None
+    whole = Prediction.joined([said for _, said in parts], torch.from_numpy(order))
+    spread, sure = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
+    rows = rows[order]
     names = None if stations is None else np.array(stations.name)[number[rows]]
-    return Answers(row[rows], names, mean, joined("variance"), joined("confidence")), silent
+    return Answers(row[rows], names, whole.mean.numpy(), spread, sure), silent

@@ -63,7 +63,7 @@ def _without_table(check: Checker, measured: str) -> Links | None:
         place = numbered(moving)
         if len(np.unique(place)) < rows:  # a place visited twice is not learned from and tested on
             links = replace(links, place=place)
-    return _heard(check, measured, links, np.zeros(rows, np.int64))
+    return _valid(check, measured, links, np.zeros(rows, np.int64))
 
 
 def _with_table(check: Checker, measured: str) -> Links | None:
@@ -112,7 +112,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         check.raw.arrays["rx_rotation"] = links.stations.rotation[links.station]  # type: ignore[index]
     for name in STATION_FIELDS[:-1]:
         check.raw.arrays.pop(name, None)
-    return _heard(check, measured, links, of_level, count)  # type: ignore[arg-type]
+    return _valid(check, measured, links, of_level, count)  # type: ignore[arg-type]
 
 
 def _unrolled(raw: Raw, measured: str, moving: End, count: int) -> Raw:
@@ -131,7 +131,7 @@ def _unrolled(raw: Raw, measured: str, moving: End, count: int) -> Raw:
     return replace(raw, arrays=arrays)
 
 
-def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
+def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
     """Rows without a missing value; censored ones hold the level below which nothing is heard, masked."""
     values, arrays = check.raw.arrays[measured], check.raw.arrays
     level = check.real("sensitivity_db", (), (count,))
@@ -175,7 +175,7 @@ def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     if not keep.any():
         return check.refuse(measured, "nothing was measured; expected numbers")
     if not keep.all() or censored.any():
-        _say_missing(check, measured, links, keep, censored)
+        _log_missing(check, measured, links, keep, censored)
         _keep(check.raw, measured, keep)
         parts = {name: getattr(links, name) for name in ("station", "place", "run")}
         pick = {name: value[keep] for name, value in parts.items() if value is not None}
@@ -204,7 +204,7 @@ def _keep(raw: Raw, measured: str, keep: np.ndarray) -> None:
             arrays[name] = array[keep]
 
 
-def _say_missing(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:
+def _log_missing(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:
     """How many links have no value, and how many were not heard, by station."""
     if not keep.all():
         text = f"{int((~keep).sum())} of {len(keep)} values are missing"

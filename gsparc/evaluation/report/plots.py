@@ -59,7 +59,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
                 label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, found.value))
-    for base in _beside(runs):
+    for base in _shared_baselines(runs):
         value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
         if value is not None and ms is not None:
             axes.plot([ms], [value], **look(base).marked, ms=4)
@@ -92,7 +92,7 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
         if values:
             pooled = np.concatenate(values)
             _cdf(axes, pooled[np.isfinite(pooled)], setting, style, samples=len(values[0]))
-    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in _beside(runs) else None
+    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in _shared_baselines(runs) else None
     if rival is not None:
         share = np.arange(1, len(rival) + 1) / len(rival)
         axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
@@ -220,7 +220,7 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
     series: dict[str, dict[int, list[float]]] = {}
     for run in runs:
         found = {str(run.facts.get("model/name")): run.figure_of(name)}
-        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in _beside(runs)}
+        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in _shared_baselines(runs)}
         for method, value in found.items():
             if value is not None:
                 series.setdefault(method, {}).setdefault(run.measured, []).append(float(value))
@@ -265,7 +265,7 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     return figure
 
 
-def _beside(runs: Sequence[Run]) -> list[str]:
+def _shared_baselines(runs: Sequence[Run]) -> list[str]:
     """Baselines that no run is of."""
     return [base for base in BASELINES if base not in {run.facts.get("model/name") for run in runs}]
 

@@ -77,7 +77,7 @@ class Obstacles:
         box_mask: (B, K, 1) bool, sources that a box applies to.
         patches: (Q, 4).
         patch_mask: (Q, K, 1) bool, sources that a patch applies to.
-        letter: (Q, 1, 1, 1) planes of the patches.
+        plane: (Q, 1, 1, 1) planes of the patches.
         axes: (3, Q, 3), normals and both tangents of these planes.
         offset: (Q, 1, 1, 1) of these planes.
         ends: (P + 1,) bool, which planes have patches; the last is no plane.
@@ -87,7 +87,7 @@ class Obstacles:
     box_mask: Tensor
     patches: Tensor
     patch_mask: Tensor
-    letter: Tensor
+    plane: Tensor
     axes: Tensor
     offset: Tensor
     ends: Tensor
@@ -95,17 +95,17 @@ class Obstacles:
     @staticmethod
     def of(clutter: Clutter, planes: Tensor, sources: int) -> Obstacles:
         """From one scene's clutter, planes (P, 4) and number of sources."""
-        letter = torch.tensor(clutter.plane, dtype=torch.long)
+        plane = torch.tensor(clutter.plane, dtype=torch.long)
         ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
-        ends[letter] = True
-        used = planes[letter]
+        ends[plane] = True
+        used = planes[plane]
         axes = [torch.cat([_units(plane[None]), tangents(plane)]) for plane in used]
         return Obstacles(
             clutter.boxes,
             torch.ones(len(clutter.boxes), sources, 1, dtype=torch.bool),
             clutter.patches,
-            torch.ones(len(letter), sources, 1, dtype=torch.bool),
-            letter.view(-1, 1, 1, 1),
+            torch.ones(len(plane), sources, 1, dtype=torch.bool),
+            plane.view(-1, 1, 1, 1),
             torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3),
             used[:, 3].float().view(-1, 1, 1, 1),
             ends,
@@ -120,7 +120,7 @@ class Obstacles:
             **{name: torch.cat([getattr(s, name) for s in many]) for name in names},
             box_mask=_blocks([s.box_mask for s in many]),
             patch_mask=_blocks([s.patch_mask for s in many]),
-            letter=torch.cat([s.letter + first for s, first in zip(many, planes, strict=False)]),
+            plane=torch.cat([s.plane + first for s, first in zip(many, planes, strict=False)]),
             axes=torch.cat([s.axes for s in many], 1),
             ends=torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
         )
@@ -141,16 +141,16 @@ class Obstacles:
         height, *place = turned.unflatten(0, (3, -1))  # each (Q, K, n, L + 1)
         height = height - self.offset
         away, (above, below) = height.abs() > NEAR_PLANE, (height[..., :-1], height[..., 1:])
-        ends_here = paths.letter == self.letter
+        ends_here = paths.plane == self.plane
         crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
         share = torch.where(crosses, above / (above - below), 1.0)
         met = [each[..., :-1] + share * each.diff() for each in place]
         outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & mine)
         passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
-        bounded = self.ends[paths.letter]
+        bounded = self.ends[paths.plane]
         seen = passed * torch.where(bounded, reflected, 1.0).prod(-1)
-        # the words of a finite mirror are invisible where their path is not valid
+        # the sequences of a finite mirror are invisible where their path is not valid
         return torch.where(paths.valid | ~bounded.any(-1), seen, 0.0)
 
 

@@ -20,7 +20,7 @@ from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.worker import ask
-from gsparc.physics.mirror_planes import Word, reflect
+from gsparc.physics.mirror_planes import Reflections, reflect
 from gsparc.physics.waves import LIGHT, NEAR_M, wave
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 def find_patch(
     scorer: CandidateScorer,
     paths: Paths,
-    words: tuple[Word, ...],
+    sequences: tuple[Reflections, ...],
     number: int,
     plane: Tensor,
     visible_waves: Tensor,
@@ -48,22 +48,22 @@ def find_patch(
     generator: torch.Generator,
     draws: int = 300,
 ) -> tuple[Tensor, float]:
-    """The patch (4,) on plane `number` that, were its words seen only in it, explains most; and its nats.
+    """The patch (4,) on plane `number` that, were its sequences seen only in it, explains most; and its nats.
 
     Args:
         scorer: what is left.
         paths: of all K sources.
-        words: of the sources.
+        sequences: of the sources.
         number, plane: (4,) which.
         visible_waves: (n, K) complex, waves of the sources as they are seen now.
         room: (2, 3) [m].
         generator: of the candidates.
         draws: random patches, of which the best evolve.
     """
-    mine = [k for k, word in enumerate(words) if number in word]
+    mine = [k for k, sequence in enumerate(sequences) if number in sequence]
     few, waves = paths.take(mine), visible_waves[:, mine]
     along = tangents(plane)
-    met, here = few.end @ along.T, few.letter == number
+    met, here = few.end @ along.T, few.plane == number
     ends = room @ along.T
     low, high = ends.amin(0), ends.amax(0)
 
@@ -90,7 +90,7 @@ class SmallMirror:
     Attributes:
         plane: (4,) float64.
         patch: (4,) float32, along its tangents.
-        score: approximate gain of its words together [nats].
+        score: approximate gain of its sequences together [nats].
     """
 
     plane: Tensor
@@ -98,9 +98,9 @@ class SmallMirror:
     score: float
 
 
-def walls(planes: Tensor, words: tuple[Word, ...]) -> list[int]:
+def walls(planes: Tensor, sequences: tuple[Reflections, ...]) -> list[int]:
     """Numbers of planes that make a source of one reflection."""
-    return [i for i in range(len(planes)) if (i,) in words]
+    return [i for i in range(len(planes)) if (i,) in sequences]
 
 
 def find_mirrors(
@@ -114,8 +114,8 @@ def find_mirrors(
 ) -> list[SmallMirror]:
     """Small mirrors parallel to walls, best first.
 
-    For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its words (itself, after and
-    before each wall) are collected in a raster of where it is met; integral images give every rectangle.
+    For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
+    and before each wall) are collected in a raster of where it is met; integral images give every rectangle.
     Sites whose rasters have more than `MAX_CELLS` are not searched.
 
     Args:
@@ -206,7 +206,7 @@ def _raster(
             for s in sums
         )  # fmt: skip
         score = (real.square() + imag.square()) / energy.clamp_min(1e-3) / 2
-        summed = ((score - 1).clamp_min(0) * (count >= MIN_SERVED)).sum(0)  # words add up: (C, u, v)
+        summed = ((score - 1).clamp_min(0) * (count >= MIN_SERVED)).sum(0)  # sequences add up: (C, u, v)
         value, at = summed.flatten(1).max(1)
         first = torch.stack([at // summed.shape[2], at % summed.shape[2]], 1)
         span = torch.tensor([wide, high_by])
@@ -226,7 +226,7 @@ def _cells(room: Tensor, along: Tensor) -> list[int]:
 def _sources(
     rows: Rows, transmitter: Tensor, candidates: Tensor, known: Tensor
 ) -> list[tuple[Tensor, Tensor]]:
-    """Waves (C, n) of every word over a candidate, and where the candidate is met (C, n, 3), NaN if not."""
+    """Waves (C, n) of every sequence over a candidate, and where it is met (C, n, 3), NaN if not."""
     places = rows.position.float()
     once, *more = _images(transmitter, candidates, known)
     found = [_meeting(places, once, candidates)]

@@ -17,7 +17,7 @@ from gsparc.multipath.clutter.residual import Residual
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.phased_gp import PhasedScene
-from gsparc.physics.mirror_planes import Word, images
+from gsparc.physics.mirror_planes import Reflections, images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
 # Adam's steps: boxes and patches [m], planes (unit normal, offset [m]), phases [rad], log amplitudes.
@@ -45,7 +45,7 @@ class ReflectionPhasePrior:
     @staticmethod
     def of(phased: PhasedScene) -> ReflectionPhasePrior:
         """From a scene's phases, weighted by power."""
-        order = torch.tensor([len(word) for word in phased.scene.words])
+        order = torch.tensor([len(sequence) for sequence in phased.scene.sequences])
         if len(order) < 4:
             return ReflectionPhasePrior(0.0, 0.0)
         power = phased.scene.log_amplitude.mul(2).exp() * (order > 0)
@@ -56,13 +56,13 @@ class ReflectionPhasePrior:
         share = min(max(share, 0.0), 0.97)
         return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
 
-    def expected(self, first: Tensor, words: tuple[Word, ...]) -> Tensor:
-        """Phases (K,) of words, given the transmitter's own."""
-        return first + self.turn * torch.tensor([float(len(word)) for word in words])
+    def expected(self, first: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
+        """Phases (K,) of sequences, given the transmitter's own."""
+        return first + self.turn * torch.tensor([float(len(sequence)) for sequence in sequences])
 
-    def cost(self, phase: Tensor, words: tuple[Word, ...]) -> Tensor:
+    def cost(self, phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """Negative log prior of phases (K,), the transmitter's first."""
-        return self.concentration * (1 - (phase - self.expected(phase[0], words)).cos()).sum()
+        return self.concentration * (1 - (phase - self.expected(phase[0], sequences)).cos()).sum()
 
 
 def descend(
@@ -84,11 +84,11 @@ def descend(
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
         seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes, soft)
-        waves = steering(rows, images(rows.static_ends(scene.transmitter), planes, scene.words))
+        waves = steering(rows, images(rows.static_ends(scene.transmitter), planes, scene.sequences))
         waves = waves * torch.polar(torch.ones(()), phase)
         deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
         cost = residual.nll(seen, log_amplitude, waves) + deviation.square().sum() / 2
-        cost = cost + phase_prior.cost(phase, scene.words)
+        cost = cost + phase_prior.cost(phase, scene.sequences)
         if cost.item() < lowest:
             lowest, best = cost.item(), [v.detach().clone() for v in values]
         if step == steps:
@@ -96,7 +96,7 @@ def descend(
         optimizer.zero_grad()
         cost.backward()
         held = residual.phased.scene
-        for value, count in ((planes, len(held.planes)), (phase, len(held.words))):
+        for value, count in ((planes, len(held.planes)), (phase, len(held.sequences))):
             if value.grad is not None:
                 value.grad[:count] = 0
         optimizer.step()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -22,7 +22,7 @@ from gsparc.multipath.gp_likelihood import JITTER, Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Word, all_words
+from gsparc.physics.mirror_planes import Reflections, all_sequences
 from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
@@ -32,60 +32,41 @@ INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the pre
 MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
 SAME_FACE_M = 0.03  # [m]; a box face that has moved less is not tried again as a mirror
 NEAR_WALL_M = 0.25  # [m]; faces closer to the end of the room are not tried as mirrors
+EPOCHS = 6  # rounds of everything, softer edges first
+SOFT_EDGES = (0.08, 0.05, 0.03)  # [m] width of edges in each epoch, the last for all that follow
+STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
+PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
+MIN_GAIN, MIRROR_SCORE = 12.0, 8.0  # least [nats] of a candidate, predicted; of a mirror, offset searched
+BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
+BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
-
-
-@dataclass(frozen=True)
-class ClutterSearch:
-    """Thresholds and effort of the clutter search.
-
-    A piece must gain half the logarithm of the number of real observations per parameter:
-    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
-
-    Attributes:
-        epochs: rounds of everything, softer edges first. progress: nats; an epoch that gains fewer is the
-        last. min_gain: least predicted gain of a candidate [nats]; `mirror_score`: of a mirror after its
-        offset search. boxes, mirrors, words: most new ones in an epoch. beyond: margin of clutter around the
-        receivers' box [m]. soft: width of edges in each epoch [m], the last for all that follow. steps: of
-        the descent on everything but clutter, at the end of each epoch.
-    """
-
-    epochs: int = 6
-    progress: float = 10.0
-    min_gain: float = 12.0
-    mirror_score: float = 8.0
-    boxes: int = 4
-    mirrors: int = 5
-    words: int = 6
-    beyond: float = 0.15
-    soft: tuple[float, ...] = (0.08, 0.05, 0.03)
-    steps: int = 8
 
 
 def find_clutter(
     rows: Rows,
     phased: PhasedScene,
     generator: torch.Generator,
-    settings: ClutterSearch = ClutterSearch(),
     late: Callable[[], bool] = lambda: False,
     noise_floor: float = JITTER,
 ) -> PhasedScene:
     """The phased scene with clutter, or unchanged when the likelihood gains too little.
 
+    A piece must gain half the logarithm of the number of real observations per parameter:
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
+
     Args:
         rows: of one output, as many as in a search.
         phased: from the final refinement of a search.
         generator: of the candidates.
-        settings: thresholds and effort.
         late: asked again and again; nothing new is tried when it says so.
         noise_floor: known variance of the noise, in units of the rows' power.
     """
     # The kernel learned without clutter explains it: reset
     bare, quadrature = replace(phased.scene, visibility=INITIAL_KERNEL), min(phased.quadrature, QUADRATURE)
     fresh = replace(phased, scene=bare, quadrature=quadrature)
-    found = _ClutterSearcher(rows, fresh, generator, settings, noise_floor).run(late)
+    found = _ClutterSearcher(rows, fresh, generator, noise_floor).run(late)
     before, after = (PhasedPosterior(rows, each, noise_floor).factor.nll for each in (phased, found))
-    return found if after < before - settings.progress else phased
+    return found if after < before - PROGRESS else phased
 
 
 class _ClutterSearcher:
@@ -94,14 +75,13 @@ class _ClutterSearcher:
         rows: Rows,
         phased: PhasedScene,
         generator: torch.Generator,
-        settings: ClutterSearch,
         noise_floor: float,
     ) -> None:
-        self.rows, self.generator, self.settings = rows, generator, settings
+        self.rows, self.generator = rows, generator
         self.noise_floor, self.wavelength = noise_floor, LIGHT / float(rows.frequency.mean())
         self.parameter_cost = math.log(2 * len(rows)) / 2  # cost of a parameter [nats]
         self.tried: list[SmallMirror] = []
-        ends = torch.stack([rows.position.amin(0) - settings.beyond, rows.position.amax(0) + settings.beyond])
+        ends = torch.stack([rows.position.amin(0) - BEYOND, rows.position.amax(0) + BEYOND])
         self.room = ends.float()
         self._refactor(phased)
 
@@ -153,15 +133,15 @@ class _ClutterSearcher:
 
     # ---- the loop ----
     def run(self, late: Callable[[], bool]) -> PhasedScene:
-        s, start = self.settings, self.nll
+        start = self.nll
         best = start, self.phased
-        for epoch in range(s.epochs):
+        for epoch in range(EPOCHS):
             before = self.nll
-            for move in (self._mirrors, self._patches, self._boxes, self._words):
+            for move in (self._mirrors, self._patches, self._boxes, self._sequences):
                 if not late():
                     move()
             if not late():
-                self._descend_soft(s.soft[min(epoch, len(s.soft) - 1)])
+                self._descend_soft(SOFT_EDGES[min(epoch, len(SOFT_EDGES) - 1)])
                 self._drop()
                 self._refactor(self.phased)
             if not late():
@@ -169,19 +149,24 @@ class _ClutterSearcher:
                 self._descend(10)
                 self._drop()
                 self._refactor(self.phased)
-                self._drop_words()
-                words, prior = self.scene.words, self.phase_prior
+                self._drop_sequences()
+                sequences, prior = self.scene.sequences, self.phase_prior
                 found = refine_phase.refine(
-                    self.rows, self.phased, s.steps, self.noise_floor, partial(prior.cost, words=words)
+                    self.rows,
+                    self.phased,
+                    STEPS,
+                    self.noise_floor,
+                    partial(prior.cost, sequences=sequences),
                 )
                 self._refactor(found)
             best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
                 "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
-                epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches), len(self.scene.words),
-                self.nll, start, math.exp(self.scene.log_noise), self.scene.visibility,
+                epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches),
+                len(self.scene.sequences), self.nll, start, math.exp(self.scene.log_noise),
+                self.scene.visibility,
             )  # fmt: skip
-            if late() or self.nll > before - s.progress:
+            if late() or self.nll > before - PROGRESS:
                 break
         return best[1]
 
@@ -195,23 +180,23 @@ class _ClutterSearcher:
             self._descend(10)
 
     def _mirrors(self) -> None:
-        s, scene = self.settings, self.scene
+        scene = self.scene
         found = find_mirrors(
             self.rows, self._scorer(), scene.transmitter, scene.planes,
-            walls(scene.planes, scene.words), self.room, 2 * s.mirrors,
+            walls(scene.planes, scene.sequences), self.room, 2 * MIRRORS,
         )  # fmt: skip
-        found = [mirror for mirror in found if mirror.score > s.min_gain]
+        found = [mirror for mirror in found if mirror.score > MIN_GAIN]
         scorer = self._scorer()
-        placed = [self._placed(mirror, scorer) for mirror in [*found, *self._faces()]]
+        placed = [self._placed(mirror, scorer) for mirror in [*found, *self._mirrors_on_boxes()]]
         added: list[SmallMirror] = []
         for mirror in sorted(placed, key=lambda m: -m.score):
-            if len(added) == s.mirrors or mirror.score < s.mirror_score:
+            if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
                 break
             double = any(same_mirror(mirror, other, self.wavelength) for other in added)
             if not double and self._add_mirror(mirror):
                 added.append(mirror)
 
-    def _faces(self) -> list[SmallMirror]:
+    def _mirrors_on_boxes(self) -> list[SmallMirror]:
         """Faces of boxes that are not on floor or walls, as mirrors."""
         found = []
         for box in self.scene.clutter.boxes:
@@ -237,62 +222,68 @@ class _ClutterSearcher:
         moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
         planes = mirror.plane.repeat(len(moves), 1)
         planes[:, 3] += moves
-        scene, known = self.scene, walls(self.scene.planes, self.scene.words)
+        scene, known = self.scene, walls(self.scene.planes, self.scene.sequences)
         first = len(scene.planes)
-        words = [word for i in range(len(moves)) for word in _words_over(first + i, known)]
-        trial = replace(scene, planes=torch.cat([scene.planes, planes]), words=tuple(words))
+        sequences = [sequence for i in range(len(moves)) for sequence in _sequences_over(first + i, known)]
+        trial = replace(scene, planes=torch.cat([scene.planes, planes]), sequences=tuple(sequences))
         paths = trial.unfolding.paths(self.rows.position)
         inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
-        inside = torch.where(paths.letter >= first, inside, 1.0).prod(-1)
+        inside = torch.where(paths.plane >= first, inside, 1.0).prod(-1)
         seen = visible_share(paths, scene.clutter, trial.planes) * inside * paths.valid
-        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], trial.words))
+        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], trial.sequences))
         scores = scorer.score(trial.unobstructed(self.rows) * seen.T * turn)
         total = scores.view(len(moves), -1).sum(1)
         best = int(total.argmax())
         return SmallMirror(planes[best], mirror.patch, float(total[best]))
 
     def _add_mirror(self, mirror: SmallMirror) -> bool:
-        """Try a small mirror with its best words; a wide one as an infinite wall first."""
+        """Try a small mirror with its best sequences; a wide one as an infinite wall first."""
         scene, number = self.scene, len(self.scene.planes)
-        words = _words_over(number, walls(scene.planes, scene.words))
+        sequences = _sequences_over(number, walls(scene.planes, scene.sequences))
         endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
         trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
-        if self._wide(mirror) and self._add(endless, words, 1.5, WALL * self.parameter_cost, len(words)):
+        if self._wide(mirror) and self._add(
+            endless, sequences, 1.5, WALL * self.parameter_cost, len(sequences)
+        ):
             return True
-        return self._add(trial, words, 1.5, MIRROR * self.parameter_cost, len(words))
+        return self._add(trial, sequences, 1.5, MIRROR * self.parameter_cost, len(sequences))
 
     def _wide(self, mirror: SmallMirror) -> bool:
         """Whether a mirror covers most of the room."""
         ends = self.room @ tangents(mirror.plane).T
         return bool((mirror.patch[2:] - mirror.patch[:2] > 0.7 * (ends[1] - ends[0]).abs()).all())
 
-    def _word_scores(
-        self, scene: Scene, words: list[Word], scorer: CandidateScorer
+    def _sequence_scores(
+        self, scene: Scene, sequences: list[Reflections], scorer: CandidateScorer
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of words over a scene's planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
-        candidates = replace(scene, words=tuple(words))
+        """Of sequences over planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
+        candidates = replace(scene, sequences=tuple(sequences))
         paths = candidates.unfolding.paths(self.rows.position)
         seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
         waves = candidates.unobstructed(self.rows) * seen.T
         if self.phase_prior.concentration < MIN_CONCENTRATION:
             return *scorer.score_waves(waves), candidates.sources
-        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], candidates.words))
+        turn = torch.polar(
+            torch.ones(()), self.phase_prior.expected(self.phased.phase[0], candidates.sequences)
+        )
         scores, gains = scorer.score_positive(waves * turn)
         return scores, gains * turn, candidates.sources
 
-    def _add(self, scene: Scene, words: list[Word], min_score: float, least: float, most: int) -> bool:
-        """Try the words of at least `min_score` nats, on a scene that may have more planes and patches."""
-        # new patches occlude present words, too
+    def _add(
+        self, scene: Scene, sequences: list[Reflections], min_score: float, least: float, most: int
+    ) -> bool:
+        """Try sequences of at least `min_score` nats, on a scene that may have more planes and patches."""
+        # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
-        scores, gains, sources = self._word_scores(scene, words, scorer)
+        scores, gains, sources = self._sequence_scores(scene, sequences, scorer)
         clear = torch.cdist(sources, self.scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(sources, scores * clear, 0.5 * self.wavelength, most, min_score)
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
         phase = torch.cat([self.phased.phase, gains[chosen].angle()])
-        return self._try(scene.with_words([words[i] for i in chosen], strong), least, phase)
+        return self._try(scene.with_sequences([sequences[i] for i in chosen], strong), least, phase)
 
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
@@ -300,14 +291,14 @@ class _ClutterSearcher:
         visible_waves, found = self.waves * self.visible.T, []
         for number in set(range(len(scene.planes))) - set(scene.clutter.plane):
             patch, score = find_patch(
-                scorer, self.paths, scene.words, number, scene.planes[number], visible_waves, self.room,
+                scorer, self.paths, scene.sequences, number, scene.planes[number], visible_waves, self.room,
                 self.generator,
             )  # fmt: skip
             found.append((score, number, patch))
         for score, number, patch in sorted(found, key=lambda f: -f[0]):
-            if score < self.settings.min_gain:
+            if score < MIN_GAIN:
                 break
-            own = [k for k, word in enumerate(self.scene.words) if number in word]
+            own = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
             louder = self.scene.log_amplitude.clone()
             louder[own] = louder[own].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.with_patch(patch, number)
@@ -315,27 +306,29 @@ class _ClutterSearcher:
             self._try(trial, PATCH * self.parameter_cost, exact=True)
 
     def _boxes(self) -> None:
-        for _ in range(self.settings.boxes):
+        for _ in range(BOXES):
             box, score = find_box(
                 self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator
             )
-            if score < self.settings.min_gain:
+            if score < MIN_GAIN:
                 break
             clutter = self.scene.clutter.with_box(box)
             if not self._try(replace(self.scene, clutter=clutter), BOX * self.parameter_cost):
                 break
 
-    def _words(self) -> None:
-        """Try more words over the present planes."""
-        scene, known = self.scene, set(self.scene.words)
-        letters = list(range(len(scene.planes)))
-        longer = [(*w, i) for w in scene.words if 0 < len(w) < 3 for i in letters if w[-1] != i]
-        words = [w for w in dict.fromkeys(all_words(letters, 2) + longer) if w not in known]
-        if not words:
+    def _sequences(self) -> None:
+        """Try more sequences over the present planes."""
+        scene, known = self.scene, set(self.scene.sequences)
+        indices = list(range(len(scene.planes)))
+        longer = [(*w, i) for w in scene.sequences if 0 < len(w) < 3 for i in indices if w[-1] != i]
+        sequences = [w for w in dict.fromkeys(all_sequences(indices, 2) + longer) if w not in known]
+        if not sequences:
             return
-        scores, _ = self._scorer().score_waves(replace(scene, words=tuple(words)).unobstructed(self.rows))
-        best = scores.topk(min(60, len(words))).indices.tolist()
-        self._add(scene, [words[i] for i in best], 6.0, self.parameter_cost, self.settings.words)
+        scores, _ = self._scorer().score_waves(
+            replace(scene, sequences=tuple(sequences)).unobstructed(self.rows)
+        )
+        best = scores.topk(min(60, len(sequences))).indices.tolist()
+        self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, SEQUENCES)
 
     def _relocate_boxes(self) -> None:
         """Search for every box anew, given the others."""
@@ -365,7 +358,7 @@ class _ClutterSearcher:
                 self._set_scene(before)
                 number += 1
 
-    def _drop_words(self) -> None:
+    def _drop_sequences(self) -> None:
         """Remove sources whose constant and varying parts both gain too little."""
         gains = self.residual.nats_per_source(self.visible, self.scene.log_amplitude)
         kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
@@ -378,6 +371,6 @@ class _ClutterSearcher:
                 self._set_scene(before)
 
 
-def _words_over(number: int, known: list[int]) -> list[Word]:
+def _sequences_over(number: int, known: list[int]) -> list[Reflections]:
     """Words over a plane: itself, after and before each wall."""
     return [(number,), *((wall, number) for wall in known), *((number, wall) for wall in known)]

@@ -19,7 +19,7 @@ from gsparc.multipath.clutter.refine import ReflectionPhasePrior
 from gsparc.multipath.ensemble import SEARCH_END, compact, left_out_error
 from gsparc.multipath.gp_likelihood import Scene, steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
-from gsparc.multipath.known.images import affordable, hiding, start_amplitudes, visible_words
+from gsparc.multipath.known.images import affordable, hiding, start_amplitudes, visible_sequences
 from gsparc.multipath.known.mirrors import MOST_PATCHES, Mirrors
 from gsparc.multipath.phased_gp import PhasedScene
 from gsparc.multipath.refine import refine
@@ -27,7 +27,7 @@ from gsparc.multipath.rows import Rows
 from gsparc.multipath.search import SearchSettings
 from gsparc.multipath.search_cache import Member, SearchCache
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Word
+from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
@@ -65,17 +65,18 @@ class KnownWallsGP(ImageSourceGP):
         """The images in the walls, refined; no search."""
         rows, floor, over = row_sets[0], self.noise_floor, partial(budget.over, SEARCH_END)
         start = self._scene(rows, settings, clutter)
-        near = partial(walls_cost, start.planes, start.words)
+        near = partial(walls_cost, start.planes, start.sequences)
         scene = refine(rows, start, STEPS[0], floor, over, near)
         phased = PhasedScene.of(rows, scene, QUADRATURE)
         phased = refine_phase.learn_visibility(rows, phased, STEPS[1], settings.visibility, floor, over)
         prior = ReflectionPhasePrior.of(phased)
-        cost = partial(prior.cost, words=phased.scene.words)
+        cost = partial(prior.cost, sequences=phased.scene.sequences)
         phased = refine_phase.refine(rows, phased, STEPS[2], floor, cost, over, near)
         error = left_out_error(rows, phased, floor)
         log.info(
-            "known walls: %d sources over %d planes, error %.3f", len(scene.words), len(scene.planes), error
-        )
+            "known walls: %d sources over %d planes, error %.3f",
+            len(scene.sequences), len(scene.planes), error,
+        )  # fmt: skip
         return [Member(phased, error)]
 
     def _scene(self, rows: Rows, settings: SearchSettings, clutter: bool) -> Scene:
@@ -87,20 +88,20 @@ class KnownWallsGP(ImageSourceGP):
             log.info(
                 "the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES
             )
-        letters = mirrors.mirroring(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
+        indices = mirrors.mirroring(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
         order = settings.order
-        if order > 1 and affordable(len(letters), order) < len(letters):
-            few = affordable(len(letters), order)
-            log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(letters))
+        if order > 1 and affordable(len(indices), order) < len(indices):
+            few = affordable(len(indices), order)
+            log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
         hidden = clutter and compact(rows)
-        words = visible_words(
-            mirrors, letters, transmitter, rows.position, order, settings.max_sources, hidden
+        sequences = visible_sequences(
+            mirrors, indices, transmitter, rows.position, order, settings.max_sources, hidden
         )
-        held = hiding(mirrors, words, transmitter, rows.position) if hidden else Clutter.none()
+        held = hiding(mirrors, sequences, transmitter, rows.position) if hidden else Clutter.none()
         direct = self._direct(rows, transmitter)
         bare = Scene(
-            transmitter, mirrors.planes, words, start_amplitudes(words, direct), math.log(settings.noise),
-            settings.visibility,
+            transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
+            math.log(settings.noise), settings.visibility,
         )  # fmt: skip
         return _without_idle(replace(bare, clutter=held))
 
@@ -111,12 +112,14 @@ class KnownWallsGP(ImageSourceGP):
         return float((waves.mH @ rows.target).abs().mean() / waves.abs().square().sum())
 
 
-def walls_cost(known: Tensor, words: tuple[Word, ...], planes: Tensor, log_amplitude: Tensor) -> Tensor:
+def walls_cost(
+    known: Tensor, sequences: tuple[Reflections, ...], planes: Tensor, log_amplitude: Tensor
+) -> Tensor:
     """Negative log prior [nats]: planes (P, 4) about the known ones, amplitudes (K,) about a law."""
     normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
     moved = (planes[:, 3] - known[:, 3]).square().sum() / MOVED_M**2
     turned = (normal - known[:, :3]).square().sum() / TURNED**2
-    order = torch.tensor([float(len(word)) for word in words])
+    order = torch.tensor([float(len(sequence)) for sequence in sequences])
     law = torch.stack([torch.ones_like(order), order], 1)
     left = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)
     return (moved + turned + left.square().sum() / LOUDER**2) / 2
@@ -124,7 +127,7 @@ def walls_cost(known: Tensor, words: tuple[Word, ...], planes: Tensor, log_ampli
 
 def _without_idle(scene: Scene) -> Scene:
     """The same without planes that neither mirror nor hide."""
-    used = sorted({letter for word in scene.words for letter in word} | set(scene.clutter.plane))
+    used = sorted({index for sequence in scene.sequences for index in sequence} | set(scene.clutter.plane))
     new = {old: i for i, old in enumerate(used)}
-    words = tuple(tuple(new[letter] for letter in word) for word in scene.words)
-    return replace(scene, planes=scene.planes[used], words=words, clutter=scene.clutter.renamed(new))
+    sequences = tuple(tuple(new[index] for index in sequence) for sequence in scene.sequences)
+    return replace(scene, planes=scene.planes[used], sequences=sequences, clutter=scene.clutter.renamed(new))

@@ -43,18 +43,18 @@ class Mirrors:
         grouped = _by_plane(faces)
         planes = torch.from_numpy(np.array([plane for plane, _ in grouped]).reshape(-1, 4))
         patches: list[Tensor] = []
-        letters: list[int] = []
+        indices: list[int] = []
         for number, (_, members) in enumerate(grouped):
             along = tangents(planes[number]).double()
             for part in _touching(members):
                 ends = torch.from_numpy(part) @ along.T
                 patches.append(torch.cat([ends.amin(0), ends.amax(0)]))
-                letters.append(number)
+                indices.append(number)
         found = torch.stack(patches) if patches else torch.zeros(0, 4, dtype=torch.float64)
         size = (found[:, 2:] - found[:, :2]).prod(1)
         kept = size.topk(min(MOST_PATCHES, len(size))).indices.sort().values.tolist()
         boxes = torch.from_numpy((walls.boxes - origin).reshape(-1, 6)).float()
-        plane = tuple(letters[i] for i in kept)
+        plane = tuple(indices[i] for i in kept)
         return Mirrors(planes, Clutter(boxes, found[kept].float(), plane), len(found) - len(kept))
 
     def mirroring(self, smallest: float) -> list[int]:

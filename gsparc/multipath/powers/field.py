@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, choice, number, setting, switch, whole
+from gsparc.data.limits import Checked, setting, switch, whole
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
@@ -30,8 +30,6 @@ from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
 from gsparc.methods.power_process import (
     CHOSEN_ON,
     LAW_NEEDS,
-    MEANS,
-    MeanName,
     Process,
     conditioned,
     draw,
@@ -56,6 +54,7 @@ LEAST_CHOSEN_ON = 300
 SEEK_WITHIN = 0.35  # of a budget: seeking, and trying on groups, takes several times what the process took
 FOLDS = 5
 MOST_ASKED = 4_000  # rows of a fold that are predicted
+SURE = 1.0  # standard errors that the gain of Gaussians at groups of places left out must exceed
 RIDGE_STEPS = 5  # of the variance of what is left
 LEAST = 40  # rows that were heard, for seeking Gaussians
 LEAST_KNOWN = 12  # the same, for asking whether known ones pay
@@ -67,15 +66,11 @@ class PowerSettings(Checked):
 
     Attributes:
         most: Gaussians; 0 leaves the plain process.
-        mean: of the plain process: `constant`, `distance`, or `auto`, the likelier.
         fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
-        sure: standard errors that the gain of Gaussians at groups of places left out must exceed.
     """
 
     most: int = setting(12, whole(0))
-    mean: MeanName = setting("auto", choice(*MEANS))
     fringes: bool = setting(True, switch())
-    sure: float = setting(1.0, number(0))
 
 
 class PowerField(ConditionalField):
@@ -363,7 +358,7 @@ def initialise(
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
-    plain, notes = fit_powers(seen, data.site, settings.mean, seed, rows_within(budget))
+    plain, notes = fit_powers(seen, data.site, "auto", seed, rows_within(budget))
     bare = PowerField(data.site, plain.trend, plain.kernel, Blockers.none(), None, seed)
     if (
         settings.fringes
@@ -394,7 +389,7 @@ def initialise(
         before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
         said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"
         said += f" (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
-        if not gain.exceeds(settings.sure if known is None else -settings.sure):
+        if not gain.exceeds(SURE if known is None else -SURE):
             return bare, (*notes, f"no Gaussians; {said}")
     trend, kernel, more = found
     assert trend.blockers is not None
@@ -457,7 +452,7 @@ def gain_of_groups(
         if len(asked) == 0 or int((~learned.silent).sum()) < least:
             continue
         queries, measured = rows.places[asked], rows.decibels[asked]
-        process, _ = fit_powers(learned, site, settings.mean, seed, rows_within(budget))
+        process, _ = fit_powers(learned, site, "auto", seed, rows_within(budget))
         without = process.mean_and_variance(queries)[0] - measured
         found = shadowed(learned, site, settings, seed, budget, known)
         if found is not None:

@@ -110,7 +110,7 @@ class Fringes:
         """The same at rows (n,) by those solutions that never saw them or their surroundings."""
         at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
         fold = np.where(self.rows[at] == rows, self.fold[at], -1)
-        mean = _blindly(self.solutions(places).numpy(), fold, self.blind)
+        mean = _held_out_mean(self.solutions(places).numpy(), fold, self.blind)
         return self._shared(decibels, torch.from_numpy(mean), distance)
 
     def _shared(self, decibels: Tensor, mean: Tensor, distance: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -210,7 +210,7 @@ def find_fringes(
     return fringes, f"{said} between rows and a block away, the process the rest{drawn}"
 
 
-def _blindly(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
+def _held_out_mean(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
     """Means (n,) of powers (n, S) over the solutions blind to each row's fold; over all where that is -1."""
     counts = _counted(fold, blind)
     return (powers * counts).sum(1) / counts.sum(1)
@@ -220,7 +220,7 @@ def _counted(fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
     return (fold[:, None] < 0) | (fold[:, None] == blind)
 
 
-def _luck(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
+def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
     """Squared error (n,) that the mean of blind solutions has beyond that of as many as there are."""
     counts = _counted(fold, blind)
     number, every = counts.sum(1), len(blind)
@@ -246,29 +246,29 @@ def _blend(
         part, rest = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
         error[part] = -np.linalg.solve(inverse[np.ix_(part, part)], process.weights[part])
         distance[part] = cKDTree(rows.places[rest]).query(rows.places[part])[0]
-    towards = _blindly(powers, fold, blind) - rows.decibels - error
-    luck = _luck(powers, fold, blind)
+    towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
+    excess = _excess_variance(powers, fold, blind)
     shares, left = [], []
     for chosen in (probes, ~probes):
-        share = _share(error[chosen], towards[chosen], luck[chosen], group[chosen])
-        both = float((((error + share * towards) ** 2 - share**2 * luck)[chosen]).mean())
+        share = _share(error[chosen], towards[chosen], excess[chosen], group[chosen])
+        both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
         shares.append(share)
         left.append(both / max(float((error[chosen] ** 2).mean()), 1e-12))
     apart = ~probes
-    squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * luck
+    squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * excess
     gain = compared(squares[apart], error[apart] ** 2, group[apart])
     middle = (float(np.median(distance[probes])), float(np.median(distance[apart])))
     return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
 
 
-def _share(error: np.ndarray, towards: np.ndarray, luck: np.ndarray, group: np.ndarray) -> float:
+def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, group: np.ndarray) -> float:
     """Of what leads from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
 
     Rows of one group err together and count as one.
     """
     alike = len(group) / len(np.unique(group))
     noise = alike * max(float((error**2).mean()), 1e-12)
-    square = max(float(towards @ towards - luck.sum()), 0.0)
+    square = max(float(towards @ towards - excess.sum()), 0.0)
     certain = 1 / SPREAD**2
     return float(
         np.clip((-(towards @ error) / noise + BEFORE * certain) / (square / noise + certain), 0.0, 1.0)

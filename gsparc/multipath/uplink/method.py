@@ -109,11 +109,11 @@ class UplinkField(UplinkMethod):
         """The sources of snapshots (B, U, L): directions, delays, gains."""
         return self._search(uplink, noise).sources
 
-    def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """See `UplinkMethod.listen`; the variance is the expected squared error per entry."""
+    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+        """See `UplinkMethod.from_uplink`; the variance is the expected squared error per entry."""
         return self._predict_at(uplink, noise, self._downlink)
 
-    def listen_at(
+    def from_uplink_at(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
     ) -> Prediction:
         """The same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
-from gsparc.multipath.waves.covariance import Shape, Values, direct_wave, prior, source_waves
+from gsparc.multipath.waves.covariance import Shape, Values, direct_wave, image_waves, prior
 from gsparc.physics.mirror_planes import images
 
 
@@ -20,12 +20,12 @@ class Common:
     Attributes:
         gain: (J,) complex128 [m], the ends' mean times distances to the places' middle; of images the smaller
             the less sure it is: small where phases are unrelated.
-        told: (J,) [m^2] what knowing it takes from the power.
+        explained: (J,) [m^2] what knowing it takes from the power.
         level: [m^2] power that covariances are in units of.
     """
 
     gain: Tensor
-    told: Tensor
+    explained: Tensor
     level: float
 
     @staticmethod
@@ -42,17 +42,17 @@ class Common:
         steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
         spread = (whole - steady) / count
         sure = steady / (steady + spread).clamp_min(1e-300)
-        told = steady * sure
+        explained = steady * sure
         # The direct wave stays: unsure as its gain may be, its shape is right.
-        sure[:1], told[:1] = 1.0, steady[:1] - spread[:1]
-        return Common(gain * sure, told, sum(levels) / count)
+        sure[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
+        return Common(gain * sure, explained, sum(levels) / count)
 
     def at(self, shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
         before = self.level / _away(shape, values, slot) ** 2 * prior(shape, values, slot, places)
         waves, _, away = _waves(shape, values, slot, places)
         waves = waves / away[:, None]
-        after = before - self.told @ waves.abs().square()
+        after = before - self.explained @ waves.abs().square()
         return self.gain @ waves, after.clamp_min(0), before
 
 
@@ -62,10 +62,10 @@ def _waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Te
         none = places.new_zeros(0)
         return places.new_zeros(0, len(places), dtype=torch.complex128), none, none
     end = slot.end + values.offset
-    placed = torch.cat([end[None], images(end, values.planes, shape.words)])
+    placed = torch.cat([end[None], images(end, values.planes, shape.sequences)])
     away = torch.linalg.vector_norm(placed - shape.middle, dim=-1)
-    mirrors = source_waves(shape, values, slot, places)[shape.sources :]
-    power = [shape.of("direct", values.power), shape.of("source", values.power)[shape.sources :]]
+    mirrors = image_waves(shape, values, slot, places)
+    power = [shape.of("direct", values.power), shape.of("source", values.power)]
     return torch.cat([direct_wave(shape, values, slot, places)[None], mirrors]), torch.cat(power), away
 
 

@@ -1,11 +1,11 @@
-"""Covariance of channels at two sets of places: leakage, direct wave, sources and the diffuse field.
+"""Covariance of channels at two sets of places: leakage, direct wave, its images and the diffuse field.
 
     C = p_0 E sinc(k d) + E sum_b p_b w_b V_b(d) + R (p_c + p_d a a^H + sum_n s_n b_n b_n^H)
         + S (p_g a a^H + sum_n t_n b_n b_n^H)
 
 with E the Matern-3/2 envelope, V_b the correlation of waves from one direction, w_b a factor by its angle to
-the static end, 1 where there is one end, a and b_n the spherical waves of the static end and of sources (of
-given places, and images of the end in mirror planes that all ends share), S a squared exponential of gains
+the static end, 1 where there is one end, a and b_n the spherical waves of the static end and of its images in
+mirror planes that all ends share, S a squared exponential of gains
 that vary over places, and R one that is so long that it only ends far outside.
 Noise, and what is correlated over the order of rows, is training's alone.
 """
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
 from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth, steering
-from gsparc.physics.mirror_planes import Word, images
+from gsparc.physics.mirror_planes import Reflections, images
 
 FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
 DRIFT_FIELD = 0.7  # share of the drift that is one of the diffuse field; the rest is of all places alike
@@ -40,10 +40,9 @@ class Shape:
         angles: (M, 3) float64, where waves of unequal power come from; none: from everywhere alike.
         concentration: of each.
         constant, direct, correlated: whether there is leakage, a direct wave, noise correlated over rows.
-        sources: how many of given places.
         middle: (3,) float64 [m] of the places learned from, where waves have their nominal power.
         reach: length of what is fixed [m].
-        words: images of the static end in `Values.planes`; they count as sources after those of given places.
+        sequences: images of the static end in `Values.planes`.
     """
 
     angles: Tensor
@@ -51,15 +50,14 @@ class Shape:
     constant: bool
     direct: bool
     correlated: bool
-    sources: int
     middle: Tensor
     reach: float
-    words: tuple[Word, ...] = ()
+    sequences: tuple[Reflections, ...] = ()
 
     @property
     def count(self) -> int:
-        """Sources and images."""
-        return self.sources + len(self.words)
+        """Images."""
+        return len(self.sequences)
 
     @property
     def is_real(self) -> bool:
@@ -105,7 +103,6 @@ class Values:
         power: (P,) float64, see `Shape.names`; relative to each group's scale.
         envelope, gain: () float64 lengths [m] of the diffuse field's envelope and of gains.
         offset: (3,) float64 [m] of static ends from where they are said to be.
-        sources: (N, 3) float64 [m], local.
         towards: (J,) float64 logarithms of factors of directions' powers, at angles to the static end from 0
             to pi; none: directions are those of the room alone.
         planes: (W, 4) float64 mirror planes that all static ends share, see `physics.mirror_planes`.
@@ -115,7 +112,6 @@ class Values:
     envelope: Tensor
     gain: Tensor
     offset: Tensor
-    sources: Tensor
     towards: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     planes: Tensor = field(default_factory=lambda: torch.zeros(0, 4, dtype=torch.float64))
 
@@ -126,36 +122,35 @@ def direct_wave(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Ten
     return steering(places, end, slot.wavenumber, torch.linalg.vector_norm(end - shape.middle))
 
 
-def source_waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
-    """(N, n) complex128 of all sources and images, each of size 1 in the middle."""
+def image_waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+    """(W, n) complex128 of all images, each of size 1 in the middle."""
     if not shape.count:
         return places.new_zeros(0, len(places), dtype=torch.complex128)
     end = slot.end + values.offset
-    given = torch.cat([values.sources, images(end, values.planes, shape.words)])
+    given = images(end, values.planes, shape.sequences)
     reference = torch.linalg.vector_norm(given - shape.middle, dim=-1)
     waves = [
         steering(places, source, slot.wavenumber, away) for source, away in zip(given, reference, strict=True)
     ]
-    seen = mirrored(values.planes, shape.words, end, shape.middle)
-    return torch.stack(waves) * torch.cat([seen.new_ones(shape.sources), seen])[:, None]
+    return torch.stack(waves) * mirrored(values.planes, shape.sequences, end, shape.middle)[:, None]
 
 
-def mirrored(planes: Tensor, words: Sequence[Word], end: Tensor, middle: Tensor) -> Tensor:
-    """1 for words (W,) whose planes all have the end (3,) and the places' middle (3,) on one side, else 0."""
+def mirrored(planes: Tensor, sequences: Sequence[Reflections], end: Tensor, middle: Tensor) -> Tensor:
+    """1 for sequences (W,) whose planes all have end (3,) and the places' middle (3,) on one side, else 0."""
     sides = planes[:, :3] @ torch.stack([end, middle], 1) - planes[:, 3:]
     alike = (sides[:, 0] * sides[:, 1] > 0).tolist()
-    return torch.tensor([float(all(alike[letter] for letter in word)) for word in words], dtype=torch.float64)
-
-
-def diffuse(shape: Shape, values: Values, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
-    """The diffuse field's covariance (n, m) complex128 of places a (n, 3) and b (m, 3) [m], as of any end."""
-    return diffuse_of(shape, values, wavenumber, shape.of("direction", values.power)[None], a, b)[0]
+    return torch.tensor(
+        [float(all(alike[index] for index in sequence)) for sequence in sequences], dtype=torch.float64
+    )
 
 
 def diffuse_of(
     shape: Shape, values: Values, wavenumber: float, powers: Tensor, a: Tensor, b: Tensor
 ) -> Tensor:
-    """The same (T, n, m) of T static ends, by their powers (T, M) of directions."""
+    """The diffuse field's covariance (T, n, m) complex128 of T static ends, places a (n, 3) and b (m, 3) [m].
+
+    `powers` (T, M) are the ends' of directions.
+    """
     distance = apart(a, b)
     found = shape.of("isotropic", values.power)[0] * isotropic(distance, wavenumber)
     found = found[None].expand(len(powers), *distance.shape)
@@ -220,16 +215,16 @@ def directions(
 
 
 def explained(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
-    """The sources' share (n, m) of the covariance."""
+    """The images' share (n, m) of the covariance."""
     distance = apart(a, b)
-    before, after = source_waves(shape, values, slot, a), source_waves(shape, values, slot, b)
+    before, after = image_waves(shape, values, slot, a), image_waves(shape, values, slot, b)
     fixed, varying = shape.of("source", values.power), shape.of("source_smooth", values.power)
     return _mixed(before, after, fixed) * smooth(distance, shape.reach) + _mixed(
         before, after, varying
     ) * smooth(distance, values.gain)
 
 
-def told(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
+def specular(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
     """Covariance (n, m) of all but the diffuse field."""
     distance = apart(a, b)
     found = torch.zeros(len(a), len(b), dtype=torch.complex128)
@@ -252,7 +247,7 @@ def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
         level = direct_wave(shape, values, slot, places).abs().square()
         found = found + level * (shape.of("direct", power) + shape.of("direct_smooth", power))
     if shape.count:
-        level = source_waves(shape, values, slot, places).abs().square()
+        level = image_waves(shape, values, slot, places).abs().square()
         found = found + (shape.of("source", power) + shape.of("source_smooth", power)) @ level
     return found.expand(len(places))
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
-from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, temporal, told
+from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, specular, temporal
 
 STRETCH = 400  # rows looked at
 COLUMNS = 3  # groups looked at
@@ -106,7 +106,7 @@ def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[
     """Covariances (n, n) of the groups' signals."""
     fields = diffuse_fields(groups, shape, values)
     return [
-        field + told(shape, values, group.slot, group.places, group.places)
+        field + specular(shape, values, group.slot, group.places, group.places)
         for field, group in zip(fields, groups, strict=True)
     ]
 

@@ -27,7 +27,7 @@ from gsparc.multipath.waves.covariance import (
     apart,
     direct_wave,
     directions,
-    source_waves,
+    image_waves,
     ways,
 )
 from gsparc.multipath.waves.kernels import envelope, isotropic, smooth
@@ -82,7 +82,7 @@ class Compressed:
         group: whose, with targets of unit mean square.
         basis: (n, r) float64 of orthonormal columns.
         room: (1 + M, r, r) complex128, the isotropic field and those of directions.
-        terms: of leakage, direct wave and sources, in the order of `Shape.names`.
+        terms: of leakage, direct wave and images, in the order of `Shape.names`.
         ways: (M, J), see `covariance.ways`; J is 0 where directions are of the room alone.
         target: (r, D) complex128.
         rest: sum of squares outside the basis.
@@ -208,7 +208,7 @@ def _factors(
     if shape.direct:
         wave = direct_wave(shape, values, slot, places)[:, None]
         found += [wide @ (wave * fixed), wide @ (wave * varying)]
-    waves = source_waves(shape, values, slot, places)[:, :, None]
+    waves = image_waves(shape, values, slot, places)[:, :, None]
     found += [wide @ (wave * fixed) for wave in waves]
     found += [wide @ (wave * varying) for wave in waves]
     return tuple(found)

@@ -27,7 +27,7 @@ from gsparc.multipath.waves.covariance import (
     disturbance,
     explained,
     prior,
-    told,
+    specular,
 )
 from gsparc.ops import Pose
 
@@ -77,7 +77,7 @@ class Weights:
 
 
 class ChannelField(ConditionalField):
-    """Leakage, direct wave, sources and a diffuse field of a static end and one that moves.
+    """Leakage, direct wave, images and a diffuse field of a static end and one that moves.
 
     Args:
         site: kind csi, of a known carrier; one end static, or several stations.
@@ -89,7 +89,6 @@ class ChannelField(ConditionalField):
         log_power: (P,) of `Shape.names`, relative to each group's scale.
         log_envelope, log_gain: lengths [log m].
         offset: (3,) of static ends [m].
-        sources: (N, 3) [m], local.
         towards, planes: (J,), (W, 4) see `Values`.
     """
 
@@ -103,7 +102,6 @@ class ChannelField(ConditionalField):
         self.log_envelope = nn.Parameter(values.envelope.log())
         self.log_gain = nn.Parameter(values.gain.log())
         self.offset = nn.Parameter(values.offset.clone())
-        self.sources = nn.Parameter(values.sources.clone())
         # An empty parameter would have no slope.
         self.towards = nn.Parameter(values.towards.clone()) if len(values.towards) else values.towards
         self.planes = nn.Parameter(values.planes.clone()) if len(values.planes) else values.planes
@@ -118,7 +116,7 @@ class ChannelField(ConditionalField):
     def values(self) -> Values:
         """The parameters as they are, differentiable."""
         lengths = self.log_envelope.exp(), self.log_gain.exp()
-        return Values(self.log_power.exp(), *lengths, self.offset, self.sources, self.towards, self.planes)
+        return Values(self.log_power.exp(), *lengths, self.offset, self.towards, self.planes)
 
     @property
     def _held(self) -> Values:
@@ -132,20 +130,19 @@ class ChannelField(ConditionalField):
 
     @property
     def count(self) -> int:
-        """Sources and images."""
+        """Images."""
         return self.shape.count
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `sources`, `mirrors`, `drift`."""
+        """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `mirrors`, `drift`."""
         shape = self.shape
         on = {
             "residual": True,
             "directions": len(shape.angles) > 0,
             "leakage": shape.constant,
             "direct": shape.direct,
-            "sources": shape.sources > 0,
-            "mirrors": len(shape.words) > 0,
+            "mirrors": len(shape.sequences) > 0,
             "drift": shape.correlated,
         }
         return tuple(name for name, is_on in on.items() if is_on)
@@ -267,7 +264,7 @@ class ChannelField(ConditionalField):
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Mean and sources' share of it (B, A, K), variance after and before learning (B,)."""
+        """Mean and images' share of it (B, A, K), variance after and before learning (B,)."""
         shape, values, size = self.shape, self._held, math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=torch.complex64)
         share = torch.zeros_like(mean) if self.count else mean
@@ -283,7 +280,7 @@ class ChannelField(ConditionalField):
             fields = diffuse_of(shape, values, slots[0].wavenumber, powers, places, learned)
             for number, (known, here, _) in enumerate(alike):
                 slot = slots[number]
-                cross = fields[min(number, len(fields) - 1)] + told(shape, values, slot, places, learned)
+                cross = fields[min(number, len(fields) - 1)] + specular(shape, values, slot, places, learned)
                 slot.put(mean, here, cross @ known.alpha)
                 if self.count:
                     slot.put(share, here, explained(shape, values, slot, places, learned) @ known.alpha)
@@ -397,14 +394,16 @@ class ChannelField(ConditionalField):
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
-    words = tuple(tuple(int(letter) for letter in word) for word in state["shape"].get("words", ()))
-    shape, kept = Shape(**{**state["shape"], "words": words}), state["values"]
+    shape, kept = dict(state["shape"]), state["values"]
+    sequences = shape.pop("words", shape.get("sequences", ()))  # `words` in earlier versions, if at all
+    shape["sequences"] = tuple(tuple(int(index) for index in sequence) for sequence in sequences)
     lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
+    shape.pop("sources", 0)  # of given places, in earlier versions: always none
     # Earlier versions knew no angles to ends, and no mirrors.
     some = {name: kept[name] for name in ("towards", "planes") if name in kept}
-    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], kept["sources"], **some)
+    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], **some)
     antennas, tones = (int(n) for n in state["channel"])
-    field = ChannelField(site, shape, values, (antennas, tones))
+    field = ChannelField(site, Shape(**shape), values, (antennas, tones))
     with torch.no_grad():
         for name, parameter in field.named_parameters():
             parameter.copy_(kept[name])
@@ -421,7 +420,7 @@ def _covariances(groups: tuple[Group, ...], shape: Shape, values: Values) -> lis
     """(n, n) complex128 of each group's rows with what disturbs them, relative to its scale."""
     return [
         field
-        + told(shape, values, group.slot, group.places, group.places)
+        + specular(shape, values, group.slot, group.places, group.places)
         + disturbance(shape, values, group)
         for field, group in zip(diffuse_fields(groups, shape, values), groups, strict=True)
     ]

@@ -41,6 +41,10 @@ from gsparc.multipath.waves.mirrors import find_mirrors
 from gsparc.multipath.waves.offset import best_offset
 from gsparc.multipath.waves.settings import ChannelSettings
 
+COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on at most
+ENDS = 64  # of several static ends, those that powers are learned on in the end
+CONCENTRATION = 8.0  # of each direction, that of a von Mises-Fisher density
+SHRINKAGE = 0.5  # of directions' powers towards their mean, in rows of the inverse Gamma prior
 FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
@@ -79,10 +83,7 @@ def initialise(
     data: Measurements,
     rows: np.ndarray,
     settings: ChannelSettings,
-    seed: int = 0,
     budget: TimeBudget | None = None,
-    sources: np.ndarray | None = None,
-    target: np.ndarray | None = None,
 ) -> tuple[ChannelField, tuple[str, ...]]:
     """A field conditioned on the rows, and notes about it.
 
@@ -90,23 +91,14 @@ def initialise(
         data: kind csi.
         rows: (n,) measurements to learn from.
         settings: terms.
-        seed: nothing is random.
         budget: when it is over, no further term is tried.
-        sources: (N, 3) [m], local: Gaussians as virtual sources; None for none.
-        target: (n, A, K) in place of the rows' targets, such as another model's left-out residual.
 
     Raises:
         ValueError: the data are no channels of a known carrier with one static end.
     """
-    del seed
     rows, budget = np.asarray(rows), budget or TimeBudget()
-    if target is not None:
-        whole = np.zeros_like(data.target)
-        whole[rows] = target.reshape(len(rows), *data.target.shape[1:])
-        data = replace(data, target=whole)
-    places = np.zeros((0, 3)) if sources is None else np.asarray(sources, np.float64)
     plain, factors, notes = _isotropic(data, rows)
-    search = _Search.of(data, rows, settings, torch.from_numpy(places), plain, factors)
+    search = _Search.of(data, rows, settings, plain, factors)
     best, more = search.run(budget)
     channel = (int(data.target.shape[1]), int(data.target.shape[2]))
     field = ChannelField(data.site, best.shape, best.values, channel)
@@ -114,11 +106,6 @@ def initialise(
     # Steps on a few rows of each end would find less than the likelihood of all of them has.
     field.requires_grad_(ends_of(search.every) == 1)
     return field, (*notes, *more)
-
-
-def isotropic_shape(middle: Tensor, reach: float) -> Shape:
-    """The diffuse field from everywhere alike, and no other term."""
-    return Shape(torch.zeros(0, 3, dtype=torch.float64), 8.0, False, False, False, 0, middle, reach)
 
 
 def _isotropic(data: Measurements, rows: np.ndarray) -> tuple[tuple[Shape, Values], Tensor, list[str]]:
@@ -135,11 +122,11 @@ def _isotropic(data: Measurements, rows: np.ndarray) -> tuple[tuple[Shape, Value
     _, factors, length, noise = min(tried, key=lambda t: t[0])
     everywhere = torch.cat([group.places for group in groups])
     extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
-    shape = isotropic_shape(everywhere.mean(0), BEYOND * max(extent, wavelength))
-    zero = torch.zeros(3, dtype=torch.float64)
+    none, reach = torch.zeros(0, 3, dtype=torch.float64), BEYOND * max(extent, wavelength)
+    shape = Shape(none, CONCENTRATION, False, False, False, everywhere.mean(0), reach)
     one = torch.tensor([1.0, noise], dtype=torch.float64)
     lengths = torch.tensor(length).double(), torch.tensor(GAINS[0] * wavelength).double()
-    values = Values(one, *lengths, zero, torch.zeros(0, 3, dtype=torch.float64))
+    values = Values(one, *lengths, torch.zeros(3, dtype=torch.float64))
     note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
     return (shape, values), factors, [note]
 
@@ -206,7 +193,6 @@ class _Search:
     groups: tuple[Group, ...]
     every: tuple[Group, ...]
     plain: tuple[Shape, Values]
-    sources: Tensor
     wavelength: float
     kept: Kept
 
@@ -215,48 +201,42 @@ class _Search:
         data: Measurements,
         rows: np.ndarray,
         settings: ChannelSettings,
-        sources: Tensor,
         plain: tuple[Shape, Values],
         factors: Tensor,
     ) -> _Search:
         every = gather(data, rows, True)
         every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
-        groups = thinned(every, settings.columns, settings.rows)
+        groups = thinned(every, COLUMNS, settings.rows)
         if not compressible(groups[0], *plain):
             groups = thinned(every, DENSE_COLUMNS, min(settings.rows, DENSE_ROWS))
         wavelength = 2 * math.pi / every[0].slot.wavenumber
-        return _Search(settings, groups, every, plain, sources, wavelength, Kept())
+        return _Search(settings, groups, every, plain, wavelength, Kept())
 
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes."""
         wanted = self.settings
         notes: list[str] = []
         best = self._measured(*self.plain, self._compressed(*self.plain))
-        best = self._step(best, self._fitted(*self.plain), "auto", "powers by likelihood", notes)
+        best = self._step(best, self._fitted(*self.plain), "powers by likelihood", notes)
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
-        direct = known and wanted.direct is not False
-        if (direct or wanted.constant is not False) and not budget.over():
-            forced = wanted.constant is True or wanted.direct is True or "auto"
-            best = self._step(best, self._with_told(best, direct), forced, "leakage and direct wave", notes)
-        if len(self.sources) and not budget.over():
-            best = self._step(best, self._with_sources(best), "auto", "sources", notes)
+        direct = known and wanted.direct
+        if (direct or wanted.constant) and not budget.over():
+            best = self._step(best, self._with_fixed(best, direct), "leakage and direct wave", notes)
         if wanted.mirrors and best.shape.direct and ends_of(self.every) > 1 and not budget.over():
             mirrored = self._with_mirrors(best, budget)
             if mirrored is not None:
                 count = len(mirrored.values.planes)
-                best = self._step(best, mirrored, "auto", f"mirror planes of all ends ({count})", notes)
-        if wanted.directions is not False and not budget.over():
-            best = self._step(best, self._with_directions(best), wanted.directions, "directions", notes)
+                best = self._step(best, mirrored, f"mirror planes of all ends ({count})", notes)
+        if wanted.directions and not budget.over():
+            best = self._step(best, self._with_directions(best), "directions", notes)
         if ends_of(self.every) > 1 and not budget.over():
             best = self._of_all_ends(best, known, notes)
-        if wanted.correlated is not False and not budget.over():
+        if wanted.correlated and not budget.over():
             best = self._with_drift(best, notes)
         return best, notes
 
-    def _step(
-        self, before: Candidate, after: Candidate, wanted: bool | str, name: str, notes: list[str]
-    ) -> Candidate:
-        keep = wanted is True or after.beats(before)
+    def _step(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
+        keep = after.beats(before)
         ratio = after.errors / before.errors
         gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
         notes.append(
@@ -280,8 +260,7 @@ class _Search:
     def _fitted(self, shape: Shape, values: Values) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compressed(shape, values)
-        shrinkage = self.settings.shrinkage
-        power, towards, _ = fit_all(parts, shape, values.power, values.towards, shrinkage)
+        power, towards, _ = fit_all(parts, shape, values.power, values.towards, SHRINKAGE)
         return self._measured(shape, replace(values, power=power, towards=towards), parts)
 
     def _worth(self, shape: Shape, values: Values) -> float:
@@ -291,9 +270,9 @@ class _Search:
         numbers = sum(2 * group.target.numel() for group in self.groups)
         return 0.5 * parameters * math.log(numbers)
 
-    def _with_told(self, before: Candidate, direct: bool) -> Candidate:
+    def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; the best of a few lengths."""
-        shape = replace(before.shape, constant=self.settings.constant is not False, direct=direct)
+        shape = replace(before.shape, constant=self.settings.constant, direct=direct)
         return self._moved(self._of_lengths(shape, before.values, before.shape, direct))
 
     def _of_lengths(self, shape: Shape, values: Values, old: Shape, gains: bool) -> Candidate:
@@ -313,7 +292,7 @@ class _Search:
     def _moved(self, found: Candidate) -> Candidate:
         """With static ends where they really are."""
         shape, values = found.shape, found.values
-        if not shape.direct or not self.settings.offset:
+        if not shape.direct:
             return found
         offset = best_offset(self._compressed(shape, values), shape, values, self.wavelength)
         if offset is None:
@@ -321,38 +300,26 @@ class _Search:
         moved = self._fitted(shape, replace(values, offset=offset))
         return moved if moved.nll < found.nll else found
 
-    def _with_sources(self, before: Candidate) -> Candidate:
-        """With those sources that have power."""
-        shape = replace(before.shape, sources=len(self.sources))
-        values = replace(before.values, sources=self.sources)
-        if before.shape.direct:
-            return self._heard(self._with_waves(before, shape, values))
-        return self._heard(self._of_lengths(shape, values, before.shape, True))
-
     def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
         shape, values = before.shape, before.values
         rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(shape, values)
-        wide = replace(self, groups=thinned(self.every, self.settings.ends, self.settings.rows))
+        wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
         parts = wide._compressed(shape, values)
-        planes, words = find_mirrors(
+        planes, sequences = find_mirrors(
             rough, parts, shape, values, self.wavelength, self.settings.mirrors, budget.over
         )
-        if not words:
+        if not sequences:
             return None
-        found = self._with_waves(before, replace(shape, words=words), replace(values, planes=planes))
-        return self._heard(found)
-
-    def _with_waves(self, before: Candidate, shape: Shape, values: Values) -> Candidate:
-        """With sources or images that there were none of before."""
-        power = before.values.power
-        level = NEW * float(before.shape.of("isotropic", power)[0])
-        end = before.shape.where("noise")[0]
+        power, end = values.power, shape.where("noise")[0]
+        level = NEW * float(shape.of("isotropic", power)[0])
+        shape = replace(shape, sequences=sequences)
         fresh = torch.full((len(shape.names) - len(power),), level, dtype=torch.float64)
-        return self._fitted(shape, replace(values, power=torch.cat([power[:end], fresh, power[end:]])))
+        power = torch.cat([power[:end], fresh, power[end:]])
+        return self._without_weak(self._fitted(shape, replace(values, planes=planes, power=power)))
 
-    def _heard(self, found: Candidate) -> Candidate:
-        """Without the sources and images that have no power."""
+    def _without_weak(self, found: Candidate) -> Candidate:
+        """Without the images that have no power."""
         shape, values, power = found.shape, found.values, found.values.power
         fixed, varying = (torch.tensor(shape.where(name)) for name in ("source", "source_smooth"))
         heard = power[fixed] + power[varying] > LEAST * power.sum()
@@ -360,33 +327,30 @@ class _Search:
             return found
         silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
         rest = power[[i for i in range(len(power)) if i not in silent]]
-        given, seen = heard[: shape.sources], heard[shape.sources :].tolist()
-        words = tuple(word for word, has in zip(shape.words, seen, strict=True) if has)
-        shape = replace(shape, sources=int(given.sum()), words=words)
-        return self._fitted(shape, replace(values, power=rest, sources=values.sources[given]))
+        seen = tuple(one for one, has in zip(shape.sequences, heard.tolist(), strict=True) if has)
+        return self._fitted(replace(shape, sequences=seen), replace(values, power=rest))
 
     def _with_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
         group = max(self.groups, key=len)
         angles = directions(group.places, group.slot.wavenumber, self.settings.angles)
-        shape = replace(before.shape, angles=angles, concentration=self.settings.concentration)
+        shape = replace(before.shape, angles=angles, concentration=CONCENTRATION)
         old = before.values.power
         level = float(before.shape.of("isotropic", old)[0])
         power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
         values = replace(before.values, power=torch.cat([power, old[1:]]))
         parts = self._compressed(shape, values)
         errors = self._crossed(parts, shape, values)
-        power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage, 2 * SHORT)
+        power, _ = fit_powers(parts, shape, values.power, SHRINKAGE, 2 * SHORT)
         found = self._fitted(*_strongest(shape, replace(values, power=power)))
         return replace(found, errors=np.maximum(found.errors, errors))
 
     def _of_all_ends(self, before: Candidate, known: bool, notes: list[str]) -> Candidate:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
-        wide = replace(self, groups=thinned(self.every, self.settings.ends, self.settings.rows))
+        wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
         best = wide._moved(wide._fitted(before.shape, before.values))
-        wanted = self.settings.directions
-        if known and wanted is not False:
-            best = wide._step(best, wide._with_tied(best), wanted, "directions by angles to ends", notes)
+        if known and self.settings.directions:
+            best = wide._step(best, wide._with_tied(best), "directions by angles to ends", notes)
         return best
 
     def _with_tied(self, before: Candidate) -> Candidate:
@@ -410,7 +374,7 @@ class _Search:
             rest = tuple(
                 without(part, torch.from_numpy(left)) for part, left in zip(parts, held, strict=True)
             )
-            power, _ = fit_powers(rest, shape, values.power, self.settings.shrinkage, 2 * SHORT)
+            power, _ = fit_powers(rest, shape, values.power, SHRINKAGE, 2 * SHORT)
             for part, left in zip(parts, held, strict=True):
                 errors += _left_out(part, power)[:, left].sum(1) / len(left) / len(parts)
         return errors
@@ -430,5 +394,5 @@ class _Search:
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
         known = replace(before, nll=0.0, errors=errors[0])
         after = Candidate(shape, values, worth - gain, errors[1])
-        kept = self._step(known, after, self.settings.correlated, "noise correlated over rows", notes)
+        kept = self._step(known, after, "noise correlated over rows", notes)
         return after if kept is after else before

@@ -16,10 +16,10 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
-from gsparc.multipath.waves.covariance import Shape, Values, source_waves
+from gsparc.multipath.waves.covariance import Shape, Values, image_waves
 from gsparc.multipath.waves.evidence import Compressed
 from gsparc.multipath.waves.probe import Probe
-from gsparc.physics.mirror_planes import Word, images
+from gsparc.physics.mirror_planes import Reflections, images
 
 LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
 MARGIN = 0.3  # how far beyond places and ends planes may be, of their extent
@@ -33,7 +33,7 @@ APART = 1.0  # wavelengths between the images in two of them
 REFINED = 5  # halvings of the step
 LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
 PARAMETERS = 4  # of a plane: two angles, an offset and a power
-SAME = 0.25  # wavelengths between images of two words that are one
+SAME = 0.25  # wavelengths between images of two sequences that are one
 CHUNK = 300_000  # entries of waves held at a time
 
 
@@ -44,34 +44,33 @@ class _Searcher:
     wavelength: float
     late: Callable[[], bool]
 
-    def waves(self, probe: Probe, planes: Tensor, words: tuple[Word, ...]) -> Tensor:
+    def waves(self, probe: Probe, planes: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """(W, n) of images in planes (P, 4)."""
-        none = self.values.sources[:0]
-        values = replace(self.values, sources=none, planes=planes)
-        return source_waves(
-            replace(self.shape, sources=0, words=words), values, probe.group.slot, probe.group.places
+        values = replace(self.values, planes=planes)
+        return image_waves(
+            replace(self.shape, sequences=sequences), values, probe.group.slot, probe.group.places
         )
 
     def gains(
-        self, probes: tuple[Probe, ...], planes: Tensor, words: tuple[Word, ...], exact: bool
+        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...], exact: bool
     ) -> Tensor:
-        """Rise of the log likelihood (W, levels) of each word alone."""
-        total = torch.zeros(len(words), len(LEVELS), dtype=torch.float64)
+        """Rise of the log likelihood (W, levels) of each sequence alone."""
+        total = torch.zeros(len(sequences), len(LEVELS), dtype=torch.float64)
         for probe in probes:
-            for chunk in torch.arange(len(words)).split(max(CHUNK // len(probe.group), 1)):
-                chosen = tuple(words[i] for i in chunk.tolist())
-                near = {letter: i for i, letter in enumerate(dict.fromkeys(sum(chosen, ())))}
-                renamed = tuple(tuple(near[letter] for letter in word) for word in chosen)
+            for chunk in torch.arange(len(sequences)).split(max(CHUNK // len(probe.group), 1)):
+                chosen = tuple(sequences[i] for i in chunk.tolist())
+                near = {index: i for i, index in enumerate(dict.fromkeys(sum(chosen, ())))}
+                renamed = tuple(tuple(near[index] for index in sequence) for sequence in chosen)
                 waves = self.waves(probe, planes[list(near)], renamed)
                 known = probe.known(waves) if exact else _about(probe, waves)
                 total[chunk] += torch.stack([probe.gain(waves, level, known) for level in LEVELS], 1)
         return total
 
     def best(
-        self, probes: tuple[Probe, ...], planes: Tensor, words: tuple[Word, ...]
+        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...]
     ) -> tuple[int, float, float]:
-        """Number of the best word, its level, and what it gains [nats]."""
-        gains = self.gains(probes, planes, words, True)
+        """Number of the best sequence, its level, and what it gains [nats]."""
+        gains = self.gains(probes, planes, sequences, True)
         number = int(gains.argmax()) // len(LEVELS)
         return number, LEVELS[int(gains[number].argmax())], float(gains[number].max())
 
@@ -104,7 +103,7 @@ def find_mirrors(
     wavelength: float,
     most: int,
     late: Callable[[], bool] = lambda: False,
-) -> tuple[Tensor, tuple[Word, ...]]:
+) -> tuple[Tensor, tuple[Reflections, ...]]:
     """Planes (W, 4) float64, local, and images in them; none where all together are not worth it.
 
     Args:
@@ -123,7 +122,7 @@ def find_mirrors(
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
     grid, turn = candidates(rough, shape, values, wavelength)
-    planes, words, risen = grid[:0], list[Word](), 0.0
+    planes, sequences, risen = grid[:0], list[Reflections](), 0.0
     while len(planes) < most and not late():
         scores = search.gains(rough, grid, _single(len(grid)), False).max(1).values
         if not len(planes):
@@ -137,19 +136,19 @@ def find_mirrors(
         planes, risen = torch.cat([planes, plane[None]]), risen + gain
         fresh = (len(planes) - 1,)
         rough, probes = (_with(search, each, planes, fresh, level) for each in (rough, probes))
-        words.append(fresh)
+        sequences.append(fresh)
     pairs = [pair for pair in permutations(range(len(planes)), 2)]
     while pairs and not late():
-        pairs = [pair for pair in pairs if not _known(probes, values, planes, words, pair, wavelength)]
+        pairs = [pair for pair in pairs if not _known(probes, values, planes, sequences, pair, wavelength)]
         if not pairs:
             break
         number, level, gain = search.best(probes, planes, tuple(pairs))
         if gain < 2 * worth:
             break
         probes = _with(search, probes, planes, pairs[number], level)
-        words.append(pairs.pop(number))
+        sequences.append(pairs.pop(number))
         risen += gain
-    return (planes, tuple(words)) if 2 * risen > LEAST * numbers else (planes[:0], ())
+    return (planes, tuple(sequences)) if 2 * risen > LEAST * numbers else (planes[:0], ())
 
 
 def candidates(
@@ -176,7 +175,7 @@ def candidates(
     return torch.cat(found), turn
 
 
-def _single(count: int) -> tuple[Word, ...]:
+def _single(count: int) -> tuple[Reflections, ...]:
     return tuple((number,) for number in range(count))
 
 
@@ -205,21 +204,21 @@ def _apart(
 
 
 def _with(
-    search: _Searcher, probes: tuple[Probe, ...], planes: Tensor, word: Word, level: float
+    search: _Searcher, probes: tuple[Probe, ...], planes: Tensor, sequence: Reflections, level: float
 ) -> tuple[Probe, ...]:
-    return tuple(probe.added(search.waves(probe, planes, (word,))[0], level) for probe in probes)
+    return tuple(probe.added(search.waves(probe, planes, (sequence,))[0], level) for probe in probes)
 
 
 def _known(
     probes: tuple[Probe, ...],
     values: Values,
     planes: Tensor,
-    words: list[Word],
-    pair: Word,
+    sequences: list[Reflections],
+    pair: Reflections,
     wavelength: float,
 ) -> bool:
-    """Whether a word's images are those of another."""
+    """Whether a sequence's images are those of another."""
     ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
-    placed = images(ends, planes, [*words, pair])
+    placed = images(ends, planes, [*sequences, pair])
     away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
     return bool((away < SAME * wavelength).any())

@@ -85,7 +85,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
         draw(api, scene.frame, _upright(answer, view, one.about.usual, scene.frame.middle, view.extent(name)))
         recorder.insert_sleep(PAUSE_S)
     said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=len(places), end=ENDS[moving])]
-    return recorder.as_html(), _beside(scene, said, legends)
+    return recorder.as_html(), _side_panel(scene, said, legends)
 
 
 def _other(view: SiteView) -> list[float] | None:
@@ -103,7 +103,7 @@ def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.nda
     return Sheet("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
 
 
-def _beside(scene: Scene, said: list[str], legends: list[Legend]) -> str:
+def _side_panel(scene: Scene, said: list[str], legends: list[Legend]) -> str:
     title = html.escape(scene.title)
     lines = "".join(f"<p style='margin:.3em .6em'>{html.escape(line)}</p>" for line in said)
     return (

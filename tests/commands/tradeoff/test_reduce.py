@@ -227,7 +227,7 @@ def test_what_a_process_beside_adds_stays_unless_it_is_spared(field):
     assert "beside" not in reduced.knobs(method)
     mean = answer(method, data, fold.test).mean
     beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(mean)))
-    method._beside = (beside, 0.25)
+    method._average = (beside, 0.25)
     assert "beside" in reduced.knobs(method)
     plain, added, earlier = (
         answer(reduced.reduced(method, {"stride": 2, **spared}, measured), data, fold.test).mean
@@ -243,7 +243,7 @@ def test_a_process_beside_spares_components_and_pixels_with_the_field(field, str
     measured = reduced.contributions(method, data, fold.train)
     process = GaussianProcess()
     process.fit(data, fold, FitContext())
-    method._beside, method._lean = (process, 0.5), None
+    method._average, method._average_mean = (process, 0.5), None
     alone = reduced.reduced(field.methods[0], {"stride": stride}, measured)
     spared = {"confidence": False, "keep": 0.5, "stride": stride}
     wanted = 0.5 * answer(alone, data, fold.test).mean

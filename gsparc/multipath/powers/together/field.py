@@ -285,7 +285,7 @@ def initialise(
     if unheard.gain is None:
         said.append("no shared terms: too few stations to leave some out")
         return field, (*notes, *said)
-    said.append("stations left out, after one constant: " + _said(unheard.gain, "shared terms"))
+    said.append("stations left out, after one constant: " + _gain_text(unheard.gain, "shared terms"))
     strong = unheard.prior
     if not strong.columns:
         return field, (*notes, *said)
@@ -294,7 +294,7 @@ def initialise(
     if at_places is None:
         said.append("no time to try shared terms on groups of places that are left out")
     else:
-        said.append("groups of places left out: " + _said(at_places, "shared terms"))
+        said.append("groups of places left out: " + _gain_text(at_places, "shared terms"))
         if at_places.exceeds(SURER * sure):
             field.heard = field.unheard
     return field, (*notes, *said)
@@ -331,7 +331,7 @@ def _errors(known: Heard, asked: Heard, prior: Prior) -> np.ndarray:
     return found
 
 
-def _said(gain: Gain, what: str) -> str:
+def _gain_text(gain: Gain, what: str) -> str:
     before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
     return (
         f"rmse {before:.3g} dB without {what}, {after:.3g} dB with them "

@@ -237,7 +237,7 @@ def given(rows: Heard, prior: Prior) -> tuple[Posterior, tuple[str, ...], list[n
         own = np.flatnonzero(rows.station == number)
         end = End.of(rows, number, prior)
         if rows.silent[own].any():
-            end, used = _told(end, rows.silent[own], prior)
+            end, used = _with_pseudo_values(end, rows.silent[own], prior)
             own = own[used]
         ends[number], factored[number] = end, Factored.of(end, prior)
         kept.append(own)
@@ -255,7 +255,7 @@ def given(rows: Heard, prior: Prior) -> tuple[Posterior, tuple[str, ...], list[n
     return Posterior(prior, ends, weights, lower, mean, whole, factored), tuple(notes), kept
 
 
-def _told(end: End, silent: np.ndarray, prior: Prior) -> tuple[End, np.ndarray]:
+def _with_pseudo_values(end: End, silent: np.ndarray, prior: Prior) -> tuple[End, np.ndarray]:
     """An end with pseudo-values where nothing was heard, and its rows that say anything.
 
     They follow from its own rows, with the shared terms as the prior has them.

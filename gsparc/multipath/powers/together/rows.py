@@ -36,10 +36,6 @@ class Heard:
         """The rows `chosen`."""
         return Heard(*(part[chosen] for part in vars(self).values()))
 
-    def pairs(self) -> Rows:
-        """The same without stations: places (n, 6) of both ends."""
-        return Rows(np.hstack([self.moving, self.still]), self.decibels, self.silent)
-
     @property
     def stations(self) -> list[int]:
         """Numbers of the stations that have rows, ascending."""

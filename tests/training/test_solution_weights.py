@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.training.weighing import Rows, error, explained, share_of_second, weights
+from gsparc.training.solution_weights import Rows, error, explained, share_of_second, weights
 
 EACH = np.arange(50)  # every row is a unit
 TARGET = torch.from_numpy(np.random.default_rng(0).standard_normal((50, 3)))

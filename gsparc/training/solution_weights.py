@@ -1,4 +1,4 @@
-"""Which of several solutions to trust: weights of least squared error on held-out rows."""
+"""Weights of several predictors: of least squared error, or of largest PSNR, on held-out rows."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.schema import Site
 from gsparc.methods.stacking import choose
 
+LEAST_HELD = 4  # rows, for weights to mean anything
 LEAST_GAIN_DB = 0.2  # for which a query may take several times as long
 UNUSED = 0.05  # weight below which a predictor is left out
 SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two
@@ -72,6 +74,11 @@ def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
     middle = target.mean(0, keepdim=True) if about_mean else torch.zeros_like(target[:1])
     whole = (target - middle).abs().square().sum().clamp_min(1e-30)
     return 1 - float((predicted - target).abs().square().sum() / whole)
+
+
+def comparable(values: Tensor, site: Site) -> Tensor:
+    """Values in the unit that errors are counted in: powers in decibels."""
+    return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
 
 
 def _real(values: Tensor) -> Tensor:

@@ -1,0 +1,159 @@
+"""Solutions that initialisers of conditional fields find, and their mean by weights from held-out rows."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField
+from gsparc.field.initial import InitSettings
+from gsparc.methods.method import FitContext, FitReport
+from gsparc.methods.registry import field_initialiser
+from gsparc.methods.time_budget import TimeBudget
+from gsparc.training import solution_weights
+from gsparc.training.solution_weights import LEAST_HELD, comparable
+from gsparc.training.terms import EffectSettings
+
+log = logging.getLogger(__name__)
+
+GROUPS = 3  # of training rows, that solutions are weighed by
+FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8, "edges": False}
+FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
+OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
+SEARCHES = ("sources", "bearings")  # of them, those that also give an answer of few sources
+
+
+def find(
+    parts: tuple[str, ...], init: InitSettings, effects: EffectSettings, data: Measurements, fold: Fold,
+    context: FitContext, budget: TimeBudget, until_s: float, held: InnerFolds | None,
+) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:  # fmt: skip
+    """What initialisers find, and what each cost.
+
+    Where they are several, training rows are cut into groups as the test was cut, and each solution
+    predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
+    few sources is a solution of its own next to the one that takes what seconds are left: many sources fit
+    rows near others better, few of them what is far.
+
+    Args:
+        parts: names of initialisers, which have settings `init`.
+        fold: validation rows are solved for, too, where nothing is weighed.
+        until_s: the second of the running `budget` by which all should be found.
+        held: how training rows are cut; None of one initialiser.
+
+    Raises:
+        ValueError: the only initialiser, or the one asked for, cannot solve this.
+    """
+    several = held is not None
+    rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
+    groups = () if held is None else _groups(held, fold.train)
+    plans = [(part, init, 1.0) for part in parts if part not in OPEN_ENDED]
+    for part in (part for part in parts if part in OPEN_ENDED):
+        if several and part in SEARCHES:
+            plans.append((f"few {part}", replace(init, **FEW), FEW_SHARE))
+        plans.append((part, init, 1.0))
+    found: dict[str, ConditionalField] = {}
+    reports: dict[str, FitReport] = {}
+    for name, settings, share in plans:
+        within = replace(context, budget_s=share * max(until_s - budget.spent, 1.0))
+        if name.startswith("few "):
+            within = replace(within, run_dir=Path(), resume=None)
+        part = name.split()[-1]
+        try:
+            leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
+            within = replace(within, leave_out=leave_out)
+            clutter = effects.visibility is not False
+            field, report = field_initialiser(part)(data, rows, settings, clutter, within)
+            if effects.residual is False and isinstance(field, CompletedField):
+                field = field.field
+            found[name] = field
+            if part not in OPEN_ENDED:
+                field.held = _held(field, data, rows, groups)
+        except KeyboardInterrupt:
+            if not name.startswith("few "):
+                raise
+            raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
+        except ValueError as error:
+            if len(parts) == 1 or name == init.name:
+                raise
+            log.info("init=%s is left out: %s", name, error)
+            found.pop(name, None)
+            continue
+        reports[name] = report
+    return found, reports
+
+
+def weighed(
+    solutions: dict[str, ConditionalField], data: Measurements, fold: Fold, cut: InnerFolds | None
+) -> dict[str, tuple[ConditionalField, float]]:
+    """Solutions with their weights where positive, by rows which they were not conditioned on.
+
+    Those are validation rows, and training rows as `cut`; one solution needs neither.
+    """
+    first = next(iter(solutions))
+    if len(solutions) == 1:
+        return {first: (solutions[first], 1.0)}
+    held = [field.held for field in solutions.values() if field.held is not None]
+    rows = np.zeros(0, np.int64)
+    if len(held) == len(solutions):
+        rows = np.asarray(functools.reduce(np.intersect1d, [one.rows for one in held]), np.int64)
+    batch = data.batch(fold.val)
+    predicted = []
+    for field in solutions.values():
+        mean = field(batch.tx, batch.rx).mean
+        if len(rows):
+            assert field.held is not None
+            order = {row: place for place, row in enumerate(field.held.rows.tolist())}
+            mean = torch.cat([field.held.mean[[order[row] for row in rows.tolist()]], mean])
+        predicted.append(comparable(mean, data.site))
+    rows = np.concatenate([rows, fold.val])
+    if len(rows) < LEAST_HELD:
+        log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), first)
+        return {first: (solutions[first], 1.0)}
+    target = comparable(data.batch(rows).target, data.site)
+    assert cut is not None
+    alone = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
+    unit = np.where(cut.unit == NOT_TESTED, alone, cut.unit)[rows]
+    weights = solution_weights.weights(predicted, target, unit)
+    for name, one, weight in zip(solutions, predicted, weights, strict=True):
+        log.info(
+            "%d held-out rows: %s misses %.3f of the energy, weight %.2f", len(rows), name,
+            solution_weights.error(one, target), weight,
+        )  # fmt: skip
+    return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
+
+
+def joined(kept: dict[str, tuple[ConditionalField, float]]) -> ConditionalField:
+    """The weighed mean, or the only one."""
+    fields, weights = zip(*kept.values(), strict=True)
+    return fields[0] if len(fields) == 1 else StackedField(fields, weights)
+
+
+def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Training rows (n,) of each group."""
+    found = [np.intersect1d(one.test, train) for one in cut.folds]
+    return tuple(group for group in found if 0 < len(group) < len(train))
+
+
+def _held(
+    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
+) -> LeftOutRows | None:
+    """Rows of every group, predicted from the others with the parameters of all."""
+    if not groups:
+        return None
+    found = []
+    for group in groups:
+        field.condition(data, np.setdiff1d(rows, group))
+        batch = data.batch(group)
+        found.append(field(batch.tx, batch.rx))
+    field.condition(data, rows)
+    mean, variance = (torch.cat([getattr(one, name) for one in found]) for name in ("mean", "variance"))
+    return LeftOutRows(np.concatenate(groups), mean, variance)
