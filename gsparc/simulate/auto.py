@@ -126,6 +126,7 @@ class Choice:
         probes: receivers that it took.
         seconds: that deciding took, tracing the probes included, which are rows of the file [s].
         samples: rays that are enough, of a call; None for those of the settings.
+        refuted: effects that probes allowed and held-back receivers did not, so that everything is needed.
         untried: whether fewer rays were not tried, because too few rows were left for that to pay.
         row_all, row_chosen: CPU seconds of a row with everything and with the choice, compiling excluded;
             None where none was traced so.
@@ -140,6 +141,7 @@ class Choice:
     probes: int
     seconds: float = 0.0
     samples: int | None = None
+    refuted: str = ""
     untried: bool = False
     row_all: float | None = None
     row_chosen: float | None = None
@@ -256,6 +258,12 @@ def fewer_rays(
         float(np.median(error)), _p95(error), failed, "", not enough,
     )  # fmt: skip
     return replace(choice, table=(*choice.table, row), samples=samples if enough else None)
+
+
+def everything(choice: Choice, full: Effects) -> Choice:
+    """All effects, in place of a choice that held-back receivers refute; the verdict is on the latter."""
+    table = tuple(replace(row, kept=True) for row in choice.table)
+    return replace(choice, effects=full, refuted=str(choice.effects), table=table)
 
 
 def without_fewer_rays(choice: Choice) -> Choice:

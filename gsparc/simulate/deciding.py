@@ -175,6 +175,9 @@ def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decisi
     else:
         log.info("auto: %s; verifying on held-back receivers", choice.effects)
         choice, changed = _verify(campaign, settings, traced, choice, held)
+        if choice.verdict is not None and not choice.verdict.kept:
+            log.info("auto: held-back receivers refute it; everything is needed")
+            choice = auto.everything(choice, full)
     if settings.rays < 1 and survey.engine.random:
         choice, changed = _fewer_rays(campaign, settings, traced, choice, changed, probes, held)
     choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)

@@ -47,7 +47,7 @@ def verdict(choice: Choice) -> str:
     found = choice.verdict
     if found is None:
         return chosen
-    outcome = "met" if found.kept else "NOT MET"
+    outcome = "met" if found.kept else f"NOT MET by less ({choice.refuted})"
     return (
         f"{chosen}; requirement {outcome}: {found.met:.1%} of {found.receivers} held-back receivers are "
         f"within tolerance (error {found.error:.2g} median, {found.error_p95:.2g} at 95 %)"

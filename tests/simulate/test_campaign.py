@@ -355,6 +355,23 @@ def test_a_decision_that_left_rays_untried_is_taken_anew_where_trying_pays(tmp_p
     assert not many.choice.reused and many.choice.samples == 90_000
 
 
+def test_what_held_back_receivers_refute_is_not_simulated(tmp_path, monkeypatch):
+    """A run said NOT MET, simulated the choice all the same, and the next set of receivers took it over."""
+    real, full = deciding.auto.verify, Effects(**{**vars(MIRROR), "depth": 4})
+
+    def refuted(*arguments):
+        choice = real(*arguments)
+        return replace(choice, verdict=replace(choice.verdict, kept=False, met=0.9))
+
+    monkeypatch.setattr(deciding.auto, "verify", refuted)
+    asked = AutoSettings(probes=16, held_back=20, full=full)
+    outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
+    assert outcome.effects == outcome.choice.effects == full and outcome.choice.saved is None
+    assert "NOT MET by less (line of sight, specular, depth" in verdict(outcome.choice)
+    again = simulate(plan(effects=asked, scene=replace(SCENE, seed=3)), tmp_path / "again.h5")
+    assert again.choice.reused and again.effects == full
+
+
 def test_where_few_are_left_everything_is_kept(tmp_path):
     asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
     outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
