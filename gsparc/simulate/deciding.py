@@ -147,11 +147,12 @@ def busy_s() -> float:
 def pays(choice: Choice, rows: int, saved: float) -> bool:
     """Whether a share of the time of so many rows, saved, pays for compiling the solver for other effects.
 
-    Where rows were traced with the choice before, its kernels are in Dr.Jit's cache.
+    Where rows were traced with the choice before, its kernels are in Dr.Jit's cache. In a later run those of
+    everything are, of both sizes of a call, and all of the choice's are to be compiled.
     """
     if choice.row_chosen is not None or choice.row_all is None or choice.compiling is None:
         return rows > 0
-    return rows * choice.row_all * saved > choice.compiling
+    return rows * choice.row_all * saved > (2 if choice.reused else 1) * choice.compiling
 
 
 def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decision:

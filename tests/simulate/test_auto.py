@@ -231,7 +231,8 @@ def test_a_choice_survives_its_file():
 def test_fewer_effects_are_compiled_for_only_where_that_pays():
     """A decision taken over compiled the solver anew for rows whose time was less than that of compiling."""
     unseen = dataclasses.replace(decided("coverage +-1 dB"), row_all=0.02, compiling=2.0)
-    assert not pays(unseen, 200, 0.2) and pays(unseen, 1000, 0.2)
+    assert not pays(unseen, 200, 0.2) and pays(unseen, 900, 0.2)
+    assert not pays(dataclasses.replace(unseen, reused=True), 900, 0.2)  # two sizes of calls
     assert pays(dataclasses.replace(unseen, row_chosen=0.018), 200, 0.2)  # its kernels are there
     assert pays(dataclasses.replace(unseen, compiling=None), 200, 0.2)
 
