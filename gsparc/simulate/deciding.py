@@ -258,9 +258,9 @@ def _fewer_rays(
     if not _may_pay(choice, settings, traced.effects, len(survey) - len(traced.rows), len(traced.rows)):
         return replace(choice, untried=True), changed
     samples = max(round(settings.rays * campaign.sampling.samples), 1)
-    log.info("auto: %d probes with %d rays", choice.probes, samples)
+    log.info("auto: probes with %d rays", samples)
     fewer = Traced(survey.thinned(samples), choice.effects, np.concatenate([probes, held]), part)
-    for count in (choice.probes, len(probes)):
+    for count in (auto.first_look(len(probes)), len(probes)):
         rows, last = probes[:count], count == len(probes)
         probe = _probe(campaign, traced, rows)
         found = auto.fewer_rays(choice, settings, probe, fewer.paths(rows), samples, last)
