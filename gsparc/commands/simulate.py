@@ -132,6 +132,7 @@ def _closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
         error = outcome.convergence
         lines.append(
             f"convergence error between two seeds: channel NMSE {error.nmse:.2g}, "
-            f"spectra {error.spectrum_psnr_db:.1f} dB, SSIM {error.spectrum_ssim:.4f}"
+            f"spectra {error.spectrum_psnr_db:.1f} dB, SSIM {error.spectrum_ssim:.4f}, "
+            f"received power within {error.power_db:.2g} dB at 95 % of {error.receivers} receivers"
         )
     return lines

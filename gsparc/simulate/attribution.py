@@ -127,21 +127,34 @@ class Probe:
         """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
-    def shares(self, kept: Effects) -> np.ndarray:
-        """Share of each receiver's power that is lost (R,)."""
-        full, ports = self._power.sum((0, 1)), len(self._power) if kept.polarisation else 1
-        return 1 - self._power[:ports, self._allowed(kept)].sum((0, 1)) / np.where(full > 0, full, 1)
+    def shares(self, kept: Effects | Paths) -> np.ndarray:
+        """Share of each receiver's power that is lost (R,), negative where more arrives.
 
-    def nmse(self, kept: Effects) -> np.ndarray:
+        Args:
+            kept: effects, here and below; or another trace of these receivers, of fewer rays.
+        """
+        full = self._power.sum((0, 1))
+        if isinstance(kept, Paths):
+            rest = kept.received_power()
+        else:
+            ports = len(self._power) if kept.polarisation else 1
+            rest = self._power[:ports, self._allowed(kept)].sum((0, 1))
+        return 1 - rest / np.where(full > 0, full, 1)
+
+    def nmse(self, kept: Effects | Paths) -> np.ndarray:
         """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
-        full, rest = self._channels.sum(0), self._channels[self._allowed(kept)].sum(0)
-        rest = rest if kept.polarisation else rest[:, : len(self.elements)]
+        full = self._channels.sum(0)
+        if isinstance(kept, Paths):
+            rest = kept.responses(self.frequency_hz, self.elements, self.wavelength)
+        else:
+            rest = self._channels[self._allowed(kept)].sum(0)
+            rest = rest if kept.polarisation else rest[:, : len(self.elements)]
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
         energy = (np.abs(full) ** 2).sum((1, 2))
         return error / np.where(energy > 0, energy, 1)
 
-    def errors(self, kept: Effects, deliverable: Deliverable) -> np.ndarray:
+    def errors(self, kept: Effects | Paths, deliverable: Deliverable) -> np.ndarray:
         """The deliverable's error at each receiver (R,), in the unit of its tolerance."""
         if deliverable.kind == "coverage":
             remains = np.maximum(1 - self.shares(kept), 10 ** (-SILENCE_DB / 10))
@@ -149,7 +162,10 @@ class Probe:
         if deliverable.kind == "csi":
             return 10 * np.log10(np.maximum(self.nmse(kept), 10 ** (-SILENCE_DB / 10)))
         full, near = self._images
-        left = full if kept == self.effects else self._render(self.paths.under(kept))
+        if isinstance(kept, Effects):
+            left = full if kept == self.effects else self._render(self.paths.under(kept))
+        else:
+            left = self._render(kept)
         error, rival = (((image - full) ** 2).mean((1, 2)) for image in (left, near))
         return error / np.maximum(rival, 1e-12)
 

@@ -13,6 +13,7 @@ from scipy.stats import binom
 
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.effects import Effects
+from gsparc.simulate.paths import Paths
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +25,7 @@ PRICE = {
     "diffuse": 0.1, "polarisation": 0.02,
 }  # fmt: skip
 BOUNCES = 0.8  # and with the bounces, to equal parts
+RAYS = 0.8  # and with the rays
 SIMILAR = 0.1  # of prices, within which the set of fewer effects is taken
 FIRST_LOOK = 0.5  # share of the probes
 SPENT = 1 / 3  # of the permitted probability of error, at the first look
@@ -39,6 +41,7 @@ class AutoSettings:
         probes: receivers the decision is measured on at most, at least 16, spread out.
         confidence: with which the quantile must follow from them (`allowed_failures`).
         held_back: other receivers on which the choice is then verified, at most.
+        rays: share of the rays that is tried as well, where that may pay; 1 for none.
         reuse: whether a decision for the same scene, transmitters, area, band and requirement is taken over.
         full: what "everything on" means.
     """
@@ -48,6 +51,7 @@ class AutoSettings:
     probes: int = 128
     confidence: float = 0.85
     held_back: int = 128
+    rays: float = 0.3
     reuse: bool = True
     full: Effects = field(default_factory=lambda: Effects(depth=5))
 
@@ -56,6 +60,8 @@ class AutoSettings:
             raise ValueError("effects.probes and effects.held_back: at least 16 receivers each, spread out")
         if not 0 < self.confidence < 1:
             raise ValueError(f"effects.confidence={self.confidence}: expected a share between 0 and 1")
+        if not 0 < self.rays <= 1:
+            raise ValueError(f"effects.rays={self.rays}: expected a share above 0, at most 1")
         Deliverable.parse(self.deliverable, self.quantile)
 
     @property
@@ -69,7 +75,7 @@ class EffectRow:
     """One row of the table: errors when one effect is left out.
 
     Attributes:
-        effect: as in `removals`.
+        effect: as in `removals`, or `rays > N`.
         share: mean share of a receiver's power.
         share_p95: its 95th percentile over the receivers.
         nmse, nmse_p95: of the channel, median and 95th percentile.
@@ -119,6 +125,9 @@ class Choice:
         table: one row per effect.
         probes: receivers that it took.
         seconds: that deciding took, tracing the probes included, which are rows of the file [s].
+        samples: rays that are enough, of a call; None for those of the settings.
+        refuted: effects that probes allowed and held-back receivers did not, so that everything is needed.
+        untried: whether fewer rays were not tried, because too few rows were left for that to pay.
         row_all, row_chosen: CPU seconds of a row with everything and with the choice, compiling excluded;
             None where none was traced so.
         compiling: CPU seconds of compiling the solver for a set of effects; None where not measured.
@@ -131,6 +140,9 @@ class Choice:
     table: tuple[EffectRow, ...]
     probes: int
     seconds: float = 0.0
+    samples: int | None = None
+    refuted: str = ""
+    untried: bool = False
     row_all: float | None = None
     row_chosen: float | None = None
     compiling: float | None = None
@@ -178,9 +190,7 @@ def decide(
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
-    heard = int(reached.sum())
-    first, all_ = (first_look(heard), heard) if last else (heard, round(heard / FIRST_LOOK))
-    early, late = allowed_failures(first, all_, settings.quantile, settings.confidence)
+    early, late = _most(int(reached.sum()), last, settings)
     most = late if last else early
     dropped = removals(full)
     errors = {name: probe.errors(kept, deliverable)[reached] for name, kept in dropped.items()}
@@ -206,16 +216,59 @@ def decide(
     return Choice(chosen, str(deliverable), tuple(table), len(reached))
 
 
-def verify(choice: Choice, settings: AutoSettings, held_back: Probe) -> Choice:
-    """The choice with its verification on held-back receivers, by path attribution in a full run."""
+def verify(choice: Choice, settings: AutoSettings, held_back: Probe, traced: Paths | None = None) -> Choice:
+    """The choice with its verification on held-back receivers.
+
+    By path attribution in a full run, or by what is left of it, `traced` with fewer rays.
+    """
     deliverable = settings.required
-    errors = held_back.errors(choice.effects, deliverable)[held_back.reached]
+    left = choice.effects if traced is None else traced
+    errors = held_back.errors(left, deliverable)[held_back.reached]
     if not len(errors):
         return choice
     met = float((errors <= deliverable.tolerance).mean())
     kept = met >= deliverable.quantile
     verdict = Verification(len(errors), met, float(np.median(errors)), _p95(errors), kept)
     return replace(choice, verdict=verdict)
+
+
+def fewer_rays(
+    choice: Choice, settings: AutoSettings, probe: Probe, traced: Paths, samples: int, last: bool
+) -> Choice | None:
+    """The choice with fewer rays, or without them; None where more probes are needed to say.
+
+    Args:
+        choice: effects.
+        settings: requirement and confidence.
+        probe: receivers traced with everything: the first look's, or all probes.
+        traced: the same with the choice's effects and fewer rays.
+        samples: how many.
+        last: whether these are all probes.
+    """
+    deliverable, reached = settings.required, probe.reached
+    error = probe.errors(traced, deliverable)[reached]
+    failed = int((error > deliverable.tolerance).sum())
+    early, late = _most(len(error), last, settings)
+    if not last and failed == early + 1:  # with more, a second look would mostly be in vain, and it costs
+        return None
+    enough = failed <= (late if last else early)
+    share, nmse = np.abs(probe.shares(traced)[reached]), probe.nmse(traced)[reached]
+    row = EffectRow(
+        f"rays > {samples}", float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
+        float(np.median(error)), _p95(error), failed, "", not enough,
+    )  # fmt: skip
+    return replace(choice, table=(*choice.table, row), samples=samples if enough else None)
+
+
+def everything(choice: Choice, full: Effects) -> Choice:
+    """All effects, in place of a choice that held-back receivers refute; the verdict is on the latter."""
+    table = tuple(replace(row, kept=True) for row in choice.table)
+    return replace(choice, effects=full, refuted=str(choice.effects), table=table)
+
+
+def without_fewer_rays(choice: Choice) -> Choice:
+    """The choice, whose fewer rays the held-back receivers refute."""
+    return replace(choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True)))
 
 
 def first_look(receivers: int) -> int:
@@ -245,12 +298,18 @@ def allowed_failures(first: int, all_: int, quantile: float, confidence: float) 
     return int(early), late
 
 
-def price(some: Effects, full: Effects) -> float:
-    """Expected time of tracing with `some`, 1 with everything."""
+def price(some: Effects, full: Effects, rays: float = 1.0) -> float:
+    """Expected time of tracing with `some` and a share of the rays, 1 with everything."""
     off = [name for name in full.on if name not in some.on]
     off += ["polarisation"] if full.polarisation and not some.polarisation else []
     bounces = 1 - BOUNCES + BOUNCES * some.depth / max(full.depth, 1)
-    return bounces * math.prod(1 - PRICE[name] for name in off)
+    return bounces * math.prod(1 - PRICE[name] for name in off) * (1 - RAYS + RAYS * rays)
+
+
+def _most(heard: int, last: bool, settings: AutoSettings) -> tuple[int, int]:
+    """`allowed_failures` of so many receivers: the first look's, or all."""
+    first, all_ = (first_look(heard), heard) if last else (heard, round(heard / FIRST_LOOK))
+    return allowed_failures(first, all_, settings.quantile, settings.confidence)
 
 
 def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effects) -> Effects:

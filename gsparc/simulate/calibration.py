@@ -165,8 +165,9 @@ class Replay:
         calculator, total = FieldCalculator(), dr.zeros(mi.Float, self._count)
         calculator.loop_mode = "evaluated"
         for arguments, owner in self._parts:
-            # The buffer is shared by all calls: each writes its own coefficients and flags.
-            valid = arguments["paths"].valid
+            # The buffer is shared by all calls: each changes its flags in place, which made the kernel of
+            # every step longer than that of the one before.
+            valid = mi.Bool(arguments["paths"].valid)
             gains = calculator(**arguments).a
             arguments["paths"].valid = valid
             for row in gains:

@@ -81,19 +81,22 @@ def simulate(campaign: Campaign, out: Path, shared: bool = False) -> Outcome | N
         if decision is None:
             return None
         effects, decided_s = decision.effects, decision.choice.seconds
+    asked = campaign
+    if decision is not None and decision.samples is not None:
+        campaign = replace(campaign, sampling=replace(campaign.sampling, samples=decision.samples))
+        survey = survey.thinned(decision.samples)
     effects = survey.engine.supported(effects)
     laps.append(time.perf_counter())
     row_s = _trace_all(campaign, survey, effects, shards)
     choice = None if decision is None else decision.choice
-    asked = campaign.effects
-    if choice is not None and row_s and isinstance(asked, AutoSettings) and effects == choice.effects:
-        choice = replace(choice, row_chosen=row_s)
-        deciding.remember(campaign, asked, survey, choice)
+    if decision is not None and decision.as_chosen and row_s and isinstance(asked.effects, AutoSettings):
+        choice = replace(decision.choice, row_chosen=row_s)
+        deciding.remember(asked, asked.effects, survey, choice)
     laps.append(time.perf_counter())
     mine: list[Outcome] = []
 
     def finish(unused: str) -> None:
-        convergence = _converge(campaign, survey, effects, shards)
+        convergence = _converge(campaign, survey, effects, shards, campaign.sampling != asked.sampling)
         laps.append(time.perf_counter())
         other_s = laps[1] - laps[0] + decided_s + laps[4] - laps[3]
         made = assemble(campaign, survey, effects, choice, convergence, other_s, shards)
@@ -135,9 +138,7 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Sha
     Returns:
         CPU seconds of a row, once compiled; None where too few were traced here.
     """
-    left = np.arange(len(survey))
-    with suppress(FileNotFoundError):  # none was decided on, or another process has written the file
-        left = np.setdiff1d(left, shards.get(0, ROWS)[ROWS])
+    left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
     starts = range(0, len(left), campaign.shard)
     parts = {n: left[i : i + campaign.shard] for n, i in enumerate(starts, 1)}
     missing = {n: rows for n, rows in parts.items() if not shards.path(n).exists()}
@@ -165,12 +166,28 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Sha
     return sum(s for s, _ in warm) / sum(n for _, n in warm) if warm else None
 
 
-def _converge(campaign: Campaign, survey: Survey, effects: Effects, shards: Shards) -> Convergence | None:
-    """The file's rows beside the same under a second seed; None for an engine without rays."""
+def _decided_on(shards: Shards) -> np.ndarray:
+    """Rows (n,) that `auto` decided on, which have all rays."""
+    with suppress(FileNotFoundError):  # none was decided on, or another process has written the file
+        return shards.get(0, ROWS)[ROWS]
+    return deciding.NONE
+
+
+def _converge(
+    campaign: Campaign, survey: Survey, effects: Effects, shards: Shards, fewer: bool
+) -> Convergence | None:
+    """The file's rows beside the same under a second seed; None for an engine without rays.
+
+    Args:
+        campaign, survey, effects, shards: what was traced.
+        fewer: whether rows that `auto` decided on have more rays than the others: these alone are compared.
+    """
     count = min(campaign.check, int(CHECKED * len(survey)))
     if count == 0 or not survey.engine.random:
         return None
-    rows = np.sort(survey.spread(count, campaign.scene.seed + 1))
+    other = _decided_on(shards) if fewer else deciding.NONE
+    rows = survey.spread(count + len(other), campaign.scene.seed + 1)
+    rows = np.sort(rows[~np.isin(rows, other)][:count])
     again = survey.trace(rows, effects, campaign.check_seed)
-    csi, images, peak = shards.of_rows(rows, "csi", "spectrum", "spectrum_peak")
-    return compare(csi, images, peak, again, campaign, survey.engine.wavelength)
+    csi, images, peak, power = shards.of_rows(rows, "csi", "spectrum", "spectrum_peak", "received_power")
+    return compare(csi, images, peak, power, again, campaign, survey.engine.wavelength)

@@ -19,6 +19,7 @@ class Convergence:
     Attributes:
         nmse: of the channels, sum |difference|^2 / sum |channel|^2.
         spectrum_nmse, spectrum_mse, spectrum_psnr_db, spectrum_ssim: of the spectra.
+        power_db: 95th percentile of |difference| of the received power, of receivers that both reach [dB].
         receivers: how many were traced twice.
     """
 
@@ -27,6 +28,7 @@ class Convergence:
     spectrum_mse: float
     spectrum_psnr_db: float
     spectrum_ssim: float
+    power_db: float
     receivers: int
 
     def attributes(self) -> dict[str, float | int]:
@@ -38,6 +40,7 @@ def compare(
     csi: np.ndarray,
     spectrum: np.ndarray,
     peak: np.ndarray,
+    power: np.ndarray,
     again: Paths,
     campaign: Campaign,
     wavelength: float,
@@ -46,7 +49,7 @@ def compare(
 
     Args:
         csi: (n, A, K) of the file, without noise.
-        spectrum, peak: (n, H, W) uint8 and (n,) of the file.
+        spectrum, peak, power: (n, H, W) uint8, (n,) and (n,) of the file.
         again: the same receivers traced again.
         campaign: band, arrays and spectra.
         wavelength: at the carrier [m].
@@ -60,11 +63,15 @@ def compare(
     images = [spectrum / 255 * share, spectra(again, campaign.spectrum, frequency, wavelength)[0]]
     squared = ((images[0] - images[1]) ** 2).mean((1, 2))
     similar = [structural_similarity(a, b, data_range=1.0) for a, b in zip(*images, strict=True)]
+    twice = np.stack([power, again.received_power()])
+    twice = twice[:, (twice > 0).all(0)]
+    apart = np.abs(np.diff(10 * np.log10(twice), axis=0))
     return Convergence(
         nmse,
         float(squared.sum() / (images[0] ** 2).mean((1, 2)).sum()),
         float(squared.mean()),
         float(np.mean(-10 * np.log10(np.maximum(squared, 1e-12)))),
         float(np.mean(similar)),
+        float(np.quantile(apart, 0.95)) if apart.size else 0.0,
         len(squared),
     )

@@ -27,6 +27,7 @@ from gsparc.simulate.survey import Survey
 log = logging.getLogger(__name__)
 
 NONE = np.zeros(0, dtype=np.int64)
+TRIAL = 2  # how much more fewer rays are to save than their trial costs, because it may fail
 OWN = ("name", "num_receivers", "test_share", "seed")  # of a scene's settings: not of what is decided
 
 
@@ -51,6 +52,7 @@ class Decision:
         choice: what the requirement needs.
         effects: what is simulated: that, or everything where few rows are left, whose saving would not pay
             for compiling the solver for other effects.
+        samples: with how many rays of a call; None for those of the settings.
         changed: errors at held-back receivers; None where there are none.
         rows: (n,) of the survey, those that were traced.
         paths: of these rows, with `effects`.
@@ -58,21 +60,29 @@ class Decision:
 
     choice: Choice
     effects: Effects
+    samples: int | None = None
     changed: Changed | None = None
     rows: np.ndarray | None = None
     paths: Paths | None = None
 
+    @property
+    def as_chosen(self) -> bool:
+        """Whether the choice is what is simulated."""
+        return (self.effects, self.samples) == (self.choice.effects, self.choice.samples)
+
     def note(self) -> dict[str, Any]:
         """What a resumed run reads; without paths, which are in a shard."""
         changed = None if self.changed is None else [v.tolist() for v in vars(self.changed).values()]
-        return {"choice": asdict(self.choice), "effects": asdict(self.effects), "changed": changed}
+        about = {"choice": asdict(self.choice), "effects": asdict(self.effects)}
+        return {**about, "samples": self.samples, "changed": changed}
 
     @staticmethod
     def of(note: Mapping[str, Any]) -> Decision:
         """Inverse of `note`."""
         rows, errors = note["changed"] or ([], [])
         changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
-        return Decision(Choice.from_dict(note["choice"]), Effects(**note["effects"]), changed)
+        effects = Effects(**note["effects"])
+        return Decision(Choice.from_dict(note["choice"]), effects, note["samples"], changed)
 
 
 class Traced:
@@ -137,11 +147,12 @@ def busy_s() -> float:
 def pays(choice: Choice, rows: int, saved: float) -> bool:
     """Whether a share of the time of so many rows, saved, pays for compiling the solver for other effects.
 
-    Where rows were traced with the choice before, its kernels are in Dr.Jit's cache.
+    Where rows were traced with the choice before, its kernels are in Dr.Jit's cache. In a later run those of
+    everything are, of both sizes of a call, and all of the choice's are to be compiled.
     """
     if choice.row_chosen is not None or choice.row_all is None or choice.compiling is None:
         return rows > 0
-    return rows * choice.row_all * saved > choice.compiling
+    return rows * choice.row_all * saved > (2 if choice.reused else 1) * choice.compiling
 
 
 def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decision:
@@ -149,34 +160,52 @@ def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decisi
     begin = time.perf_counter()
     stored = platform_cache() / "scenes" / f"{_key(campaign, settings, survey)}.json"
     full = survey.engine.supported(settings.full)
+    probes, held = _groups(survey, settings, campaign.scene.seed)
     if settings.reuse and stored.exists():
         choice = Choice.from_dict(json.loads(stored.read_text(encoding="utf-8")))
-        log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
-        choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
-        return Decision(choice, _simulated(choice, full, len(survey)))
-    probes, held = _groups(survey, settings, campaign.scene.seed)
+        asked = len(probes) + len(held)
+        if not (choice.untried and _may_pay(choice, settings, full, len(survey) - asked, asked)):
+            log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
+            choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
+            return Decision(choice, *_simulated(campaign, choice, full, len(survey)))
     size = campaign.sampling.part if survey.engine.random else 1
     traced = Traced(survey, full, np.concatenate([probes, held]), size)
     choice, changed = _look(campaign, settings, survey, traced, probes), None
     if choice.effects == full:
-        log.info("auto: everything is needed")
+        log.info("auto: every effect is needed")
     else:
         log.info("auto: %s; verifying on held-back receivers", choice.effects)
         choice, changed = _verify(campaign, settings, traced, choice, held)
+        if choice.verdict is not None and not choice.verdict.kept:
+            log.info("auto: held-back receivers refute it; everything is needed")
+            choice = auto.everything(choice, full)
+    if settings.rays < 1 and survey.engine.random:
+        choice, changed = _fewer_rays(campaign, settings, traced, choice, changed, probes, held)
     choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
-    effects = _simulated(choice, full, len(survey) - len(traced.rows))
+    effects, samples = _simulated(campaign, choice, full, len(survey) - len(traced.rows))
     choice = replace(choice, seconds=time.perf_counter() - begin)
     _remember(stored, choice)
     rows = np.sort(traced.rows)
-    return Decision(choice, effects, changed, rows, traced.paths(rows).under(effects))
+    return Decision(choice, effects, samples, changed, rows, traced.paths(rows).under(effects))
 
 
-def _simulated(choice: Choice, full: Effects, rows: int) -> Effects:
-    """The choice, or everything where that is cheaper for so many rows."""
-    if choice.effects == full or pays(choice, rows, 1 - auto.price(choice.effects, full)):
-        return choice.effects
+def _simulated(campaign: Campaign, choice: Choice, full: Effects, rows: int) -> tuple[Effects, int | None]:
+    """Effects and rays of the choice, or everything where that is cheaper for so many rows."""
+    rays = 1.0 if choice.samples is None else choice.samples / campaign.sampling.samples
+    price = auto.price(choice.effects, full, rays)
+    if (choice.effects == full and rays == 1) or pays(choice, rows, 1 - price):
+        return choice.effects, choice.samples
     log.info("auto: everything is simulated: for %d receivers, compiling anew costs more", rows)
-    return full
+    return full, None
+
+
+def _may_pay(choice: Choice, settings: AutoSettings, full: Effects, rows: int, asked: int) -> bool:
+    """Whether trying fewer rays on rows that were asked can pay on so many others."""
+    if choice.row_all is None or choice.compiling is None:
+        return False
+    all_, fewer = (auto.price(choice.effects, full, rays) for rays in (1.0, settings.rays))
+    trial = asked * fewer * choice.row_all + choice.compiling
+    return rows * (all_ - fewer) * choice.row_all > TRIAL * trial
 
 
 def remember(campaign: Campaign, settings: AutoSettings, survey: Survey, choice: Choice) -> None:
@@ -213,14 +242,49 @@ def _look(
     raise AssertionError("the last look decides")
 
 
+def _fewer_rays(
+    campaign: Campaign, settings: AutoSettings, traced: Traced, choice: Choice, changed: Changed | None,
+    probes: np.ndarray, held: np.ndarray,
+) -> tuple[Choice, Changed | None]:  # fmt: skip
+    """Whether a share of the rays is enough: probes, then held-back rows, traced with the choice and those.
+
+    Rays that are fewer are other rays, so that no attribution tells. What was traced so is no row of the
+    file: the same rows are there with all rays.
+    """
+    survey, part = traced.survey, campaign.sampling.part
+    if len(survey) - len(traced.rows) > campaign.sampling.batch:
+        traced.paths(held[: auto.first_look(len(held))])  # rows of the file, which say what one costs
+    choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
+    if not _may_pay(choice, settings, traced.effects, len(survey) - len(traced.rows), len(traced.rows)):
+        return replace(choice, untried=True), changed
+    samples = max(round(settings.rays * campaign.sampling.samples), 1)
+    log.info("auto: probes with %d rays", samples)
+    fewer = Traced(survey.thinned(samples), choice.effects, np.concatenate([probes, held]), part)
+    for count in (auto.first_look(len(probes)), len(probes)):
+        rows, last = probes[:count], count == len(probes)
+        probe = _probe(campaign, traced, rows)
+        found = auto.fewer_rays(choice, settings, probe, fewer.paths(rows), samples, last)
+        if found is not None:
+            break
+    assert found is not None  # the last look decides
+    if found.samples is None:
+        return found, changed
+    verified, errors = _verify(campaign, settings, traced, found, held, fewer)
+    if verified.verdict is not None and not verified.verdict.kept:
+        return replace(auto.without_fewer_rays(found), verdict=choice.verdict), changed
+    return verified, errors
+
+
 def _verify(
-    campaign: Campaign, settings: AutoSettings, traced: Traced, choice: Choice, held: np.ndarray
-) -> tuple[Choice, Changed]:
+    campaign: Campaign, settings: AutoSettings, traced: Traced, choice: Choice, held: np.ndarray,
+    fewer: Traced | None = None,
+) -> tuple[Choice, Changed]:  # fmt: skip
     """On the first half of the held-back rows, and on all where that does not prove the requirement."""
     for count in (auto.first_look(len(held)), len(held)):
         probe = _probe(campaign, traced, held[:count])
-        choice = auto.verify(choice, settings, probe)
-        errors = probe.errors(choice.effects, settings.required)
+        kept = None if fewer is None else fewer.paths(held[:count])
+        choice = auto.verify(choice, settings, probe, kept)
+        errors = probe.errors(choice.effects if kept is None else kept, settings.required)
         failed = int((errors[probe.reached] > settings.required.tolerance).sum())
         heard = int(probe.reached.sum())
         early, _ = auto.allowed_failures(heard, len(held), settings.quantile, settings.confidence)

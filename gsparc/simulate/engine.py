@@ -39,6 +39,9 @@ class Engine(Protocol):
     def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
+    def thinned(self, samples: int) -> Engine:
+        """The same with so many rays of a call, where there are any."""
+
     def versions(self) -> dict[str, str]:
         """Versions of the solver's packages."""
 

@@ -42,6 +42,8 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         known = outcome.made.power[changed.rows] > 0
         errors, rows = changed.errors[known], changed.rows[known] % len(places)
         label = "error without what is not needed" if np.ptp(errors) > 0 else "all is needed"
+        if outcome.choice is not None and not outcome.choice.deliverable.startswith("spectrum"):
+            label += " [dB]"
         _map(panels[2], places[rows], errors, f"{label}: held-back receivers", 40.0, clipped=0.0)
     for panel in panels:
         if (~reached).any():

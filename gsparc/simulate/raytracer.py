@@ -11,7 +11,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -104,6 +104,12 @@ class RayTracer:
         """The same scene with the transmitter elsewhere."""
         other = copy(self)
         other.transmitter, other.antenna = np.asarray(transmitter, dtype=np.float64), antenna
+        return other
+
+    def thinned(self, samples: int) -> RayTracer:
+        """The same scene with so many rays of a call."""
+        other = copy(self)
+        other.sampling = replace(self.sampling, samples=samples)
         return other
 
     def supported(self, effects: Effects) -> Effects:
@@ -208,11 +214,12 @@ class RayTracer:
     def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Any | None:
         """Sionna's paths, or None when the solver ran into `limit` and left some out."""
         import sionna.rt as rt
-        from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
+        from sionna.rt.path_solvers import sb_candidate_generator as shooting
 
         self._place_ends(receivers, 2 if effects.polarisation else 1)
         # Chains of all receivers of a call share the table; collisions are dropped silently.
-        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = HASHES
+        shooting.SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = HASHES
+        shooting.fibonacci_lattice = _lattice
         solver = rt.PathSolver()
         counting = _CountingGenerator(solver._candidate_generator)
         solver._candidate_generator = counting
@@ -336,6 +343,16 @@ class RayTracer:
         )
         ray = mi.Ray3f(origin, mi.Vector3f(*map(float, direction)))
         return self._scene.mi_scene.ray_intersect(ray)
+
+
+def _lattice(points: int) -> Any:
+    """Sionna's, evaluated: else the number of rays is a constant of the largest kernel."""
+    import drjit as dr
+    from sionna.rt.utils.fibonacci import fibonacci_lattice
+
+    found = fibonacci_lattice(points)
+    dr.eval(found)
+    return found
 
 
 def calls(receivers: int, batch: int) -> list[tuple[int, int]]:

@@ -36,7 +36,9 @@ def reasons(choice: Choice) -> list[str]:
 
 def verdict(choice: Choice) -> str:
     """What was chosen, what it saves, and whether the requirement is met on held-back receivers."""
-    chosen = f"needed: {choice.effects}" + (", as decided before" if choice.reused else "")
+    chosen = f"needed: {choice.effects}"
+    chosen += "" if choice.samples is None else f", {choice.samples:,} rays"
+    chosen += ", as decided before" if choice.reused else ""
     if choice.saved is not None and choice.row_chosen and choice.row_all:
         chosen += (
             f"; a receiver takes {choice.row_chosen * 1e3:.0f} CPU ms instead of {choice.row_all * 1e3:.0f} "
@@ -45,7 +47,7 @@ def verdict(choice: Choice) -> str:
     found = choice.verdict
     if found is None:
         return chosen
-    outcome = "met" if found.kept else "NOT MET"
+    outcome = "met" if found.kept else f"NOT MET by less ({choice.refuted})"
     return (
         f"{chosen}; requirement {outcome}: {found.met:.1%} of {found.receivers} held-back receivers are "
         f"within tolerance (error {found.error:.2g} median, {found.error_p95:.2g} at 95 %)"
@@ -74,7 +76,16 @@ def figures(outcome: Outcome) -> dict[str, Any]:
             "auto/decide_s": choice.seconds,
             **{
                 f"auto/{k}": getattr(choice, k)
-                for k in ("deliverable", "probes", "row_all", "row_chosen", "saved", "reused")
+                for k in (
+                    "deliverable",
+                    "probes",
+                    "samples",
+                    "untried",
+                    "row_all",
+                    "row_chosen",
+                    "saved",
+                    "reused",
+                )
             },
         }
         for row in choice.table:

@@ -64,6 +64,10 @@ class ShoeboxEngine:
             order,
         )
 
+    def thinned(self, samples: int) -> ShoeboxEngine:
+        """Itself: there are no rays."""
+        return self
+
     def fingerprint(self) -> str:
         """Of the room."""
         return sha256(repr(self.room).encode()).hexdigest()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,6 +54,10 @@ class Survey:
     def receivers(self) -> np.ndarray:
         """The receiver's place (S, 3) [m] of each row."""
         return np.tile(self.places, (len(self.engines), 1))
+
+    def thinned(self, samples: int) -> Survey:
+        """The same with so many rays of a call."""
+        return replace(self, engines=[engine.thinned(samples) for engine in self.engines])
 
     def distances(self) -> np.ndarray:
         """Between the ends of each row (S,) [m]."""

@@ -134,6 +134,21 @@ def test_gradients_are_the_powers_own(wall):
 
 
 @pytest.mark.slow
+def test_steps_compile_nothing(wall):
+    """Flags of paths were changed in place: each step had a longer kernel than the one before."""
+    import drjit as dr
+
+    materials = {name: TRUE.logarithms() for name in used_materials(wall)}
+    replay, longest = Replay(wall, places(), PLAIN), []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for _ in range(3):
+            dr.kernel_history()
+            replay.decibels(materials, lambda db: (0.0, np.ones(60)))
+            longest.append(max(kernel.get("operation_count", 0) for kernel in dr.kernel_history()))
+    assert longest[1] == longest[2]
+
+
+@pytest.mark.slow
 def test_a_replay_is_the_trace(wall):
     apply(wall, dict.fromkeys(used_materials(wall), TRUE))
     traced = wall.trace(places(), PLAIN).received_power()

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import pytest
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.deciding import Traced, pays
+from gsparc.simulate.deciding import Decision, Traced, pays
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -133,6 +134,38 @@ def test_prices_rank_sets():
     )
 
 
+def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
+    """By powers and channels of another trace: of none of 64 outside, or of 3 of 128."""
+    settings, whole = AutoSettings(full=FULL), Invented(RECORD).trace(np.zeros((128, 3)), FULL)
+    choice = dataclasses.replace(decided("coverage +-1 dB"), effects=FULL)
+
+    def tried(outside, count, last):
+        probe = Probe(whole.take(np.arange(count)), FULL, np.array([2.4e9]), 0.125, np.zeros((1, 3)),
+                      SpectrumSettings())  # fmt: skip
+        gain = probe.paths.gain * 1.05
+        gain[: outside * len(RECORD)] *= 2
+        return auto.fewer_rays(
+            choice, settings, probe, dataclasses.replace(probe.paths, gain=gain), 300, last
+        )
+
+    taken = tried(0, 64, last=False)
+    assert taken.samples == 300 and not taken.table[-1].kept and taken.table[-1].effect == "rays > 300"
+    assert taken.table[-1].error == pytest.approx(20 * np.log10(1.05), rel=1e-4)
+    assert taken.table[-1].nmse == pytest.approx(0.05**2, rel=1e-3)
+    assert tried(1, 64, last=False) is None and tried(3, 128, last=True).samples == 300
+    for refused in (tried(2, 64, last=False), tried(4, 128, last=True)):
+        assert refused.samples is None and refused.table[-1].kept
+    assert auto.without_fewer_rays(taken).samples is None and auto.without_fewer_rays(taken).table[-1].kept
+    assert Choice.from_dict(dataclasses.asdict(taken)) == taken
+    assert auto.price(FULL, FULL, 0.3) == pytest.approx(0.44)
+
+
+@pytest.mark.parametrize("wrong", [{"rays": 0}, {"rays": 2}, {"confidence": 1.0}, {"probes": 3}])
+def test_settings_that_cannot_be_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"effects\."):
+        AutoSettings(**wrong)
+
+
 def test_one_odd_receiver_does_not_keep_everything():
     """A single probe in a corner once kept every effect of a whole room."""
     engine, count = Invented(RECORD), 128
@@ -157,6 +190,11 @@ def test_a_violated_requirement_is_reported():
 def test_spectra_are_judged_against_the_nearest_receiver():
     choice = decided("spectrum skill 0.9")
     assert choice.effects.line_of_sight and choice.effects.specular
+    again = Invented(RECORD).trace(np.zeros((20, 3)), FULL)
+    small, sight = SpectrumSettings(height=18, width=36), again.select(again.order == 0)
+    same = Probe(again, FULL, np.array([2.4e9]), 0.125, np.zeros((1, 3)), small, sight)
+    assert (same.errors(again, Deliverable("spectrum", 0.1)) == 0).all()
+    assert (same.errors(again, Deliverable("csi", -20.0)) == -99).all()
     probe = Probe(Invented(RECORD).trace(np.zeros((2, 3)), FULL), FULL, np.array([2.4e9]), 0.125,
                   np.zeros((1, 3)), SpectrumSettings())  # fmt: skip
     with pytest.raises(ValueError, match="nearest"):
@@ -186,12 +224,15 @@ def test_removals_and_combinations_are_complete():
 def test_a_choice_survives_its_file():
     choice = decided("coverage +-1 dB")
     assert Choice.from_dict(dataclasses.asdict(choice)) == choice
+    noted = json.loads(json.dumps(Decision(choice, FULL, 300).note()))
+    assert Decision.of(noted) == Decision(choice, FULL, 300)
 
 
 def test_fewer_effects_are_compiled_for_only_where_that_pays():
     """A decision taken over compiled the solver anew for rows whose time was less than that of compiling."""
     unseen = dataclasses.replace(decided("coverage +-1 dB"), row_all=0.02, compiling=2.0)
-    assert not pays(unseen, 200, 0.2) and pays(unseen, 1000, 0.2)
+    assert not pays(unseen, 200, 0.2) and pays(unseen, 900, 0.2)
+    assert not pays(dataclasses.replace(unseen, reused=True), 900, 0.2)  # two sizes of calls
     assert pays(dataclasses.replace(unseen, row_chosen=0.018), 200, 0.2)  # its kernels are there
     assert pays(dataclasses.replace(unseen, compiling=None), 200, 0.2)
 

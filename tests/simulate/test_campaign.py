@@ -21,6 +21,7 @@ from gsparc.data.campaigns.sionna import _heard
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
+from gsparc.data.schema import LIGHT
 from gsparc.simulate import campaign as campaigns
 from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays
@@ -304,6 +305,86 @@ def test_probes_are_rows_of_the_file_and_a_decision_is_kept(tmp_path, monkeypatc
     assert not simulate(plan(effects=asked, scene=moved), tmp_path / "moved.h5").choice.reused
     fresh = replace(asked, reuse=False)
     assert not simulate(plan(effects=fresh), tmp_path / "fresh.h5").choice.reused
+
+
+class Rays(ShoeboxEngine):
+    """Our own engine as if it had rays: fewer than all miss by `off`."""
+
+    random, samples, off = True, None, 1.05
+
+    def thinned(self, samples):
+        other = Rays(self.room, self.transmitter, LIGHT / self.wavelength)
+        other.samples = samples
+        return other
+
+    def trace(self, receivers, effects, seed=None):
+        paths = super().trace(receivers, effects, seed)
+        miss = 1.0 if self.samples is None else Rays.off
+        return replace(paths, gain=paths.gain * np.float32(miss if seed is None else miss * 1.01))
+
+
+def with_rays(monkeypatch, off: float) -> AutoSettings:
+    monkeypatch.setattr("gsparc.simulate.scenes.build.ShoeboxEngine", Rays)
+    monkeypatch.setattr(Rays, "off", off)
+    monkeypatch.setattr(deciding, "_may_pay", lambda *unused: True)
+    monkeypatch.setattr(deciding, "pays", lambda *unused: True)
+    return AutoSettings(probes=64, held_back=64, full=MIRROR)
+
+
+def test_fewer_rays_are_simulated_where_held_back_receivers_allow_it(tmp_path, monkeypatch):
+    """The file says with how many; what was decided on has all of them, and is not in the solver's error."""
+    asked, many = with_rays(monkeypatch, 1.05), replace(SCENE, num_receivers=200)
+    whole = simulate(plan(scene=many, effects=replace(asked, rays=1.0)), tmp_path / "whole.h5")
+    outcome = simulate(plan(scene=many, effects=asked), tmp_path / "fewer.h5")
+    assert whole.choice.samples is None and outcome.choice.samples == 90_000
+    assert outcome.choice.verdict.kept and outcome.choice.verdict.error == pytest.approx(0.42, abs=0.01)
+    (all_, _), (fewer, about) = (arrays(tmp_path / f"{name}.h5") for name in ("whole", "fewer"))
+    assert json.loads(about["sampling"])["samples"] == json.loads(about["auto"])["samples"] == 90_000
+    ratio = fewer["received_power"] / all_["received_power"]
+    decided_on = np.isclose(ratio, 1.0, rtol=1e-5)
+    assert 128 <= decided_on.sum() < 200
+    np.testing.assert_allclose(ratio[~decided_on], 1.05**2, rtol=1e-4)
+    assert outcome.convergence.nmse == pytest.approx(1e-4, rel=0.01)
+    assert outcome.convergence.power_db == pytest.approx(20 * np.log10(1.01), rel=0.01)
+    assert "90,000 rays" in verdict(outcome.choice) and figures(outcome)["auto/samples"] == 90_000
+    again = simulate(plan(scene=replace(many, seed=3), effects=asked), tmp_path / "again.h5")
+    assert (
+        again.choice.reused and json.loads(arrays(tmp_path / "again.h5")[1]["sampling"])["samples"] == 90_000
+    )
+
+
+def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
+    outcome = simulate(plan(effects=with_rays(monkeypatch, 1.2)), tmp_path / "box.h5")
+    row = outcome.choice.table[-1]
+    assert outcome.choice.samples is None and row.effect == "rays > 90000" and row.kept and row.failures > 0
+    assert json.loads(arrays(tmp_path / "box.h5")[1]["sampling"])["samples"] == 300_000
+
+
+def test_a_decision_that_left_rays_untried_is_taken_anew_where_trying_pays(tmp_path, monkeypatch):
+    asked = with_rays(monkeypatch, 1.05)
+    with monkeypatch.context() as patch:
+        patch.setattr(deciding, "_may_pay", lambda *unused: False)
+        assert simulate(plan(effects=asked), tmp_path / "few.h5").choice.untried
+        assert simulate(plan(effects=asked), tmp_path / "same.h5").choice.reused
+    many = simulate(plan(effects=asked, scene=replace(SCENE, num_receivers=200)), tmp_path / "many.h5")
+    assert not many.choice.reused and many.choice.samples == 90_000
+
+
+def test_what_held_back_receivers_refute_is_not_simulated(tmp_path, monkeypatch):
+    """A run said NOT MET, simulated the choice all the same, and the next set of receivers took it over."""
+    real, full = deciding.auto.verify, Effects(**{**vars(MIRROR), "depth": 4})
+
+    def refuted(*arguments):
+        choice = real(*arguments)
+        return replace(choice, verdict=replace(choice.verdict, kept=False, met=0.9))
+
+    monkeypatch.setattr(deciding.auto, "verify", refuted)
+    asked = AutoSettings(probes=16, held_back=20, full=full)
+    outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
+    assert outcome.effects == outcome.choice.effects == full and outcome.choice.saved is None
+    assert "NOT MET by less (line of sight, specular, depth" in verdict(outcome.choice)
+    again = simulate(plan(effects=asked, scene=replace(SCENE, seed=3)), tmp_path / "again.h5")
+    assert again.choice.reused and again.effects == full
 
 
 def test_where_few_are_left_everything_is_kept(tmp_path):

@@ -139,7 +139,7 @@ def test_calls_have_one_of_few_sizes():
 
 def test_other_places_compile_nothing(places):
     """Each receiver's coordinates were constants of a kernel of its own, a fifth of the time of tracing, and
-    so was the number of receivers of a call."""
+    so were the number of receivers of a call and that of rays."""
     import drjit as dr
 
     room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK)
@@ -148,7 +148,10 @@ def test_other_places_compile_nothing(places):
         dr.kernel_history()
         room.trace(places[20:50], PLAIN)
         compiled = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
+        room.thinned(1777).trace(places[:50], PLAIN)
+        anew = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
     assert len(compiled) < 10  # of what follows the number of paths
+    assert all(kernel["operation_count"] < 1000 for kernel in anew if kernel["size"] == 1777)  # of rays
 
 
 def test_polarisation_edges_and_scattering_are_recorded(room, places):
