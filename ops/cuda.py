@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import _native, calls, cuda_library, validation
-from gsparc.ops.geometry import Gaussians, Pose
+from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.operators import (
     Buffers,
     Poses,
@@ -29,7 +29,6 @@ from gsparc.ops.operators import (
     kernel_view,
     make_plan,
     mean_weights,
-    thaw,
 )
 from gsparc.ops.plan import Plan
 from gsparc.ops.settings import KernelSettings
@@ -211,3 +210,14 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     rank_of[order] = torch.arange(len(order), device=order.device)
     of_entries = buffers.entries[len(starts) : len(starts) + capacity].to(torch.int64)
     return order, (starts, ends, rank_of[of_entries].to(torch.int32), blocks)
+
+
+def thaw(
+    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
+) -> Tensor:
+    """Images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
+    columns = validation.seen_features(features, order, picked).contiguous()
+    image = columns.new_empty(columns.shape[1], grid.height, grid.width)
+    if image.numel():
+        calls.run("thaw", columns, *buffers, columns, image, sizes=image.shape)
+    return image

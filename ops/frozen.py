@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.ops import backends, validation
+from gsparc.ops import backends
 from gsparc.ops.geometry import SphereGrid
 from gsparc.ops.transforms import beyond_kernels
 
@@ -41,31 +41,39 @@ class FrozenPlan:
         Raises:
             StalePlan: if `version`, the field's counter now, is not the one this view was made from.
             RuntimeError: under `torch.func` and in forward mode, where a constant would be no answer.
-            ValueError, TypeError: features of another number or dtype, or (on the CPU) not finite.
+            ValueError, TypeError: features of another number, dtype or device, or (on the CPU) not finite.
         """
         if version != self.version:
             raise StalePlan(
                 f"this view was frozen at version {self.version}, the field is at {version}: freeze again"
             )
-        return self.compose(features.index_select(-2, self.order))
+        return self._drawn(features, picked=False)
 
     @torch.no_grad()
     def compose(self, seen: Tensor) -> Tensor:
         """As `render`, of features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
-        if beyond_kernels(seen):
-            raise RuntimeError(
-                "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"
-            )
-        if seen.dtype != self.buffers[-1].dtype:
-            raise TypeError(f"features are {seen.dtype}, this view was frozen in {self.buffers[-1].dtype}")
         if seen.dim() not in (2, 3) or seen.shape[-2] != len(self.order):
             count = len(self.order)
             raise ValueError(
                 f"features must be ({count}, C) or (B, {count}, C) of those seen, got {tuple(seen.shape)}"
             )
-        validation.check_features(seen, self.order)
-        batch = seen if seen.dim() == 3 else seen.unsqueeze(0)
-        samples, count, channels = batch.shape
-        columns = batch.transpose(0, 1).reshape(count, samples * channels)
-        image = backends.named(self.backend).thaw(self.grid, self.buffers, columns)
-        return image.unflatten(0, (samples, channels)) if seen.dim() == 3 else image
+        return self._drawn(seen, picked=True)
+
+    def _drawn(self, features: Tensor, *, picked: bool) -> Tensor:
+        if beyond_kernels(features):
+            raise RuntimeError(
+                "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"
+            )
+        if features.dtype != self.buffers[-1].dtype:
+            raise TypeError(
+                f"features are {features.dtype}, this view was frozen in {self.buffers[-1].dtype}"
+            )
+        if features.device != self.order.device:
+            raise ValueError(
+                f"features are on {features.device} but this view on {self.order.device}; move one"
+            )
+        if features.dim() not in (2, 3):
+            raise ValueError(f"features must be (N, C) or (B, N, C), got {tuple(features.shape)}")
+        batch = features if features.dim() == 3 else features.unsqueeze(0)
+        image = backends.named(self.backend).thaw(self.grid, self.buffers, batch, self.order, picked)
+        return image.unflatten(0, batch.shape[::2]) if features.dim() == 3 else image

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 from torch.library import CustomOpDef, custom_op
 
-from gsparc.ops import built, calls
+from gsparc.ops import built
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
 from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
-from gsparc.ops.transforms import carries_tangent, differentiated_forward, transforming
+from gsparc.ops.transforms import carries_tangent, unwatched
 
 KERNELS: dict[str, dict[str, Callable[..., Any]]] = {"cpu": {}, "cuda": {}}
 """What computes an operator, by type of device and name; see `kernel`."""
@@ -113,22 +113,6 @@ class Operator:
                 f"{self.defined._qualname} has no forward-mode derivative; take backend='reference'"
             )
         return self.defined(*flat)
-
-
-def unwatched(values: Iterable[Any]) -> bool:
-    """Whether torch would only pass a call on: nothing records, traces, maps, fakes or differentiates."""
-    if transforming() or differentiated_forward() or torch.compiler.is_compiling():
-        return False
-    if torch._C._get_tracing_state() is not None or torch._C._len_torch_function_stack():
-        return False
-    if torch._C._len_torch_dispatch_stack():
-        return False
-    recorded, plain = torch.is_grad_enabled(), (Tensor, torch.nn.Parameter)
-    return all(
-        type(value) in plain and value.is_cpu and not (recorded and value.requires_grad)
-        for value in values
-        if isinstance(value, Tensor)
-    )
 
 
 def _no_second_derivative(ctx, *slopes):
@@ -371,15 +355,6 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     seen, total = weights_op.of(gaussians, *view_of(plan))
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
-
-
-def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
-    """Image (K, H, W) of features (V, K) in the order and precision of `freeze`."""
-    features = features.contiguous()
-    image = features.new_empty(features.shape[1], grid.height, grid.width)
-    if image.numel():
-        calls.run("thaw", features, *buffers, features, image, sizes=image.shape)
-    return image
 
 
 def check_memory(entries: int, bytes_each: int) -> None:

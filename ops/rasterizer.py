@@ -14,8 +14,8 @@ from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.projection import Projection
 from gsparc.ops.results import Raster, Weights
-from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, kernel_settings
+from gsparc.ops.transforms import beyond_kernels, unwatched
 
 
 def make_plan(
@@ -108,6 +108,7 @@ def composite(
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
     values = validation.features(features, means, plan.pose)
+    validation.check_features(features)
     plain = beyond_kernels(*gaussians, features)
     trained = _trained(plan, *gaussians, features) and not plain
     means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
@@ -134,7 +135,19 @@ def rasterize(
     ids: Tensor | None = None,
     backend: str | None = None,
 ) -> Raster:
-    """`make_plan`, then `composite`: see there. `features` (N, C) or (B, N, C) holds real channels."""
+    """`make_plan`, then `composite`: see there. `features` (N, C) or (B, N, C) holds real channels.
+
+    Where no gradient is asked for, the `cpu` backend does both in one call and keeps no plan; same bits.
+    """
+    chosen = backends.choose(backend, means.device)
+    at_once = getattr(chosen, "rasterize", None)
+    given = (means, quats, scales, opacities, extinctions, ids, features, *vars(pose).values())
+    if at_once is not None and unwatched(given):
+        gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
+        optics = Optics(projection, low_pass, compensate, near, cutoff)
+        poses = validation.poses(pose, means)
+        values = validation.features(features, means, poses)
+        return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))
     plan = make_plan(
         *(means, quats, scales, opacities, pose, grid),
         projection=projection,

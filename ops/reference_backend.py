@@ -89,9 +89,12 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 @full_precision
-def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
-    """Image (K, H, W) of features (N, K) in the order of `freeze`."""
-    return (features.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
+def thaw(
+    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
+) -> Tensor:
+    """Images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
+    columns = validation.seen_features(features, order, picked)
+    return (columns.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
 
 
 def _stacked(parts: list[Tensor], none: Tensor) -> Tensor:

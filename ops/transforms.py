@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, cast
 
 import torch
@@ -59,3 +59,19 @@ def transforming() -> bool:
 def beyond_kernels(*values: Any) -> bool:
     """Whether plain PyTorch must compute what a kernel would answer without its derivative, or not at all."""
     return transforming() or carries_tangent(*values)
+
+
+def unwatched(values: Iterable[Any]) -> bool:
+    """Whether torch would only pass a call on: nothing records, traces, maps, fakes or differentiates."""
+    if transforming() or differentiated_forward() or torch.compiler.is_compiling():
+        return False
+    if torch._C._get_tracing_state() is not None or torch._C._len_torch_function_stack():
+        return False
+    if torch._C._len_torch_dispatch_stack():
+        return False
+    recorded, plain = torch.is_grad_enabled(), (Tensor, torch.nn.Parameter)
+    return all(
+        type(value) in plain and value.is_cpu and not (recorded and value.requires_grad)
+        for value in values
+        if isinstance(value, Tensor)
+    )

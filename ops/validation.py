@@ -146,13 +146,12 @@ def raise_for_ids() -> None:
 
 
 def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
-    """Features (N, C) or (B, N, C) as (B, N, C), checked against the Gaussians and the poses (ValueError)."""
+    """Features (N, C) or (B, N, C) as (B, N, C), as many as Gaussians and poses (ValueError, TypeError)."""
     _check_dtype_and_device("features", values, means)
     if values.dim() not in (2, 3) or values.shape[-2] != means.shape[0]:
         raise ValueError(
             f"features must be ({means.shape[0]}, C) or (B, {means.shape[0]}, C), got {tuple(values.shape)}"
         )
-    check_features(values)
     poses = len(pose)
     if values.dim() == 2:
         return values.expand(poses, *values.shape)
@@ -171,6 +170,19 @@ def check_features(values: Tensor, rows: Tensor | None = None) -> None:
         if bool(bad.any()):
             index = torch.argmax(bad.to(torch.int8))
             raise_for("features", int(index if rows is None else rows[index]))
+
+
+def seen_features(values: Tensor, order: Tensor, picked: bool) -> Tensor:
+    """Features (B, N, C) of `order` (V,), or those already `picked`, side by side (V, B C).
+
+    Raises:
+        ValueError: features that are not finite or too few, on the CPU.
+    """
+    if not picked and not values.is_cuda and len(order) and int(order.max()) >= values.shape[1]:
+        raise ValueError(f"this view shows Gaussian {int(order.max())}, got features of {values.shape[1]}")
+    seen = values if picked else values.index_select(1, order)
+    check_features(seen, order)
+    return seen.transpose(0, 1).reshape(seen.shape[1], values.shape[0] * values.shape[2])
 
 
 def poses(pose: Pose, means: Tensor) -> Pose:

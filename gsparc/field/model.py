@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -199,34 +200,37 @@ class GaussianModel(nn.Module):
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
         features = self.features(tx, rx)
-        plan = self.plan(rx)
         if self.site.kind == "spectrum":
-            raster = ops.composite(plan, *self.gaussians.geometry(), features)
+            raster = self.raster(features, rx)
             image, unknown = raster.image, self.unknown(tx, rx)
             mean = self.response(image, unknown) if self.response else image.squeeze(1)
             return Rendered(mean, raster, unknown)
-        weights = ops.mean_weights(plan, *self.gaussians.geometry()).share
+        weights = ops.mean_weights(self.plan(rx), *self.gaussians.geometry()).share
         if self.response is None:
             return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
         gains = torch.view_as_complex(features.contiguous())
         return Rendered(self.response(weights * gains), None)
 
+    def raster(self, features: Tensor, rx: Pose) -> Raster:
+        """Images of features (B, N, C) from one pose, or each from its own of B."""
+        return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._optics())
+
     def plan(self, rx: Pose) -> Plan:
         """Footprints and depth order from one pose, or from each of B."""
-        settings = self.settings.raster
-        image = self.site.kind == "spectrum"
-        cutoff = Cutoff(settings.alpha_cutoff if image else settings.relative_cutoff, relative=not image)
-        return ops.make_plan(
-            *self.gaussians.geometry(),
-            rx,
-            self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS),
-            projection=settings.projection,
-            low_pass=settings.low_pass,
-            compensate=settings.compensate,
-            cutoff=cutoff,
-            ids=self.gaussians.ids,
-            backend=settings.backend,
-        )
+        return ops.make_plan(*self.gaussians.geometry(), rx, **self._optics())
+
+    def _optics(self) -> dict[str, Any]:
+        settings, image = self.settings.raster, self.site.kind == "spectrum"
+        least = settings.alpha_cutoff if image else settings.relative_cutoff
+        return {
+            "grid": self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS),
+            "projection": settings.projection,
+            "low_pass": settings.low_pass,
+            "compensate": settings.compensate,
+            "cutoff": Cutoff(least, relative=not image),
+            "ids": self.gaussians.ids,
+            "backend": settings.backend,
+        }
 
     def freeze(self, rx: Pose) -> FrozenPlan:
         """The pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
-from gsparc.ops import FrozenPlan, Pose, composite, freeze, make_plan, mean_weights
+from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
 from gsparc.peers.gaussians import (
     GEOMETRY_RATES,
     GaussianNetwork,
@@ -92,12 +92,11 @@ class ComplexGaussians(GaussianNetwork):
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W) or channels (B, A, K)."""
         sent, geometry = self.radiance(tx, rx), self.field.geometry()
-        plan = make_plan(*geometry, rx, self.grid, **self.options)
         if self.response is not None:
-            seen = mean_weights(plan, *geometry).share
+            seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
             arriving = seen * torch.view_as_complex(sent.contiguous())
             return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
-        return _magnitude(composite(plan, *geometry, sent).image)
+        return _magnitude(rasterize(*geometry, sent, rx, self.grid, **self.options).image)
 
     def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `GaussianNetwork`; of channels the root mean square over antennas and tones."""

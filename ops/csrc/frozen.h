@@ -1,69 +1,60 @@
-// A static receiver's weights as blocks of lanes (sparse: rank, tile, weights), and images from them.
+// A static receiver's weights as blocks of lanes, tile by tile, and images from them.
 #pragma once
+#include "finite.h"
 #include "forward.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
 
 template <class S> struct FreezeArgs : ViewArgs<S> {  // of one pose
-    int64_t* starts;                // (strips + 1), first block of each strip; [1:] is counted while heads is null
-    int32_t* heads;                 // (blocks, 2) rank and tile of the strip
+    int64_t* starts;                // (strips tiles + 1), first block of each tile; [1:] is counted while ranks is null
+    int32_t* ranks;                 // (blocks,)
     S* weights;                     // (blocks, lanes)
-    FreezeArgs(const Call& call, Reader& in) : ViewArgs<S>(call, in) { in.read(starts, heads, weights); }
+    FreezeArgs(const Call& call, Reader& in) : ViewArgs<S>(call, in) { in.read(starts, ranks, weights); }
 };
 
 template <class S> struct ThawArgs {
-    int channels, height, width, threads;
+    int channels, height, width, samples, seen, given, threads;
     const int64_t* starts;
-    const int32_t* heads;
-    const S *weights, *features;    // features (V, K) by rank
-    S* image;                       // (K, H, W)
+    const int32_t* ranks;
+    const S *weights, *features;    // features (samples, given, channels)
+    const int64_t* rows;            // (seen,) of the features by rank; null: the rank
+    S* image;                       // (samples channels, H, W)
     explicit ThawArgs(const Call& call) : threads(call.threads) {
         Reader in(call);
-        in.sizes(channels, height, width);
-        in.read(starts, heads, weights, features, image);
+        in.sizes(samples, channels, height, width, seen, given);
+        in.read(starts, ranks, weights, features, rows, image);
     }
 };
 
-// Counts the blocks of a strip (heads null) or writes them, tile by tile and front to back within a tile.
+// Counts the blocks of each tile of a strip (ranks null) or writes them, front to back.
 template <class P, class S, bool kHides>
 void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.settings.height, task);
     const Vec<S> alpha_max = splat(a.settings.alpha_max), floor = splat(a.settings.transmittance_min);
     const Lights<S> lights = {before, n, floor};
-    Buffer<int64_t> next(stage.tiles);
-    for (int pass = 0; pass < (a.heads ? 2 : 1); ++pass) {  // how many blocks each tile has, then the blocks
-        if (pass == 1) {
-            int64_t start = a.starts[task];
-            for (int tile = 0; tile < stage.tiles; ++tile) {
-                const int64_t count = next[tile];
-                next[tile] = start, start += count;
-            }
+    int64_t* const starts = a.starts + int64_t(task) * stage.tiles;
+    Buffer<int64_t> counts(stage.tiles);
+    fill(before, int64_t(stage.tiles) * n, S(1));
+    const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
+        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        for (; hit < end; ++hit) {
+            typename Shape<S, P>::Seen seen;
+            const Vec<S> light = load(before + *hit * n);
+            const Mask<S> counts_here = shape.look(*hit, seen) & at_most(floor, light);
+            if (!any(counts_here)) continue;
+            const Layer<S, kHides> layer(seen.form, counts_here, opacity, extinction, alpha_max);
+            const Vec<S> weight = light * layer.alpha;
+            store(before + *hit * n, layer.behind(light, weight));
+            const int64_t number = counts[*hit]++;
+            if (!a.ranks) continue;
+            a.ranks[starts[*hit] + number] = rank;
+            store(a.weights + (starts[*hit] + number) * n, weight);
         }
-        fill(before, int64_t(stage.tiles) * n, S(1));
-        const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
-            const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
-            for (; hit < end; ++hit) {
-                typename Shape<S, P>::Seen seen;
-                const Vec<S> light = load(before + *hit * n);
-                const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
-                if (!any(counts)) continue;
-                const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
-                const Vec<S> weight = light * layer.alpha;
-                store(before + *hit * n, layer.behind(light, weight));
-                const int64_t block = next[*hit]++;
-                if (pass == 0) continue;
-                a.heads[2 * block] = rank, a.heads[2 * block + 1] = *hit;
-                store(a.weights + block * n, weight);
-            }
-        };
-        sweep<P>(strip, a.plan, stage, lines, batch, lights, visit);
-    }
-    if (a.heads) return;
-    int64_t total = 0;
-    for (int tile = 0; tile < stage.tiles; ++tile) total += next[tile];
-    a.starts[task + 1] = total;
+    };
+    sweep<P>(strip, a.plan, stage, lines, batch, lights, visit);
+    for (int tile = 0; !a.ranks && tile < stage.tiles; ++tile) starts[tile + 1] = counts[tile];
 }
 
 // Returns the lanes of a block.
@@ -76,31 +67,37 @@ template <class S> int64_t freeze(const Call& call) {
     return Lanes<S>::n;
 }
 
-// Channels [first, first + kMany) of the tile whose blocks begin at `block`, up to `past` at most; returns where they end.
-// Sums stay in registers.
-template <class S, int kMany> GSPARC_INLINE int64_t thaw_channels(const ThawArgs<S>& a, int64_t block, int64_t past, int first, S* cells) {
-    constexpr int n = Lanes<S>::n;
-    const int32_t tile = a.heads[2 * block + 1];
-    Vec<S> sums[kMany] = {};
-    for (; block < past && a.heads[2 * block + 1] == tile; ++block) {
-        const S* feature = a.features + int64_t(a.heads[2 * block]) * a.channels + first;
-        const Vec<S> weight = load(a.weights + block * n);
-        for (int k = 0; k < kMany; ++k) sums[k] = fma(splat(feature[k]), weight, sums[k]);
-    }
-    for (int k = 0; k < kMany; ++k) store(cells + (int64_t(tile) * a.channels + first + k) * n, sums[k]);
-    return block;
+// Channels [first, first + kMany) of the tile whose blocks are [block, past), of features (seen, k_count). Sums stay in
+// registers; where they are few, neighbouring blocks have sums of their own: one would wait for the other.
+template <class S, int kMany> GSPARC_INLINE void thaw_channels(const ThawArgs<S>& a, const S* features, int k_count, int64_t block, int64_t past, int first, S* cell) {
+    constexpr int n = Lanes<S>::n, chains = kMany > 2 ? 1 : 4;
+    constexpr int64_t ahead = 8192 / sizeof(Vec<S>);  // blocks: two pages, at whose ends the machine's own prefetching stops
+    Vec<S> sums[chains][kMany] = {};
+    const auto add = [&](int64_t at, Vec<S>* to) __attribute__((always_inline)) {
+        if (first == 0) __builtin_prefetch(a.weights + (at + ahead) * n, 0, 2);  // as far as the second cache
+        const S* feature = features + int64_t(a.ranks[at]) * k_count + first;
+        const Vec<S> weight = load(a.weights + at * n);
+        for (int k = 0; k < kMany; ++k) to[k] = fma(splat(feature[k]), weight, to[k]);
+    };
+    for (; block + chains <= past; block += chains)
+        for (int chain = 0; chain < chains; ++chain) add(block + chain, sums[chain]);
+    for (int chain = 0; block < past; ++block, ++chain) add(block, sums[chain]);
+    for (int half = chains / 2; half > 0; half /= 2)
+        for (int chain = 0; chain < half; ++chain)
+            for (int k = 0; k < kMany; ++k) sums[chain][k] += sums[chain + half][k];
+    for (int k = 0; k < kMany; ++k) store(cell + (first + k) * n, sums[0][k]);
 }
 
-template <class S> void thaw_strip(const ThawArgs<S>& a, int task, S* cells) {
+template <class S> void thaw_strip(const ThawArgs<S>& a, const S* features, int k_count, int task, S* cells) {
     constexpr int n = Lanes<S>::n, many = 16;
-    const int k_count = a.channels, cell = k_count * n, row0 = task * kStripRows;
-    fill(cells, int64_t(tiles_across<S>(a.width)) * cell, S(0));
-    const int64_t past = a.starts[task + 1];
-    for (int64_t block = a.starts[task], end = block; block < past && k_count > 0; block = end) {
+    const int cell = k_count * n, row0 = task * kStripRows, tiles = tiles_across<S>(a.width);
+    for (int tile = 0; tile < tiles; ++tile) {
+        const int64_t *at = a.starts + int64_t(task) * tiles + tile, block = at[0], past = at[1];
+        S* const mine = cells + int64_t(tile) * cell;
         int done = 0;  // all channels of a tile before the next: its weights stay near
-        for (; done + many <= k_count; done += many) end = thaw_channels<S, many>(a, block, past, done, cells);
-        for (; done + 2 <= k_count; done += 2) end = thaw_channels<S, 2>(a, block, past, done, cells);
-        if (done < k_count) end = thaw_channels<S, 1>(a, block, past, done, cells);
+        for (; done + many <= k_count; done += many) thaw_channels<S, many>(a, features, k_count, block, past, done, mine);
+        for (; done + 2 <= k_count; done += 2) thaw_channels<S, 2>(a, features, k_count, block, past, done, mine);
+        if (done < k_count) thaw_channels<S, 1>(a, features, k_count, block, past, done, mine);
     }
     Strip<S> strip;
     strip.row0 = row0, strip.row1 = row0 + kStripRows < a.height ? row0 + kStripRows : a.height;
@@ -111,13 +108,31 @@ template <class S> void thaw_strip(const ThawArgs<S>& a, int task, S* cells) {
     });
 }
 
+// Returns -1, kUnsoundFeatures, or the first rank whose row the features do not have.
 template <class S> int64_t thaw(const Call& call) {
     const ThawArgs<S> a(call);
-    const int64_t scratch = int64_t(tiles_across<S>(a.width)) * Lanes<S>::n * a.channels;
-    Buffer<S> memory(scratch * a.threads);
-    auto strip = [&](int task, int worker) { thaw_strip<S>(a, task, memory.data + worker * scratch); };
+    const int k_count = a.samples * a.channels;
+    for (int rank = 0; a.rows && rank < a.seen; ++rank)
+        if (a.rows[rank] < 0 || a.rows[rank] >= a.given) return rank;
+    const bool as_they_are = !a.rows && a.samples == 1;
+    Buffer<S> side_by_side(as_they_are ? 0 : int64_t(a.seen) * k_count, false);  // (seen, samples channels)
+    constexpr int chunk = 512;
+    auto pick = [&](int task, int) {  // rank by rank: what is written lies together
+        for (int rank = task * chunk; rank < a.seen && rank < (task + 1) * chunk; ++rank) {
+            S* to = side_by_side.data + int64_t(rank) * k_count;
+            const int64_t row = a.rows ? a.rows[rank] : rank;
+            for (int sample = 0; sample < a.samples; ++sample)
+                for (int k = 0; k < a.channels; ++k) *to++ = a.features[(int64_t(sample) * a.given + row) * a.channels + k];
+        }
+    };
+    if (!as_they_are) parallel_for((a.seen + chunk - 1) / chunk, a.threads, pick);
+    const S* features = as_they_are ? a.features : side_by_side.data;
+    if (!all_finite(features, int64_t(a.seen) * k_count)) return kUnsoundFeatures;
+    const int64_t scratch = int64_t(tiles_across<S>(a.width)) * Lanes<S>::n * k_count;
+    Buffer<S> memory(scratch * a.threads, false);
+    auto strip = [&](int task, int worker) { thaw_strip<S>(a, features, k_count, task, memory.data + worker * scratch); };
     parallel_for(strips_of(a.height), a.threads, strip);
-    return 0;
+    return -1;
 }
 
 }  // namespace GSPARC_ISA

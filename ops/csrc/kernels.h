@@ -33,8 +33,10 @@ const char* instruction_set();
 bool use_instruction_set(const char* name);  // for tests; false if this machine or build lacks it
 
 // Of plan.cpp. The first fills a plan but for its entries; returns -1, the first unsound Gaussian as `Kernels::project`
-// does, or kUnsoundPose. The second fills the entries.
+// does, or kUnsoundPose. The second fills the entries. The third makes a plan that it keeps to itself, and its image:
+// returns as the first, kUnsoundFeatures, or kRefused less the entries where they need more bytes than numbers[0].
 int64_t plan(const Call& call);
 int64_t entries(const Call& call);
+int64_t rasterize(const Call& call);
 
 }  // namespace gsparc

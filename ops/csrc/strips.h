@@ -58,7 +58,7 @@ template <class S> struct Strip {
         first = plan.entries + plan.strip_starts[task], last = plan.entries + plan.strip_starts[task + 1];
         boxes = plan.boxes + int64_t(pose) * plan.count, records = plan.records + int64_t(pose) * plan.count * kRecord;
         order = plan.order + int64_t(pose) * plan.count;
-        slots = plan.slots + int64_t(pose) * (plan.count + 1);
+        slots = plan.slots ? plan.slots + int64_t(pose) * (plan.count + 1) : nullptr;  // absent where only an image is made
     }
     int64_t slot(int rank) const { return slots[rank] + index - boxes[rank].row0 / kStripRows; }
 };

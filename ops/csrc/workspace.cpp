@@ -7,7 +7,7 @@
 namespace gsparc {
 namespace {
 
-constexpr int kKept = 24;
+constexpr int kKept = 48;
 constexpr int64_t kMostKept = int64_t(1) << 28, kLine = 64;  // bytes
 
 struct Header {

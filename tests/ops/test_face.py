@@ -148,6 +148,28 @@ def test_frozen_view_renders_the_same(backend, dtype):
     assert torch.allclose(frozen.render(scene.features[0], version=3), want[0], atol=1e-5)
 
 
+@pytest.mark.parametrize("channels", [0, 1, 3, 19])
+@pytest.mark.parametrize("samples", [1, 2])
+def test_frozen_view_of_any_number_of_channels(channels, samples):
+    """Few channels add neighbouring blocks apart, many all at once."""
+    scene, pose = random_scene(n=300, channels=channels, samples=samples), poses(0)
+    plan = make_plan(**parts(scene), pose=pose, grid=GRIDS["patch"])
+    frozen = freeze(plan, **parts(scene), version=0)
+    want = composite(plan, **parts(scene), features=scene.features).image
+    assert torch.allclose(frozen.render(scene.features, version=0), want, rtol=0, atol=1e-12)
+    assert torch.allclose(frozen.compose(scene.features[:, frozen.order]), want, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_frozen_view_of_features_that_are_too_few(backend):
+    """The kernel picks the rows itself: it may not read beyond them."""
+    scene = random_scene(n=60)
+    plan = make_plan(**parts(scene), pose=poses(0), grid=GRID, backend=backend)
+    frozen = freeze(plan, **parts(scene), version=0)
+    with pytest.raises(ValueError, match=r"this view shows Gaussian \d+, got features of 5"):
+        frozen.render(scene.features[:, :5], version=0)
+
+
 def test_frozen_view_knows_when_it_is_stale():
     scene = random_scene()
     plan = make_plan(**parts(scene), pose=poses(0), grid=GRID)

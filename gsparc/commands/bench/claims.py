@@ -16,6 +16,11 @@ from gsparc.commands.bench.scene import Scene, scene
 from gsparc.methods.timing import ClockSettings
 from gsparc.ops.projection import Projection
 
+# Of forward / limit: for fewer Gaussians than MANY, and for more. Where it comes from: docs/cpu.md.
+FORWARD: dict[Projection, tuple[float, float]] = {"tangent": (4.0, 5.0), "equirect": (3.0, 4.0)}
+MANY = 25_000
+FROZEN = 1.5  # times the bytes that it must read
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -58,6 +63,7 @@ def claims(
             *_backward(middle, clock),
             *_forward(fields[1:], machine, clock),
             *_frozen(middle, batch, clock),
+            *_product(fields[1:], machine, clock),
             *_channels(middle, clock),
             *_growth(fields, clock),
             *_learning(projection),
@@ -73,7 +79,16 @@ def _backward(field: Scene, clock: ClockSettings) -> list[Claim]:
 
 def _forward(fields: list[Scene], machine: Machine, clock: ClockSettings) -> list[Claim]:
     rows = [measure(kernels.moving(field, 1), machine, None, clock, references=False) for field in fields]
-    return [Claim(f"forward / limit at {row.case.count}", row.over, 3.0) for row in rows]
+    bounds = [FORWARD[field.projection][len(field) > MANY] for field in fields]
+    return [
+        Claim(f"forward / limit at {row.case.count}", row.over, bound)
+        for row, bound in zip(rows, bounds, strict=True)
+    ]
+
+
+def _product(fields: list[Scene], machine: Machine, clock: ClockSettings) -> list[Claim]:
+    rows = [measure(kernels.frozen(field, 1), machine, None, clock, references=False) for field in fields]
+    return [Claim(f"frozen / bytes at {row.case.count}", row.over, FROZEN) for row in rows]
 
 
 def _channels(field: Scene, clock: ClockSettings) -> list[Claim]:

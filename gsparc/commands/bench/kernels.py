@@ -8,7 +8,7 @@ from torch import Tensor
 from gsparc.commands.bench.case import Call, Case, Work, size
 from gsparc.commands.bench.scene import COMPLEX, GRID, Scene, places, receiver, receivers
 from gsparc.field.frozen import frozen_view
-from gsparc.ops import composite, freeze, machine_limits, mean_weights
+from gsparc.ops import composite, freeze, machine_limits, mean_weights, rasterize
 from gsparc.ops.geometry import Pose
 
 REFERENCE_BYTES = 3 * 2**30  # of one forward pass in dense tensors
@@ -16,12 +16,13 @@ DENSE_TENSORS = 12  # (N, H W) tensors alive at once in the reference
 
 
 def moving(scene: Scene, batch: int) -> Case:
-    """A query of a moving receiver: plan and blend (kernel); emission too (whole)."""
+    """A query of a moving receiver: rasterize, as the model does (kernel); emission too (whole)."""
     poses, tx = receivers(batch), places(batch).flip(0) + 1
     features = scene.features.expand(batch, -1, -1)
 
     def draw(backend: str | None = None) -> Tensor:
-        return composite(scene.plan(poses, backend=backend), *scene.geometry, features).image
+        kind, view = scene.projection, (features, poses, GRID)
+        return rasterize(*scene.geometry, *view, projection=kind, backend=backend).image
 
     return Case(
         *("forward, moving receiver", scene.projection, len(scene), batch),

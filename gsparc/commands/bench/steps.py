@@ -8,7 +8,7 @@ from torch import Tensor
 from gsparc.commands.bench.case import Call, Case, Work
 from gsparc.commands.bench.scene import GRID, places, receiver, scene
 from gsparc.field.model import GaussianModel
-from gsparc.ops import Pose, composite
+from gsparc.ops import Pose
 from gsparc.ops.projection import Projection
 from gsparc.training.losses import spectrum_loss
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for
@@ -38,7 +38,7 @@ def _learning(model: GaussianModel, batch: int) -> Call:
         with torch.enable_grad():
             optimizer.zero_grad(set_to_none=True)
             values = model.features(tx, rx)[..., :1]
-            image = composite(model.plan(receiver()), *model.gaussians.geometry(), values).image
+            image = model.raster(values, receiver()).image
             loss = spectrum_loss(image.squeeze(1), target).mean()
             loss.backward()
             optimizer.step()
