@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from omegaconf import OmegaConf
 
-from gsparc.commands.cli import _told
+from gsparc.commands.cli import _message_of
 from gsparc.commands.continued import once
 from gsparc.data.claims import claimed
 from gsparc.evaluation.report.sweep import FAILURE
@@ -63,6 +63,6 @@ def test_a_job_that_another_process_does_is_refused(tmp_path):
 
 def test_a_launcher_s_lost_job_is_said_with_what_to_do():
     lost = type("UncompletedJobError", (RuntimeError,), {"__module__": "submitit.core.utils"})
-    said = _told(lost("Job 386 (task: 0) with path FILE\nhas not produced any output"))
+    said = _message_of(lost("Job 386 (task: 0) with path FILE\nhas not produced any output"))
     assert "\n" not in said and "Job 386" in said and said.endswith("the same command goes on with the rest")
-    assert _told(ValueError("seed=x: no")) == "seed=x: no"
+    assert _message_of(ValueError("seed=x: no")) == "seed=x: no"
