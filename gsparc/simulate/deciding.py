@@ -82,7 +82,7 @@ class Decision:
         rows, errors = note["changed"] or ([], [])
         changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
         effects = Effects(**note["effects"])
-        return Decision(Choice.from_dict(note["choice"]), effects, note["samples"], changed)
+        return Decision(Choice.from_dict(note["choice"]), effects, note.get("samples"), changed)
 
 
 class Traced:

@@ -17,8 +17,9 @@ from gsparc.data.splits import Fold
 from gsparc.methods import censored_ep
 from gsparc.methods.censored import heard, left_out_note
 from gsparc.methods.censored_ep import condition, log_evidence, propagate, truncated
+from gsparc.methods.distance_law import Rows
 from gsparc.methods.method import FitContext
-from gsparc.methods.power_process import draw
+from gsparc.methods.power_process import AMPLITUDES_DB2, draw, fit_powers
 from gsparc.methods.registry import build
 
 STATION = np.array([500.0, 500.0, 20.0])
@@ -175,3 +176,13 @@ def test_drawn_rows_keep_half_of_what_was_heard():
     assert len(rows) == 150 and (~silent[rows]).sum() == 75 and (np.diff(rows) > 0).all()
     assert (~silent[draw(silent, 300, 0)]).sum() == 100
     assert np.array_equal(draw(silent, 1000, 0), np.arange(1000))
+
+
+def test_silent_rows_alone_do_not_make_powers_spread_beyond_any_site():
+    """One heard row of forty: the evidence is flat, and the process was taken 98 dB below the level."""
+    data, _, _ = town(40)
+    level = float(10 * np.log10(data.target.max()))
+    quiet = np.arange(40) > 0
+    rows = Rows(data.moving, np.where(quiet, level - 1, level), quiet)
+    process, _ = fit_powers(rows, data.site)
+    assert process.kernel.amplitude <= AMPLITUDES_DB2[1] * (1 + 1e-9) == pytest.approx(1e3)

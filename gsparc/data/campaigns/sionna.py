@@ -6,7 +6,6 @@ import logging
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,9 @@ def with_true_targets(data: Measurements, truth: Measurements, named: str) -> Me
     return replace(data, site=site, target=target, mask=mask, censored=censored)
 
 
-def _tested(train: np.ndarray | None, truth: np.ndarray | None, test: np.ndarray, plain: bool) -> Any:
+def _tested(
+    train: np.ndarray | None, truth: np.ndarray | None, test: np.ndarray, plain: bool
+) -> np.ndarray | None:
     """Flags (S, ...) of `train` with those of `truth` in test rows; None is `plain` everywhere."""
     known = truth if train is None else train
     if known is None:

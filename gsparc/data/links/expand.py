@@ -175,7 +175,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     if not keep.any():
         return check.refuse(measured, "nothing was measured; expected numbers")
     if not keep.all() or censored.any():
-        _log_missing(check, measured, links, keep, censored)
+        _note_lost(check, measured, links, keep, censored)
         _keep(check.raw, measured, keep)
         parts = {name: getattr(links, name) for name in ("station", "place", "run")}
         pick = {name: value[keep] for name, value in parts.items() if value is not None}
@@ -204,7 +204,7 @@ def _keep(raw: Raw, measured: str, keep: np.ndarray) -> None:
             arrays[name] = array[keep]
 
 
-def _log_missing(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:
+def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:
     """How many links have no value, and how many were not heard, by station."""
     if not keep.all():
         text = f"{int((~keep).sum())} of {len(keep)} values are missing"

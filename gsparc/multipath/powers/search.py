@@ -81,7 +81,7 @@ def gains(inverse: Tensor, values: Tensor, columns: Tensor) -> tuple[Tensor, Ten
     white, weights = inverse @ columns, inverse @ values
     by_value, by_column = columns.T @ weights, (columns * white).sum(0) + TINY
     ratio = by_value.square() / by_column
-    # What a row adds to the forms c' K^-1 v and c' K^-1 c of all others, so that they are exact without it.
+    # By block inversion: what each row adds to the quadratic forms c' K^-1 v and c' K^-1 c of the others.
     share = inverse.diagonal()[:, None]
     telling = (white * weights[:, None] / share).argmin(0, keepdim=True)
     own, at = white.gather(0, telling)[0], telling[0]
