@@ -54,7 +54,7 @@ def inner_folds(
     `random` and `sparse` leave out pieces of one permutation of the places, so that folds share none where
     `count` pieces fit; `sparse` does not thin again, as its training rows are thin already. `blocks` leaves
     out squares of the same side, `grouped` stretches as long, `corner` the other corners first, `stations`
-    as many stations at a time. Folds of a file are random, unless its validation rows lie clearly farther
+    and `runs` as many of these at a time. Folds of a file are random, unless its validation rows lie clearly farther
     from training rows than these from one another: then squares as far apart. Where too few squares,
     stretches or stations remain, squares are made smaller, then rows are drawn at random; `name` says so.
 
@@ -65,7 +65,7 @@ def inner_folds(
         count: folds wanted; of stretches, corners and stations there may be fewer.
         seed: of the draws.
         place: (S,) int64; rows of one place stay together. None where every row is one.
-        station: (S,) int64, of which station a row is.
+        station: (S,) int64, of which station, for `runs` of which run, a row is.
 
     Raises:
         DataError: fewer than 2 places to cut.
@@ -79,11 +79,11 @@ def inner_folds(
     settings = _inside(positions, fold, split)
     rng = np.random.default_rng([seed, 4])
     unit = np.full(len(positions), NOT_TESTED)
-    if settings.name == "stations":
+    if settings.name in ("stations", "runs"):
         stations = None if station is None else np.unique(station[known], return_inverse=True)[1].reshape(-1)
         cut = None if stations is None or stations.max() == 0 else _stations(stations, settings, count, rng)
         if stations is not None and cut is not None:
-            return _of_all(known, "stations", cut, stations, unit)
+            return _of_all(known, settings.name, cut, stations, unit)
         settings = replace(settings, name="random", leave_out=())
     found = _cut(where, settings, count, rng)
     folds = [Fold(*(np.flatnonzero(np.isin(which, p)) for p in vars(one).values())) for one in found.folds]
@@ -101,7 +101,8 @@ def cut_inside(
     positions = data.moving
     if data.site.static_end is None and data.station is not None:
         positions = data.rx_position if _still(data.tx, data.station) else data.tx
-    return inner_folds(positions, fold, split, count, seed, data.place, data.station)
+    unit = data.run if split is not None and split.name == "runs" else data.station
+    return inner_folds(positions, fold, split, count, seed, data.place, unit)
 
 
 def _still(places: np.ndarray, station: np.ndarray) -> bool:
@@ -222,12 +223,16 @@ def _least_shared(drawn: list[Fold], count: int) -> tuple[Fold, ...]:
 def _stations(
     station: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator
 ) -> list[Fold]:
-    """Folds of rows of stations (n,), at least two of them, that leave out whole ones."""
+    """Folds of rows of stations or runs (n,), at least two of them, that leave out whole ones."""
     number = int(station.max()) + 1
     if number == 2:  # one to learn from; none is left to choose on
         none = np.zeros(0, np.int64)
         return [Fold(np.flatnonzero(station != t), none, np.flatnonzero(station == t)) for t in range(2)]
-    together = min(settings.leave_out if isinstance(settings.leave_out, int) else 0, number - 2)
+    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
+    if settings.name == "runs":
+        together = max(round(settings.test_fraction * number), 1)
+        settings = replace(settings, name="stations")
+    together = min(together, number - 2)
     where = np.zeros((len(station), 3))
     settings = replace(settings, leave_out=together)
     if together <= 1:

@@ -93,7 +93,8 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = left_out(settings.leave_out, wrong, len(data))
         return without(split, absent) if len(absent) else split
-    return make_split(data.moving, settings, data.release_split, wrong, data.place, data.station)
+    unit = data.run if settings.name == "runs" else data.station
+    return make_split(data.moving, settings, data.release_split, wrong, data.place, unit)
 
 
 def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:

@@ -19,7 +19,7 @@ from gsparc.data.files import whole_file
 
 log = logging.getLogger(__name__)
 
-NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations")
+NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs")
 OLD_NAMES = {"block": "corner"}  # in configurations of earlier runs
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
@@ -68,10 +68,11 @@ class SplitSettings:
     """How to split; one instance of the config group `split`.
 
     Attributes:
-        name: `random`, `grouped`, `corner`, `blocks`, `sparse` or `stations`.
+        name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `stations` or `runs`.
         seed: of every random choice below.
         val_fraction: share of each fold's training rows kept for validation.
-        test_fraction: share of the rows that `random` (without files) and `corner` hold out.
+        test_fraction: share of the rows that `random` (without files) and `corner` hold out, and of the runs
+            that `runs` does, one at least.
         redraw: `random` ignores the release's own files and draws anew.
         folds: number of folds of `grouped`.
         stretches_per_fold: `grouped` cuts the path into folds x this many stretches.
@@ -167,7 +168,7 @@ def make_split(
         release_split: (train, test) rows that the release names; used by `random` only.
         outliers: (n,) rows that `leave_out=outliers` means.
         place: (S,) int64; rows of one place stay together. None where every row is one.
-        station: (S,) int64, of which station a row is; needed by `stations`.
+        station: (S,) int64, of which station, for `runs` of which run, a row is; needed by these two.
 
     Raises:
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
@@ -178,8 +179,8 @@ def make_split(
         rest = np.setdiff1d(np.arange(rows), absent)
         return _of_the_rest(rest, positions, settings, release_split, place, station)
     named = settings.name == "random" and release_split is not None and not settings.redraw
-    if settings.name == "stations":
-        folds = _stations(station, settings)
+    if settings.name in ("stations", "runs"):
+        folds = _whole(station, settings)
     elif place is not None and not named:
         _, first, which = np.unique(place, return_index=True, return_inverse=True)
         found = make_split(positions[first], settings)
@@ -391,16 +392,24 @@ def _blocks(
     return rows[np.isin(square, order[:count])]
 
 
-def _stations(station: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]:
-    """Folds that each hold out a station, or one that holds out as many as `leave_out` says."""
-    if station is None:
-        raise DataError("split=stations: these measurements have one station; take split=random or blocks")
-    count = int(station.max()) + 1
+def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]:
+    """Folds that each hold out a station, or one that holds out as many as `leave_out` says, or a share of runs.
+
+    Args:
+        unit: (S,) int64 number of each row's station, or run.
+    """
+    name = settings.name
+    if unit is None:
+        raise DataError(f"split={name}: these measurements have one {name[:-1]}; take split=random or blocks")
+    unit = np.unique(unit, return_inverse=True)[1].reshape(-1)
+    count = int(unit.max()) + 1
     together = settings.leave_out if isinstance(settings.leave_out, int) else 0
-    if count < 3 or together > count - 2:
-        raise DataError(
-            f"split=stations: {count} stations; two at least must remain to learn from and to choose on"
-        )
+    if name == "runs":
+        together = max(round(settings.test_fraction * count), 1)
+    least = 2 if name == "stations" else 1
+    if count - max(together, 1) < least:
+        remain = "two at least must remain to learn from and to choose on" if least == 2 else "one must remain"
+        raise DataError(f"split={name}: {count} {name}; {remain}")
     draw = np.random.default_rng(settings.seed).permutation(count)
     held = [draw[:together]] if together else [np.array([t]) for t in range(count)]
     folds = []
@@ -410,7 +419,7 @@ def _stations(station: np.ndarray | None, settings: SplitSettings) -> tuple[Fold
         )
         chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]
         parts = (np.setdiff1d(rest, chosen), chosen, test)
-        folds.append(Fold(*(np.flatnonzero(np.isin(station, part)) for part in parts)))
+        folds.append(Fold(*(np.flatnonzero(np.isin(unit, part)) for part in parts)))
     return tuple(folds)
 
 

@@ -22,7 +22,7 @@ from gsparc.methods.registry import method_class
 log = logging.getLogger(__name__)
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-CACHE_VERSION = 5  # raise it when a baseline or a metric changes its results
+CACHE_VERSION = 6  # raise it when a baseline or a metric changes its results
 STORE_ABOVE_S = 3.0  # processor time; cheaper fits are repeated, so that their times are current
 
 

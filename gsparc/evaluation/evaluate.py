@@ -14,7 +14,7 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.pooled import pooled
-from gsparc.evaluation.scores import Scores, rows_of, score
+from gsparc.evaluation.scores import Scores, rows_of, score, unseen_runs
 from gsparc.methods import timing
 from gsparc.methods.label import common_label
 from gsparc.methods.method import Method
@@ -95,6 +95,7 @@ def evaluate(
     facts |= {"model/name": first.name, "model/label": common_label(first.name, methods)}
     facts |= {"model/effects": first.effects, **first.facts()}
     facts |= dataset_facts(data) | split_facts(split) | timing.peak_memory()
+    facts["split/unseen_runs"] = sum(len(unseen_runs(data, fold, eval_on)) for fold in split.folds)
     return Evaluation(facts, _columns(scores, others, data))
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Fold, Split
@@ -100,8 +102,35 @@ def rows_of(fold: Fold, eval_on: str) -> np.ndarray:
     return rows
 
 
+def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
+    """Numbers (R,) of runs with channels among the rows `eval_on` and none among those learned from."""
+    if data.site.kind != "csi" or data.run is None:
+        return np.zeros(0, np.int64)
+    learned = fold.train if eval_on == "val" else np.concatenate([fold.train, fold.val])
+    return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[learned])
+
+
+def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
+    """What predictions of rows (n,) are turned by, (n,) complex64: for each of some runs the phase of least error.
+
+    A run has a phase of its own, which nothing tells of one that was not learned from.
+    """
+    turn = torch.ones(len(rows), dtype=torch.complex64)
+    for run in runs:
+        mine, overlap = np.flatnonzero(data.run[rows] == run), 0j  # type: ignore[index]
+        for start in range(0, len(mine), CHUNK):
+            batch = data.batch(rows[mine[start : start + CHUNK]])
+            product = (method.answer(batch).mean.cpu().conj() * batch.target).to(torch.complex128)
+            overlap += complex((product if batch.mask is None else product * batch.mask).sum())
+        if overlap:
+            turn[torch.from_numpy(mine)] = overlap / abs(overlap)
+    return turn
+
+
 def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test") -> Scores:
     """Predict the chosen rows of every fold with that fold's method.
+
+    Channels of runs that it did not learn from are scored after the best common phase of each.
 
     Args:
         methods: one fitted method per fold.
@@ -118,7 +147,9 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     confidence: list[np.ndarray] = []
     variance: list[np.ndarray] = []
     samples = []
-    for method, rows in zip(methods, every, strict=True):
+    for method, rows, fold in zip(methods, every, split.folds, strict=True):
+        runs = unseen_runs(data, fold, eval_on)
+        turn = best_phases(method, data, rows, runs) if len(runs) else None
         metric = metrics_for(data.site.kind, data.site.target_scale)
         # One station at a time: each has a model of its own, whose matrices are read for every chunk.
         order = (
@@ -126,9 +157,11 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
         )
         said: dict[str, list[np.ndarray]] = {"confidence": [], "variance": []}
         for start in range(0, len(rows), CHUNK):
-            batch = data.batch(rows[order[start : start + CHUNK]])
+            chunk = order[start : start + CHUNK]
+            batch = data.batch(rows[chunk])
             prediction = method.answer(batch)
-            metric.update(prediction.mean, batch.target, batch.mask)
+            mean = prediction.mean if turn is None else prediction.mean * turn[chunk, None, None]
+            metric.update(mean, batch.target, batch.mask)
             for name, values in said.items():
                 given, none = getattr(prediction, name), np.full(len(batch), np.nan)
                 values.append(none if given is None else given.detach().cpu().double().numpy())

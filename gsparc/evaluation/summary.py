@@ -118,6 +118,9 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
         found.append(f"SIMULATED stand-in: the {release} release was not found; no figure here is about it")
+    if facts.get("split/unseen_runs"):
+        count = facts["split/unseen_runs"]
+        found.append(f"{count} runs were not learned from: scored after the best common phase of each")
     if facts.get("model/limited_by_clock"):
         repeat = "fixed steps or searches repeat exactly"
         if facts["model/limited_by_clock"] == "wall":

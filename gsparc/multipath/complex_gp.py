@@ -10,7 +10,7 @@ predictions at places are those of the largest run, those of measured rows their
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,9 @@ from gsparc.data.splits import Fold
 from gsparc.methods.covering import covering
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.neighbourhood import Neighbourhood
+from gsparc.methods.run_factors import RunFactors, run_factors
 from gsparc.methods.vecchia import solved
 from gsparc.multipath.ridge import cholesky
-from gsparc.multipath.run_factors import run_factors
 from gsparc.multipath.visibility_kernel import matern32
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
@@ -99,8 +99,8 @@ class ComplexGP(Method):
         notes = [f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"]
         if len(known) > CHOSEN_ON:
             notes.append(f"complex_gp: settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
-        self.runs, first = names.astype(np.int64), np.unique(run, return_index=True)[1]
-        self.factors = self.turned[torch.from_numpy(first)]
+        first = torch.from_numpy(np.unique(run, return_index=True)[1])
+        self.runs = RunFactors(names.astype(np.int64), self.turned[first])
         if len(names) > 1:
             notes.append(self._factors_note(names, run))
         return FitReport(time.monotonic() - started, tuple(notes))
@@ -129,7 +129,7 @@ class ComplexGP(Method):
                 tried.append((np.log(max(power, 1e-300)) + float(variance.log().mean()), length, noise))
         _, self.length, self.noise = min(tried, key=lambda t: t[0])
         self.power = max(float(values[:, 0].abs().square().mean()), 1e-30)
-        self.runs, self.factors = np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128)
+        self.runs = RunFactors.none()
         said = f"envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
         told_by = f"each query is predicted from the {NEAREST} nearest of {len(known)} rows (Vecchia)"
         return said, told_by, f"settings chosen on {len(row)} of them, each given its nearest"
@@ -194,14 +194,7 @@ class ComplexGP(Method):
 
     def answer(self, batch: Batch) -> Prediction:
         """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
-        found = self.predict(batch.tx, batch.rx)
-        if batch.run is None or len(self.runs) == 1:
-            return found
-        same = batch.run.cpu()[:, None] == torch.from_numpy(self.runs)
-        factor = torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
-        assert found.variance is not None
-        mean = found.mean * factor.to(found.mean.dtype)[:, None, None]
-        return replace(found, mean=mean, variance=found.variance * factor.abs().square().float())
+        return self.runs.restored(self.predict(batch.tx, batch.rx), batch.run)
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64; see `Differentiable`."""
@@ -261,8 +254,8 @@ class ComplexGP(Method):
             stored = {**arrays, "targets": torch.from_numpy(self.targets), "shape": list(self.shape)}
             return {**stored, "length": self.length, "noise": self.noise, "power": self.power}
         names = ("places", "weights", "factor", "length", "noise", "power", "turned")
-        runs = {"runs": torch.from_numpy(self.runs), "factors": self.factors}
-        return {**{name: getattr(self, name) for name in names}, **runs, "shape": list(self.shape)}
+        own = {name: getattr(self, name) for name in names}
+        return {**own, **self.runs.state(), "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
@@ -272,13 +265,12 @@ class ComplexGP(Method):
         if "level" in state:
             self.near = Neighbourhood(self.places.numpy(), state["level"].numpy())
             self.targets = state["targets"].numpy()
-            self.runs, self.factors = np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128)
+            self.runs = RunFactors.none()
             return
         self.weights, self.factor = state["weights"], state["factor"]
         ones = torch.ones(len(self.places), dtype=torch.complex128)  # earlier versions knew no runs
         self.turned = state.get("turned", ones)
-        self.runs = state["runs"].numpy() if "runs" in state else np.zeros(1, np.int64)
-        self.factors = state.get("factors", ones[:1])
+        self.runs = RunFactors.read(state if "runs" in state else None)
 
     def size(self) -> int:
         """Training samples kept."""

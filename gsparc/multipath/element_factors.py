@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.methods.run_factors import run_factors
 from gsparc.multipath.gp_likelihood import Posterior, Scene
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.run_factors import run_factors
 
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 

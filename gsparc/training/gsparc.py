@@ -27,7 +27,8 @@ from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.pareto import Settings
 from gsparc.methods.power_process import PowerProcess, approximated, exact
 from gsparc.methods.reduced import contributions, knobs, reduced
-from gsparc.methods.registry import method_class
+from gsparc.methods.registry import field_initialiser, method_class
+from gsparc.methods.run_factors import RunFactors
 from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
 from gsparc.ops import Pose
 from gsparc.training import process_average, solution_weights, solutions
@@ -67,6 +68,7 @@ class Gsparc(LearnedField):
         self.started = ""  # initialisers of what was fitted
         self._average: tuple[Method, float] | None = None  # a process and its weight in the mean
         self._average_mean: Method | None = None  # that process without its variance, made when first asked
+        self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
 
     @property
     def label(self) -> str:
@@ -91,6 +93,7 @@ class Gsparc(LearnedField):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the terms, initialise, weigh, take the steps that pay."""
         self.site, self.field, self._average, self._average_mean = data.site, None, None, None
+        self.runs = RunFactors.none()
         count = self.settings.field.count
         self.plan = plan(self.switches, self.init, data, self.settings.emission.hidden, count)
         for reason in self.plan.reasons:
@@ -148,6 +151,7 @@ class Gsparc(LearnedField):
         held = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
         init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
         until_s = budget.seconds * (1 - STEPS_SHARE)
+        data = self._aligned(data, known, context)
         found, reports = solutions.find(
             chosen.parts, init, self.switches, data, fold, context, budget, until_s, held
         )
@@ -172,6 +176,18 @@ class Gsparc(LearnedField):
         for report in reports.values():
             limited = less_repeatable(limited, report.limited_by)
         return FitReport(seconds, tuple(notes), limited)
+
+    def _aligned(self, data: Measurements, known: np.ndarray, context: FitContext) -> Measurements:
+        """Channels of several runs in the phase and level of one, by the waves that explain rows (n,)."""
+        if not RunFactors.several(data, known):
+            return data
+        field, _ = field_initialiser("diffuse")(data, known, self.init, True, context)
+        assert isinstance(field.runs, RunFactors)
+        self.runs = field.runs
+        log.info(
+            "channels of %d runs: the factor of each was estimated with the waves' field", len(self.runs)
+        )
+        return self.runs.aligned(data)
 
     def _take_steps(
         self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
@@ -229,9 +245,11 @@ class Gsparc(LearnedField):
     def answer(self, batch: Batch) -> Prediction:
         """See `Method.answer`."""
         if self.field is None or not self.field.reads_rows:
-            return super().answer(batch)
-        found = self.field.answer(batch)
-        return Prediction(found.mean, (1 - found.unknown).clamp(0, 1), found.variance)
+            found = super().answer(batch)
+        else:
+            of_field = self.field.answer(replace(batch, run=None))
+            found = Prediction(of_field.mean, (1 - of_field.unknown).clamp(0, 1), of_field.variance)
+        return self.runs.restored(found, batch.run)
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
@@ -343,6 +361,7 @@ class Gsparc(LearnedField):
             "facts": {"explained": self.explained, "steps": self.steps},
             "init": self.started,
             "array": self.settings.response.array,
+            "runs": self.runs.state(),
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -368,6 +387,7 @@ class Gsparc(LearnedField):
         facts = state.get("facts", {})
         self.explained, self.steps = facts.get("explained"), int(facts.get("steps", 0))
         self.started = str(state.get("init", ""))
+        self.runs = RunFactors.read(state.get("runs"))
 
     def size(self) -> int:
         """Number of Gaussians."""

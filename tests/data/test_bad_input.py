@@ -126,7 +126,6 @@ CSI = {
                  "determinant [+]1"),
     "mask shape": (_set("mask", np.ones(12, bool)), "mask: expected shape"),
     "mask of numbers": (_set("mask", np.full((12, 2, 3), 2)), "mask: expected True and False"),
-    "row masked out": (_set("mask", half_masked), "mask, row 7: nothing measured"),
     "negative noise": (_set("noise_variance", np.array(-1.0)), "noise_variance, row 0: expected a finite number"),
     "paths without offsets": (_set("path_gain", np.ones(4, complex)), "path_offsets: missing, but path_gain"),
     "offsets fall": (_set("path_offsets", np.array([0, 2, 1] + [4] * 10)), "never decrease"),

@@ -10,11 +10,11 @@ from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
+from gsparc.methods.run_factors import run_factors
 from gsparc.multipath import complex_gp
 from gsparc.multipath.complex_gp import ComplexGP
 from gsparc.multipath.gp_likelihood import Factor
 from gsparc.multipath.ridge import cholesky
-from gsparc.multipath.run_factors import run_factors
 
 CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"
 

@@ -292,7 +292,7 @@ def test_runs_are_brought_together():
     spread = replace(data, target=(data.target * factor[:, None, None]).astype(np.complex64), run=run * 4 + 1)
     settings = ChannelSettings(directions=False, correlated=False)
     field, _ = initialise(spread, np.arange(100), settings)
-    factors = field.run_factor(torch.tensor([1, 5, 9]))
+    factors = field.runs.of(torch.tensor([1, 5, 9]))
     np.testing.assert_allclose(factors, [1.0, 0.6 * np.exp(2j), 1.0], atol=0.05)
     batch = data.batch(np.arange(100, 150))
     assert nmse(field(batch.tx, batch.rx).mean.detach().numpy(), batch.target.numpy()) < 0.1

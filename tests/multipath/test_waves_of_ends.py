@@ -142,7 +142,7 @@ def test_runs_of_all_ends_differ_by_one_phase():
     data = _ceiling(runs=runs)
     fold = _fold(data)
     field, _ = initialise(data, _known(fold), QUICK)
-    found = field.run_factors[1] / field.run_factors[0]
+    found = field.runs.factors[1] / field.runs.factors[0]
     torch.testing.assert_close(found.abs(), torch.ones(()).double())
     assert abs(abs(float(found.angle())) - 0.9) < 0.1
     batch = data.batch(fold.test)

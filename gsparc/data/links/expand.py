@@ -81,6 +81,8 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     values = check.raw.arrays[measured]
     long = "station" in check.raw.arrays
     count = len(stations)
+    if count == 1 and not long and values.shape[1:2] != (1,):  # one station has no columns to tell apart
+        check.raw.arrays["station"], long = np.zeros(len(values), np.int64), True
     if not long and (values.ndim < 2 or values.shape[1] != count):
         return check.refuse(
             measured, f"expected shape (S, {count}, ...), a column for each station, found {values.shape}; "
@@ -145,7 +147,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     mask = arrays.get("mask")
     if mask is not None and mask.shape != values.shape:
         return links  # said where the mask is read
-    may_miss = measured in POWERS or links.stations is not None
+    may_miss = measured in POWERS or links.stations is not None or mask is not None
     if values.dtype.kind not in "iufc" or values.ndim == 0 or not may_miss:
         return links
     axes = tuple(range(1, values.ndim))

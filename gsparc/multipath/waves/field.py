@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.methods.run_factors import RunFactors, aligning, run_quadratic
 from gsparc.multipath.ridge import cholesky
-from gsparc.multipath.run_factors import aligning, run_quadratic
 from gsparc.multipath.waves.columns import Group, Slot, asked, gather, of_runs, static_place
 from gsparc.multipath.waves.common import Common
 from gsparc.multipath.waves.covariance import (
@@ -109,8 +109,7 @@ class ChannelField(ConditionalField):
         self.stations: dict[int, list[Weights]] = {}
         self.common: Common | None = None
         self.rows = np.zeros(0, np.int64)
-        self.runs = np.zeros(1, np.int64)
-        self.run_factors = torch.ones(1, dtype=torch.complex128)
+        self.runs = RunFactors.none()
 
     @property
     def values(self) -> Values:
@@ -160,7 +159,7 @@ class ChannelField(ConditionalField):
         """
         moving, _, turned, nearest = asked(self.site, batch.tx, batch.rx)
         station = self._numbers(batch.station, nearest)
-        target = batch.target.cpu().to(torch.complex128) / self.run_factor(batch.run)[:, None, None]
+        target = batch.target.cpu().to(torch.complex128) / self.runs.of(batch.run)[:, None, None]
         shape, values = self.shape, self.values
         total, entries = torch.zeros(len(moving), dtype=torch.float64), torch.zeros(len(moving))
         for known in self._conditioned():
@@ -194,20 +193,21 @@ class ChannelField(ConditionalField):
                 f"channels of shape {tuple(data.target.shape[1:])}, the field has {self.channel}"
             )
         self.rows = np.asarray(rows)
-        self.runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
+        runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
         groups = gather(data, self.rows, self.apart)
         with torch.no_grad():
-            self._solve(groups, None)
+            self._solve(groups, runs, None)
 
-    def _solve(self, groups: tuple[Group, ...], factors: Tensor | None) -> None:
-        """Set the weights; factors of runs (runs,), as measured, are estimated unless given."""
+    def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
+        """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
         shape, values = self.shape, self.values
         lowers = [cholesky(covariance) for covariance in _covariances(groups, shape, values)]
         if factors is None:
-            factors = torch.ones(len(self.runs), dtype=torch.complex128)
-            if len(self.runs) > 1:
-                factors = of_runs(_factors(groups, lowers, len(self.runs)), groups)
-        self.run_factors, found, noise = factors, [], float(shape.of("noise", values.power))
+            factors = torch.ones(len(runs), dtype=torch.complex128)
+            if len(runs) > 1:
+                factors = of_runs(_factors(groups, lowers, len(runs)), groups)
+        self.runs = RunFactors(runs, factors)
+        found, noise = [], float(shape.of("noise", values.power))
         for group, lower in zip(groups, lowers, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])
             alpha = torch.cholesky_solve(aligned.target, lower)
@@ -221,7 +221,7 @@ class ChannelField(ConditionalField):
         self.common = Common.of(shape, self._held, heard) if len(self.stations) > 1 else None
 
     def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
-        """See `ConditionalField`; in the phase and level of the largest run, see `run_factor`.
+        """See `ConditionalField`; in the phase and level of the largest run.
 
         Differentiable in the places, not in the parameters, which the weights depend on as well.
 
@@ -255,7 +255,7 @@ class ChannelField(ConditionalField):
         found = self(batch.tx, batch.rx, batch.station)
         if len(self.runs) == 1:
             return found
-        factor = self.run_factor(batch.run).to(found.mean.device)
+        factor = self.runs.of(batch.run).to(found.mean.device)
         turned = factor[:, None, None].to(found.mean.dtype)
         explained = None if found.explained is None else found.explained * turned
         variance = found.variance * factor.abs().square().float()
@@ -333,13 +333,6 @@ class ChannelField(ConditionalField):
             after.index_add_(0, here, variance * outputs / size)
             before.index_add_(0, here, prior_variance * outputs / size)
 
-    def run_factor(self, run: Tensor | None) -> Tensor:
-        """What predictions of rows of runs (B,) must be multiplied by, (B,) complex128; 1 where unknown."""
-        if run is None:
-            return torch.ones(1, dtype=torch.complex128)
-        same = run.cpu()[:, None] == torch.from_numpy(self.runs)
-        return torch.where(same.any(1), (same * self.run_factors).sum(1), 1.0)
-
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; in the phase and level of each row's own run.
 
@@ -358,8 +351,8 @@ class ChannelField(ConditionalField):
                 rest = other + torch.diag(own)
                 predicted = group.target - rest @ known.alpha
                 error = (rest * (rest @ inverse).conj()).sum(1).real
-                group.slot.put(mean, group.rows, predicted * self.run_factors[group.run][:, None])
-                level = known.scale * outputs * self.run_factors[group.run].abs().square()
+                group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
+                level = known.scale * outputs * self.runs.factors[group.run].abs().square()
                 variance.index_add_(0, group.rows, error * level)
                 entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
         return LeftOutRows(self.rows, mean, (variance / entries.clamp_min(1)).float())
@@ -380,8 +373,7 @@ class ChannelField(ConditionalField):
             "values": values,
             "channel": list(self.channel),
             "rows": torch.from_numpy(self.rows),
-            "runs": torch.from_numpy(self.runs),
-            "run_factors": self.run_factors,
+            **self.runs.state(),
             "groups": [
                 {**_parts(group), "slot": _stored(group.slot), "target": group.target * self._turn(group)}
                 for group in groups
@@ -389,7 +381,7 @@ class ChannelField(ConditionalField):
         }
 
     def _turn(self, group: Group) -> Tensor:
-        return self.run_factors[group.run][:, None]
+        return self.runs.factors[group.run][:, None]
 
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
@@ -407,12 +399,12 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     with torch.no_grad():
         for name, parameter in field.named_parameters():
             parameter.copy_(kept[name])
-    field.rows, field.runs = state["rows"].numpy(), state["runs"].numpy()
+    field.rows, runs = state["rows"].numpy(), RunFactors.read(state)
     groups = []
     for each in state["groups"]:
         groups.append(Group(**{**each, "slot": _read(each["slot"])}))
     with torch.no_grad():
-        field._solve(tuple(groups), state["run_factors"])
+        field._solve(tuple(groups), runs.runs, runs.factors)
     return field
 
 

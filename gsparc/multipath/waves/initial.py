@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
+from gsparc.methods.run_factors import aligning, run_quadratic
 from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath.complex_gp import CHOSEN_ON, LENGTHS, NOISES
 from gsparc.multipath.ridge import cholesky
-from gsparc.multipath.run_factors import aligning, run_quadratic
 from gsparc.multipath.waves import drift
 from gsparc.multipath.waves.columns import Group, ends_of, gather, of_runs, thinned
 from gsparc.multipath.waves.covariance import BEYOND, Shape, Values, disturbance
