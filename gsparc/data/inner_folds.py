@@ -54,9 +54,9 @@ def inner_folds(
     `random` and `sparse` leave out pieces of one permutation of the places, so that folds share none where
     `count` pieces fit; `sparse` does not thin again, as its training rows are thin already. `blocks` leaves
     out squares of the same side, `grouped` stretches as long, `corner` the other corners first, `stations`
-    and `runs` as many of these at a time. Folds of a file are random, unless its validation rows lie clearly farther
-    from training rows than these from one another: then squares as far apart. Where too few squares,
-    stretches or stations remain, squares are made smaller, then rows are drawn at random; `name` says so.
+    and `runs` as many of these at a time. Folds of a file are random, unless its validation rows lie clearly
+    farther from training rows than these from one another: then squares as far apart. Where too few squares,
+    stretches or units remain, squares are made smaller, then rows are drawn at random; `name` says so.
 
     Args:
         positions: (S, 3) [m] of the moving end, or (S, 6) of both, of all rows.

@@ -141,6 +141,11 @@ class Site:
         return tx if self.static_end == "rx" else place
 
     @property
+    def query_box(self) -> np.ndarray:
+        """The box for each end that moves, (2, 3) or (2, 6) [m]: of what `moving` gives."""
+        return np.tile(self.box, 1 if self.static_end is not None else 2)
+
+    @property
     def wavelength(self) -> float | None:
         """Carrier wavelength [m]; None when the carrier is unknown."""
         return None if self.carrier_hz is None else LIGHT / self.carrier_hz

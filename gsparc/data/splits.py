@@ -393,7 +393,7 @@ def _blocks(
 
 
 def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]:
-    """Folds that each hold out a station, or one that holds out as many as `leave_out` says, or a share of runs.
+    """Folds that each hold out a station, or one that holds out `leave_out` of them, or a share of the runs.
 
     Args:
         unit: (S,) int64 number of each row's station, or run.
@@ -408,8 +408,8 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
         together = max(round(settings.test_fraction * count), 1)
     least = 2 if name == "stations" else 1
     if count - max(together, 1) < least:
-        remain = "two at least must remain to learn from and to choose on" if least == 2 else "one must remain"
-        raise DataError(f"split={name}: {count} {name}; {remain}")
+        remain = "two at least must remain" if least == 2 else "one must remain"
+        raise DataError(f"split={name}: {count} {name}; {remain} to learn from and to choose on")
     draw = np.random.default_rng(settings.seed).permutation(count)
     held = [draw[:together]] if together else [np.array([t]) for t in range(count)]
     folds = []

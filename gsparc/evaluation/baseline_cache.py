@@ -34,12 +34,7 @@ def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
     carrier = site.carrier_hz is not None or (
         site.stations is not None and site.stations.carrier_hz is not None
     )
-    if (
-        site.kind == "csi"
-        and carrier
-        and site.static_end is not None
-        and _all_trained("complex_gp", data, split)
-    ):
+    if site.kind == "csi" and carrier and _all_trained("complex_gp", data, split):
         return (*names, "complex_gp")
     return names
 

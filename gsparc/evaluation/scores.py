@@ -111,7 +111,7 @@ def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
 
 
 def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
-    """What predictions of rows (n,) are turned by, (n,) complex64: for each of some runs the phase of least error.
+    """What predictions of rows (n,) are turned by, (n,) complex64: the best phase of each of `runs`.
 
     A run has a phase of its own, which nothing tells of one that was not learned from.
     """

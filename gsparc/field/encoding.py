@@ -54,11 +54,11 @@ class Prior:
 
 
 class PositionEncoding(nn.Module):
-    """Encode local positions (B, 3) [m] as (B, width) float32 of order one.
+    """Encode local positions (B, D) [m] as (B, width) float32 of order one.
 
     Args:
         settings: which encoding.
-        box: (2, 3) [m], lower and upper corner of the moving end's box, local frame.
+        box: (2, D) [m], lower and upper corner of the moving end's box, local frame; of both ends, D = 6.
         prior: needed by `kernel`.
     """
 
@@ -79,7 +79,7 @@ class PositionEncoding(nn.Module):
         self.register_buffer("half_extent", (extent / 2).float())
         if settings.kind == "fourier":
             octaves = math.pi * 2.0 ** torch.arange(settings.octaves)
-            axes = (octaves[:, None, None] * torch.eye(3)).reshape(-1, 3)
+            axes = (octaves[:, None, None] * torch.eye(box.shape[1])).reshape(-1, box.shape[1])
             self.register_buffer("frequencies", axes.repeat(2, 1))
             quarter = torch.full((len(axes),), -math.pi / 2)
             self.register_buffer("phases", torch.cat([torch.zeros(len(axes)), quarter]))
@@ -102,10 +102,10 @@ class PositionEncoding(nn.Module):
         """Number of encoded values."""
         if self.settings.kind == "kernel":
             return self.whitening.shape[1]
-        return 3 + (len(self.frequencies) if self.settings.kind == "fourier" else 0)
+        return len(self.centre) + (len(self.frequencies) if self.settings.kind == "fourier" else 0)
 
     def forward(self, position: Tensor) -> Tensor:
-        """Encode (B, 3) [m] as (B, width)."""
+        """Encode (B, D) [m] as (B, width)."""
         if self.settings.kind == "kernel":
             return correlation(position, self.anchors, self.length, self.kernel) @ self.whitening
         scaled = (position - self.centre) / self.half_extent

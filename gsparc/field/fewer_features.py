@@ -32,7 +32,7 @@ def tell_with_fewer(model: GaussianModel, share: float) -> None:
     features = with_places(places[chosen], places, length, noise, old.kernel)
     found = features.weigh @ (own @ (old.whitening.double() @ weights))
     prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())
-    few = PositionEncoding(old.settings, torch.as_tensor(model.site.box), prior)
+    few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)
     emission.encoding = few.to(old.anchors.device)
     emission.weight2 = torch.nn.Parameter(
         found.float().view(-1, count, channels).permute(1, 0, 2).contiguous(), emission.weight2.requires_grad

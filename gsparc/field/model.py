@@ -122,21 +122,21 @@ class GaussianModel(nn.Module):
             )
         self.settings = settings
         self.site = site
-        box = torch.as_tensor(site.box).float()
+        box, query_box = torch.as_tensor(site.box).float(), torch.as_tensor(site.query_box)
         self.gaussians: GaussianField = initial_field(
             settings.field,
             box,
             None if receiver is None else receiver.position,
             None if receiver is None else receiver.rotation,
         )
-        encoding = PositionEncoding(settings.emission.encoding, box, prior)
+        encoding = PositionEncoding(settings.emission.encoding, query_box, prior)
         self.emission = Emission(settings.emission, len(self.gaussians), self.channels, encoding)
         self.confidence: Confidence | None = None
         self.error: ErrorModel | None = None  # in its place where the unknown share is known
         if settings.confidence.enabled and self.tells_unknown:
             self.error = ErrorModel()
         elif settings.confidence.enabled:
-            of_position = PositionEncoding(settings.confidence.encoding, box, prior)
+            of_position = PositionEncoding(settings.confidence.encoding, query_box, prior)
             self.confidence = Confidence(settings.confidence, of_position)
         static = receiver.position if receiver is not None else transmitter
         apart = None if static is None else float((static.float() - box.mean(0)).norm())

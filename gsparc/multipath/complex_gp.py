@@ -9,6 +9,7 @@ predictions at places are those of the largest run, those of measured rows their
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -26,9 +27,8 @@ from gsparc.methods.neighbourhood import Neighbourhood
 from gsparc.methods.run_factors import RunFactors, run_factors
 from gsparc.methods.vecchia import solved
 from gsparc.multipath.ridge import cholesky
-from gsparc.multipath.visibility_kernel import matern32
+from gsparc.multipath.waves.kernels import plain
 from gsparc.ops import Pose
-from gsparc.physics.waves import LIGHT
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
@@ -52,9 +52,13 @@ class _Solved:
 
 
 class ComplexGP(Method):
-    """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid."""
+    """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid.
+
+    Where both ends move the covariance is the product of both ends'.
+    """
 
     name = "complex_gp"
+    both_ends = True
 
     def __init__(self) -> None:
         self.site: Site | None = None
@@ -114,12 +118,11 @@ class ComplexGP(Method):
         others, _ = near.nearest(near.places[row], row, NEAREST)
         rows = np.c_[row, others]
         at = torch.from_numpy(near.places[rows])
-        between = torch.cdist(at, at, compute_mode="donot_use_mm_for_euclid_dist")
         entries = np.random.default_rng(0).permutation(self.targets.shape[1])[:ENTRIES]
         values = torch.from_numpy(self.targets[rows[..., None], entries])
         tried = []
         for length in (length * self.site.wavelength for length in LENGTHS):
-            covariance = self._correlation(between, length)
+            covariance = self._correlation(at, at, length)
             for noise in NOISES:
                 gram = covariance[:, 1:, 1:] + noise * torch.eye(others.shape[1], dtype=torch.float64)
                 weights, told = solved(gram, covariance[:, 0, 1:])
@@ -149,7 +152,7 @@ class ComplexGP(Method):
     def _solve(self, target: Tensor, length: float, noise: float, rows: Tensor, run: np.ndarray) -> _Solved:
         """Weights of `rows` (m,) for an envelope's length [m]; the best power and runs' factors are taken."""
         places, target, number = self.places[rows], target[rows], run[rows.numpy()]
-        gram = self._correlation(torch.cdist(places, places), length)
+        gram = self._correlation(places, places, length)
         gram.diagonal().add_(noise)
         lower = cholesky(gram)
         aligning = torch.ones(len(rows), dtype=torch.complex128)
@@ -166,11 +169,10 @@ class ComplexGP(Method):
         nll = 0.5 * np.log(max(fit, 1e-300)) + determinant - float(aligning.abs().log().mean())
         return _Solved(nll, lower, torch.complex(weights[:, :half], weights[:, half:]), aligning)
 
-    def _correlation(self, distance: Tensor, length: float) -> Tensor:
-        """At distances [m], of any shape."""
-        assert self.site is not None and self.site.carrier_hz is not None
-        envelope = matern32((distance / length).square())
-        return torch.sinc(2 * distance * self.site.carrier_hz / LIGHT) * envelope
+    def _correlation(self, a: Tensor, b: Tensor, length: float) -> Tensor:
+        """Between places (..., n, 3) and (..., m, 3) [m], or (..., 6) of both ends."""
+        assert self.site is not None and self.site.wavelength is not None
+        return plain(a, b, 2 * math.pi / self.site.wavelength, length)
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
@@ -212,11 +214,9 @@ class ComplexGP(Method):
             own = None if without is None else without[start : start + QUERIES]
             row, _ = near.nearest(part.detach().numpy(), own, NEAREST)
             places = torch.from_numpy(near.places[row])
-            far = (part[:, None] - places).square().sum(-1).clamp_min(1e-24).sqrt()  # finite slope at 0
-            apart = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
-            gram = self._correlation(apart, self.length)
+            gram = self._correlation(places, places, self.length)
             gram.diagonal(dim1=-2, dim2=-1).add_(self.noise)
-            weights, told = solved(gram, self._correlation(far, self.length))
+            weights, told = solved(gram, self._correlation(part[:, None], places, self.length)[:, 0])
             values = torch.from_numpy(self.targets[row])
             means.append(torch.einsum("bk,bkr->br", weights.to(values.dtype), values))
             left.append((1 + self.noise - told).clamp_min(0))
@@ -232,14 +232,13 @@ class ComplexGP(Method):
         return LeftOut(np.arange(len(self.places)), self.turned[:, None] * self.weights / inverse[:, None])
 
     def _moving(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Places (B, 3) float64 [m] of the moving end."""
+        """Places (B, 3) float64 [m] of the moving end, (B, 6) of both."""
         assert self.site is not None
-        moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
-        return moving.cpu().double()
+        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
     def _cross(self, tx: Tensor, rx: Pose) -> Tensor:
         """Covariance (B, n) of the moving end's places with those learned from."""
-        return self._correlation(torch.cdist(self._moving(tx, rx), self.places), self.length)
+        return self._correlation(self._moving(tx, rx), self.places, self.length)
 
     def _mean(self, cross: Tensor) -> Tensor:
         mean = torch.complex(cross @ self.weights.real, cross @ self.weights.imag)

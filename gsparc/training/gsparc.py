@@ -59,6 +59,8 @@ class Gsparc(LearnedField):
         **field: see `LearnedField`.
     """
 
+    both_ends = True
+
     def __init__(self, effects: EffectSettings | None = None, **field: Any) -> None:
         super().__init__(**field)
         self.switches = effects or EffectSettings()

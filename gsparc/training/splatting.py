@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.gaussian_cloud import GaussianCloud
+from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import check_arguments, or_null, switch, whole
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -45,6 +46,7 @@ from gsparc.training.time_budget import Pace
 
 log = logging.getLogger(__name__)
 
+LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
@@ -137,6 +139,8 @@ class LearnedField(Method):
             marks.get("left_out")
         )  # the initialiser of an interrupted run is not repeated
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
+        if self._told_by_few(fold) and not self.choices.closed_form:
+            fold = _more_told(data, fold, context)
         if self._solved(fold):
             if self.refit:
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
@@ -160,10 +164,12 @@ class LearnedField(Method):
         return FitReport(seconds, limited_by=self._limited_by)
 
     def _solved(self, fold: Fold) -> bool:
-        """Whether a closed-form start is the answer: without validation rows nobody knows which steps pay."""
+        """Whether a closed-form start is the answer: few validation rows choose steps by chance."""
         assert self.choices is not None
-        untold = self.keep_best and not len(fold.val)
-        return self.choices.closed_form and (self.most_steps == 0 or untold)
+        return self.choices.closed_form and (self.most_steps == 0 or self._told_by_few(fold))
+
+    def _told_by_few(self, fold: Fold) -> bool:
+        return self.keep_best and len(fold.val) < LEAST_TOLD
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
@@ -393,6 +399,15 @@ def _choices(stored: dict[str, Any]) -> Choices:
     if known.pop("warm_start", False):
         known["init"] = "images"
     return Choices(**known)
+
+
+def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
+    """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    if len(known) < 2 * LEAST_TOLD:
+        return fold
+    cut = cut_inside(data, fold, context.split, 3, context.seed).folds[0]
+    return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
 
 
 def _apart(data: Measurements, fold: Fold) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,14 +13,11 @@ from campaigns import compose
 from worlds import World, arrays
 
 from gsparc.commands.train import Objects, train
-from gsparc.data.errors import DataError
-from gsparc.data.own import load_own
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Kind, Measurements
 from gsparc.evaluation.baseline_cache import baseline, fitting
-from gsparc.evaluation.scores import Scores
+from gsparc.evaluation.scores import score
 
-BEHIND = 0.05  # of the best plain method's error, that ours may be behind
-FIGURE = {"spectrum": "mse", "csi": "error_power", "rssi": "error_db"}
+BEHIND = 1.05  # times the best plain method's error that ours may have
 FRESH = 5  # seeds that repeat a miss
 
 
@@ -29,10 +27,11 @@ class Outcome:
 
     Attributes:
         world, seed: which.
-        seconds: of the whole training, baselines and evaluation with it [s].
+        seconds: of everything [s].
         fit_s: of the fit [s].
-        best: the plain method of least error, its error beside ours; relative to that of zero, or in dB.
-        own_error, best_error, allowed: the last is what ours may be behind.
+        model: its terms, where its Gaussians come from, and their number.
+        own, best, allowed: our error, that of the plain method `name`, and how much larger ours may be: minus
+            PSNR in dB of spectra, NMSE of channels, rmse in dB of powers.
         plain: whether the default came to no more than a plain process.
         refused: what it said instead; then nothing else is known.
     """
@@ -41,65 +40,79 @@ class Outcome:
     seed: int
     seconds: float = 0.0
     fit_s: float = 0.0
-    best: str = ""
-    own_error: float = np.nan
-    best_error: float = np.nan
-    allowed: float = np.nan
-    plain: bool = False
     model: str = ""
+    name: str = ""
+    own: float = math.nan
+    best: float = math.nan
+    allowed: float = math.nan
+    plain: bool = False
     refused: str = ""
 
     @property
     def behind(self) -> bool:
         """Whether the default lost."""
-        return bool(self.own_error - self.best_error > self.allowed)
+        return self.own - self.best > self.allowed
 
     def line(self) -> str:
         """For a file of results."""
         return json.dumps(asdict(self))
 
 
-def run(world: World, seed: int, folder: Path, more: tuple[str, ...] = ()) -> tuple[Outcome, Objects | None]:
-    """Train and judge; files go to `folder`."""
+def run(
+    world: World, seed: int, folder: Path, more: tuple[str, ...] = ()
+) -> tuple[Outcome, Objects | None]:
+    """Train and judge; files go to `folder`, `more` overrides."""
     folder.mkdir(parents=True, exist_ok=True)
     file, started = folder / "own.npz", time.perf_counter()
     np.savez(file, **arrays(world, seed))
     found = Outcome(world.name, seed)
-    overrides = ["dataset=own", f"dataset.file='{file}'", "model=gsparc", f"split={world.split}", "logger=none", *more]
+    said = ["dataset=own", f"dataset.file='{file}'", "model=gsparc", f"split={world.split}", "logger=none"]
     try:
-        facts, objects = train(compose(*overrides, "baselines=[zero]"), folder / "run")
-    except (ValueError, DataError) as error:
+        facts, objects = train(compose(*said, "baselines=[zero]", *more), folder / "run")
+    except ValueError as error:
         found.refused, found.seconds = str(error), time.perf_counter() - started
         return found, None
-    found.fit_s, method = float(facts["time/train_s"]), objects.methods[0]
-    found.model = f"{facts['model/effects']} init={facts.get('model/init')} n={method.size()}"
-    found.plain = method.size() == 0
-    own = objects.evaluation.columns
-    split, data = objects.split, objects.data
-    errors = {name: _errors(baseline(name, data, split).scores) for name in _plain(data, split)}
-    mine = own[FIGURE[data.site.kind]]
-    mine = mine**2 if data.site.kind == "rssi" else mine
-    unit = _unit(world, data, split.folds[0].test)
-    usable = np.isfinite(mine)
-    means = {name: float(np.mean(each[usable])) for name, each in errors.items()}
-    found.best = min(means, key=lambda name: means[name])
-    difference = mine[usable] - errors[found.best][usable]
-    root = (lambda e: float(np.sqrt(e))) if data.site.kind == "rssi" else (lambda e: e / max(means["zero"], 1e-300))
-    found.own_error, found.best_error = root(float(mine[usable].mean())), root(means[found.best])
-    spread = 2 * standard_error(difference, unit[usable])
-    found.allowed = max(BEHIND * found.best_error, root(means[found.best] + spread) - found.best_error)
+    data, split, gaussians = objects.data, objects.split, int(facts["model/num_gaussians"])
+    found.fit_s, found.plain = float(facts["time/train_s"]), gaussians == 0
+    found.model = f"{facts['model/effects']} from {facts['model/init']}, {gaussians} Gaussians"
+    kind = data.site.kind
+    own = _losses(kind, score(objects.methods, data, split).samples)
+    plain = {name: _losses(kind, baseline(name, data, split).scores.samples) for name in fitting(data, split)}
+    told = np.isfinite(own)
+    means = {name: float(each[told].mean()) for name, each in plain.items()}
+    found.name = min(means, key=lambda name: means[name])
+    difference = own[told] - plain[found.name][told]
+    spread = standard_error(difference, _unit(world, data, split.folds[0].test)[told])
+    found.own, found.best = _figure(kind, float(own[told].mean())), _figure(kind, means[found.name])
+    found.allowed = max(_least(world, found.best), _figure(kind, means[found.name] + 2 * spread) - found.best)
     found.seconds = time.perf_counter() - started
     return found, objects
 
 
-def _plain(data: Measurements, split) -> tuple[str, ...]:
-    return fitting(data, split)
+def repeated(world: World, folder: Path, more: tuple[str, ...] = ()) -> Outcome:
+    """The mean over fresh seeds."""
+    every = [run(world, 100 + seed, folder / f"fresh{seed}", more)[0] for seed in range(FRESH)]
+    means = {name: float(np.nanmean([getattr(o, name) for o in every])) for name in ("own", "best", "allowed")}
+    means["allowed"] = max(means["allowed"] / math.sqrt(FRESH), _least(world, means["best"]))
+    return Outcome(**{**asdict(every[0]), **means, "seed": -1, "seconds": sum(o.seconds for o in every)})
 
 
-def _errors(scores: Scores) -> np.ndarray:
-    """Squared error (n,) of each test row: of decibels where powers are measured."""
-    value = scores.samples[FIGURE[scores.kind]]
-    return value**2 if scores.kind == "rssi" else value
+def _least(world: World, best: float) -> float:
+    spectra = world.kind in ("array", "moving_array", "image")
+    return 10 * math.log10(BEHIND) if spectra else (BEHIND - 1) * best
+
+
+def _losses(kind: Kind, samples: dict[str, np.ndarray]) -> np.ndarray:
+    """(n,) of each test row, less is better: what the deciding figure is the mean of."""
+    if kind == "csi":
+        return samples["error_power"] / np.nanmean(samples["target_power"])
+    if kind == "rssi":
+        return samples["error_db"] ** 2
+    return np.where(samples["target_power"] > 0, -samples["psnr_db"], np.nan)  # nothing equals silence but zero
+
+
+def _figure(kind: Kind, loss: float) -> float:
+    return math.sqrt(loss) if kind == "rssi" else loss
 
 
 def _unit(world: World, data: Measurements, rows: np.ndarray) -> np.ndarray:
@@ -119,16 +132,4 @@ def standard_error(difference: np.ndarray, unit: np.ndarray) -> float:
     if number.max() == 0:
         number = np.arange(len(unit))
     sums = np.bincount(number, difference - difference.mean())
-    count = len(sums)
-    return float(np.sqrt((sums**2).sum() * count / max(count - 1, 1)) / len(difference))
-
-
-def repeated(world: World, folder: Path) -> tuple[float, float, float]:
-    """Means over fresh seeds of our error, the best plain one, and what is allowed."""
-    found = [run(world, 100 + seed, folder / f"fresh{seed}")[0] for seed in range(FRESH)]
-    return tuple(float(np.nanmean([getattr(o, name) for o in found])) for name in ("own_error", "best_error", "allowed"))
-
-
-def loaded(world: World, folder: Path) -> Measurements:
-    """The world's measurements as read."""
-    return load_own(folder / "own.npz")
+    return float(np.sqrt((sums**2).sum() * len(sums) / max(len(sums) - 1, 1)) / len(difference))

@@ -174,8 +174,8 @@ def _measured(
     if world.kind in ("tone", "tones", "antennas"):
         return h
     steering = np.exp(2j * np.pi * CARRIER / LIGHT * _directions() @ elements.T)  # (D, A)
-    power = abs(h[:, :, 0] @ steering.conj().T) ** 2
-    return (power / power.max(1, keepdims=True)).reshape(-1, *SHAPE)
+    image = abs(h[:, :, 0] @ steering.conj().T)
+    return (image / image.max(1, keepdims=True)).reshape(-1, *SHAPE)
 
 
 def _elements(world: World) -> np.ndarray:
@@ -232,11 +232,15 @@ def _values(world: World, measured: np.ndarray, rng: np.random.Generator) -> dic
         if "mask" in found:
             found["mask"] = found["mask"][:, 0]
     if name == "csi":
-        found["frequency_hz"] = CARRIER + (np.linspace(-10e6, 10e6, 30) if world.kind == "tones" else np.zeros(1))
+        found["frequency_hz"] = CARRIER + (
+            np.linspace(-10e6, 10e6, 30) if world.kind == "tones" else np.zeros(1)
+        )
     else:
         found["carrier_hz"] = np.array(CARRIER)
     if len(_elements(world)) > 1:
         found["array_position"] = _elements(world)
+    if name == "spectrum":
+        found["attributes"] = np.array('{"normalisation": "max"}')
     return {**found, name: value}
 
 

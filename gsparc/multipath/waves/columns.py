@@ -93,15 +93,13 @@ def refuse(site: Site) -> None:
     """`ValueError` for data that waves of a known length cannot explain."""
     if site.kind != "csi" or site.wavelength is None:
         raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
-    if site.static_end is None:
-        raise ValueError(f"{site.name}: both ends move; waves need one that stands still")
 
 
 def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
     """Groups of the given rows (n,).
 
     Args:
-        data: kind csi; one end is static, or there are several static stations.
+        data: kind csi; one end is static, or there are several static stations, or both ends move.
         rows: measurements; those with a masked entry of a group are no rows of that group.
         apart: whether antennas with places of their own and tones far apart are groups of their own; if not,
             all columns of a station are one, measured at the moving end's place at the carrier.
@@ -197,6 +195,7 @@ def carrier_of(site: Site, station: int) -> float:
 def asked(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Moving and static ends' places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
 
+    Where both ends move, the moving places are (B, 6).
     A static end that is not where any station stands is of station `NOBODY`.
     """
     count = len(tx)
@@ -204,6 +203,8 @@ def asked(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Ten
     turned = rx.rotation.reshape(-1, 3, 3).expand(count, 3, 3).cpu().double()
     sender = tx.cpu().double()
     moving, static = (sender, receiver) if site.moving_end == "tx" else (receiver, sender)
+    if site.static_end is None:
+        moving = torch.cat([sender, receiver], 1)
     if site.stations is None:
         return moving, static, turned, torch.zeros(count, dtype=torch.long)
     known = torch.from_numpy(np.asarray(site.stations.position, np.float64))

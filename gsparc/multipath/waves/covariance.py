@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
-from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth, steering
+from gsparc.multipath.waves.kernels import apart, directed, envelope, plain, smooth, steering
 from gsparc.physics.mirror_planes import Reflections, images
 
 FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
@@ -151,15 +151,18 @@ def diffuse_of(
 
     `powers` (T, M) are the ends' of directions.
     """
+    found = shape.of("isotropic", values.power)[0] * plain(a, b, wavenumber, values.envelope)
+    found = found[None].expand(len(powers), *found.shape)
+    if not len(shape.angles):
+        return found.to(torch.complex128)
     distance = apart(a, b)
-    found = shape.of("isotropic", values.power)[0] * isotropic(distance, wavenumber)
-    found = found[None].expand(len(powers), *distance.shape)
+    bound = envelope(distance, values.envelope)
     block = max(BLOCK // max(distance.numel(), 1), 1)
     for angles, power in zip(shape.angles.split(block), powers.split(block, dim=1), strict=False):
         if len(angles):
             correlations = directions(angles, shape.concentration, wavenumber, a, b, distance)
-            found = found + torch.tensordot(power.to(correlations.dtype), correlations, 1)
-    return (found * envelope(distance, values.envelope)).to(torch.complex128)
+            found = found + torch.tensordot(power.to(correlations.dtype), correlations, 1) * bound
+    return found.to(torch.complex128)
 
 
 def diffuse_fields(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
@@ -265,15 +268,9 @@ def temporal(length: Tensor | float, group: Group) -> tuple[Tensor, Tensor]:
     """Correlations (n, n) of errors over few rows and over many, between rows of the same run."""
     between = (group.order[:, None] - group.order[None]).abs()
     same = group.run[:, None] == group.run[None]
-    distance = apart(group.places, group.places)
-    waves = isotropic(distance, group.slot.wavenumber) * envelope(distance, length)
+    waves = plain(group.places, group.places, group.slot.wavenumber, length)
     fast, slow = (torch.exp(-between / rows) * same for rows in (FAST_ROWS, DRIFT_ROWS))
     return fast, slow * (DRIFT_FIELD * waves + 1 - DRIFT_FIELD)
-
-
-def apart(a: Tensor, b: Tensor) -> Tensor:
-    """Distances (n, m) [m]; exact at none, and differentiable there."""
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def _mixed(before: Tensor, after: Tensor, power: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ from gsparc.multipath.waves.covariance import (
     image_waves,
     ways,
 )
-from gsparc.multipath.waves.kernels import envelope, isotropic, smooth
+from gsparc.multipath.waves.kernels import envelope, plain, smooth
 
 FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
@@ -167,21 +167,20 @@ def compressed(
 def compressible(group: Group, shape: Shape, values: Values) -> bool:
     """Whether the places tell far fewer waves apart than there are rows."""
     noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
-    distance = apart(group.places, group.places)
-    plain = isotropic(distance, group.slot.wavenumber) * envelope(distance, values.envelope)
-    return int((torch.linalg.eigvalsh(plain) > FLOOR * noise).sum()) <= WORTH * len(group)
+    alike = plain(group.places, group.places, group.slot.wavenumber, values.envelope)
+    return int((torch.linalg.eigvalsh(alike) > FLOOR * noise).sum()) <= WORTH * len(group)
 
 
 def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Tensor, Tensor]:
     places, wavenumber = group.places, group.slot.wavenumber
     distance = apart(places, places)
     bound = envelope(distance, values.envelope)
-    plain = isotropic(distance, wavenumber) * bound
-    size, vectors = torch.linalg.eigh(plain)
+    alike = plain(places, places, wavenumber, values.envelope)
+    size, vectors = torch.linalg.eigh(alike)
     kept = size > FLOOR * noise
     whole = int(kept.sum()) > WORTH * len(group)
     basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
-    room = [plain.to(torch.complex128)]
+    room = [alike.to(torch.complex128)]
     for angle in shape.angles:
         one = directions(angle[None], shape.concentration, wavenumber, places, places, distance)
         room.append(one[0] * bound)

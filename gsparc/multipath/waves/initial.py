@@ -36,7 +36,7 @@ from gsparc.multipath.waves.evidence import (
     without,
 )
 from gsparc.multipath.waves.field import ChannelField
-from gsparc.multipath.waves.kernels import cells, directions, envelope, isotropic
+from gsparc.multipath.waves.kernels import cells, directions, plain
 from gsparc.multipath.waves.mirrors import find_mirrors
 from gsparc.multipath.waves.offset import best_offset
 from gsparc.multipath.waves.settings import ChannelSettings
@@ -97,8 +97,8 @@ def initialise(
         ValueError: the data are no channels of a known carrier with one static end.
     """
     rows, budget = np.asarray(rows), budget or TimeBudget()
-    plain, factors, notes = _isotropic(data, rows)
-    search = _Search.of(data, rows, settings, plain, factors)
+    start, factors, notes = _isotropic(data, rows)
+    search = _Search.of(data, rows, settings, start, factors)
     best, more = search.run(budget)
     channel = (int(data.target.shape[1]), int(data.target.shape[2]))
     field = ChannelField(data.site, best.shape, best.values, channel)
@@ -116,7 +116,7 @@ def _isotropic(data: Measurements, rows: np.ndarray) -> tuple[tuple[Shape, Value
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     tried = []
     for length in LENGTHS:
-        bounded = [_plain_kernel(group, length * wavelength) for group in looked]
+        bounded = [plain(g.places, g.places, g.slot.wavenumber, length * wavelength) for g in looked]
         for noise in NOISES:
             tried.append((*_grid_point(looked, bounded, noise, runs), length * wavelength, noise))
     _, factors, length, noise = min(tried, key=lambda t: t[0])
@@ -129,11 +129,6 @@ def _isotropic(data: Measurements, rows: np.ndarray) -> tuple[tuple[Shape, Value
     values = Values(one, *lengths, torch.zeros(3, dtype=torch.float64))
     note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
     return (shape, values), factors, [note]
-
-
-def _plain_kernel(group: Group, length: float) -> Tensor:
-    distance = torch.cdist(group.places, group.places)
-    return isotropic(distance, group.slot.wavenumber) * envelope(distance, length)
 
 
 def _grid_point(
@@ -192,7 +187,7 @@ class _Search:
     settings: ChannelSettings
     groups: tuple[Group, ...]
     every: tuple[Group, ...]
-    plain: tuple[Shape, Values]
+    start: tuple[Shape, Values]
     wavelength: float
     kept: Kept
 
@@ -201,33 +196,34 @@ class _Search:
         data: Measurements,
         rows: np.ndarray,
         settings: ChannelSettings,
-        plain: tuple[Shape, Values],
+        start: tuple[Shape, Values],
         factors: Tensor,
     ) -> _Search:
         every = gather(data, rows, True)
         every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
         groups = thinned(every, COLUMNS, settings.rows)
-        if not compressible(groups[0], *plain):
+        if not compressible(groups[0], *start):
             groups = thinned(every, DENSE_COLUMNS, min(settings.rows, DENSE_ROWS))
         wavelength = 2 * math.pi / every[0].slot.wavenumber
-        return _Search(settings, groups, every, plain, wavelength, Kept())
+        return _Search(settings, groups, every, start, wavelength, Kept())
 
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes."""
         wanted = self.settings
         notes: list[str] = []
-        best = self._measured(*self.plain, self._compressed(*self.plain))
-        best = self._step(best, self._fitted(*self.plain), "powers by likelihood", notes)
+        best = self._measured(*self.start, self._compressed(*self.start))
+        best = self._step(best, self._fitted(*self.start), "powers by likelihood", notes)
+        one_end = self.every[0].places.shape[1] == 3
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = known and wanted.direct
-        if (direct or wanted.constant) and not budget.over():
+        if (direct or wanted.constant) and one_end and not budget.over():
             best = self._step(best, self._with_fixed(best, direct), "leakage and direct wave", notes)
         if wanted.mirrors and best.shape.direct and ends_of(self.every) > 1 and not budget.over():
             mirrored = self._with_mirrors(best, budget)
             if mirrored is not None:
                 count = len(mirrored.values.planes)
                 best = self._step(best, mirrored, f"mirror planes of all ends ({count})", notes)
-        if wanted.directions and not budget.over():
+        if wanted.directions and one_end and not budget.over():
             best = self._step(best, self._with_directions(best), "directions", notes)
         if ends_of(self.every) > 1 and not budget.over():
             best = self._of_all_ends(best, known, notes)

@@ -60,6 +60,23 @@ def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
         return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
 
 
+def apart(a: Tensor, b: Tensor) -> Tensor:
+    """Distances (..., n, m) [m]; exact at none, and differentiable there."""
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
+    """Correlation (..., n, m) float64 of waves from everywhere alike within an envelope's length [m].
+
+    Where both ends move, waves leave in all directions as they arrive from all: the product over the ends.
+
+    Args:
+        a, b: (..., n, 3) and (..., m, 3) [m] of one end, or (..., 6) of both.
+    """
+    ends = [apart(*pair) for pair in zip(a.split(3, -1), b.split(3, -1), strict=True)]
+    return math.prod(isotropic(each, wavenumber) * envelope(each, length) for each in ends)  # type: ignore[return-value]
+
+
 def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
     """Spherical wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3) of a source (3,) [m]."""
     away = ((places - source).square().sum(-1) + NEAR_M**2).sqrt()
