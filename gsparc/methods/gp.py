@@ -370,7 +370,7 @@ class ReducedMean(View):
     ) -> None:
         super().__init__(inner)
         assert inner.site is not None
-        self._kind, self._end, self._shape = inner.site.kind, inner.site.moving_end, shape
+        self._kind, self._site, self._shape = inner.site.kind, inner.site, shape
         self._mean, self._axes, self._weights = mean, axes, weights.float().contiguous()
         self._middle = torch.from_numpy(inner.positions.mean(0)).float()
         self._scale = math.sqrt(3) / inner.kernel.length
@@ -379,7 +379,7 @@ class ReducedMean(View):
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; Matern-3/2 as in `Kernel`, in float32."""
-        where = tx if self._end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        where = self._site.moving(tx, rx).expand(len(tx), -1)
         query = (where - self._middle) * self._scale
         far = torch.linalg.vector_norm(query[:, None] - self._places, dim=-1)  # cdist: three times slower
         scores = ((1 + far) * torch.exp(-far)) @ self._weights

@@ -87,6 +87,8 @@ class Gsparc(LearnedField):
         """The terms that are computed, for `summary.json`."""
         if self.field is not None:
             return "+".join(self.field.terms) or "residual"
+        if self._alone:
+            return "residual"
         base = "array" if self.settings.response.array else "image"
         return base + ("+residual" if self._average is not None else "")
 
@@ -131,6 +133,15 @@ class Gsparc(LearnedField):
         log.info("%d Gaussians, %d gradient steps kept", self.size(), self.steps)
         _log_cost(spent, report.seconds)
         return report
+
+    @property
+    def _alone(self) -> bool:
+        """Whether the averaged process has all the weight."""
+        return self._average is not None and self._average[1] >= 1
+
+    def _pays(self) -> bool:
+        """Whether the rendered field is worth another stage."""
+        return not self._alone
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         if self.plan is not None and self.plan.plain:
@@ -393,6 +404,8 @@ class Gsparc(LearnedField):
 
     def size(self) -> int:
         """Number of Gaussians."""
+        if self._alone:
+            return 0
         return super().size() if self.field is None else self.field.count
 
     def facts(self) -> dict[str, float | int | str | None]:

@@ -154,7 +154,7 @@ class LearnedField(Method):
             self._weigh_process(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
-        if self.refit and len(fold.val):
+        if self.refit and len(fold.val) and self._pays():
             every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
             again = context.within("refit", resume=resume)
@@ -162,6 +162,10 @@ class LearnedField(Method):
             seconds += self._stage("refit", origin, data, every, again, budget, seconds, confidence)
         self.frozen = None
         return FitReport(seconds, limited_by=self._limited_by)
+
+    def _pays(self) -> bool:
+        """Whether another stage is worth its seconds."""
+        return True
 
     def _solved(self, fold: Fold) -> bool:
         """Whether a closed-form start is the answer: few validation rows choose steps by chance."""

@@ -58,9 +58,7 @@ class Outcome:
         return json.dumps(asdict(self))
 
 
-def run(
-    world: World, seed: int, folder: Path, more: tuple[str, ...] = ()
-) -> tuple[Outcome, Objects | None]:
+def run(world: World, seed: int, folder: Path, more: tuple[str, ...] = ()) -> tuple[Outcome, Objects | None]:
     """Train and judge; files go to `folder`, `more` overrides."""
     folder.mkdir(parents=True, exist_ok=True)
     file, started = folder / "own.npz", time.perf_counter()
@@ -92,7 +90,9 @@ def run(
 def repeated(world: World, folder: Path, more: tuple[str, ...] = ()) -> Outcome:
     """The mean over fresh seeds."""
     every = [run(world, 100 + seed, folder / f"fresh{seed}", more)[0] for seed in range(FRESH)]
-    means = {name: float(np.nanmean([getattr(o, name) for o in every])) for name in ("own", "best", "allowed")}
+    means = {
+        name: float(np.nanmean([getattr(o, name) for o in every])) for name in ("own", "best", "allowed")
+    }
     means["allowed"] = max(means["allowed"] / math.sqrt(FRESH), _least(world, means["best"]))
     return Outcome(**{**asdict(every[0]), **means, "seed": -1, "seconds": sum(o.seconds for o in every)})
 
@@ -108,7 +108,9 @@ def _losses(kind: Kind, samples: dict[str, np.ndarray]) -> np.ndarray:
         return samples["error_power"] / np.nanmean(samples["target_power"])
     if kind == "rssi":
         return samples["error_db"] ** 2
-    return np.where(samples["target_power"] > 0, -samples["psnr_db"], np.nan)  # nothing equals silence but zero
+    return np.where(
+        samples["target_power"] > 0, -samples["psnr_db"], np.nan
+    )  # nothing equals silence but zero
 
 
 def _figure(kind: Kind, loss: float) -> float:

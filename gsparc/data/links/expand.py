@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.data.blocks import is_big
 from gsparc.data.links.degrees import in_metres
 from gsparc.data.links.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
 from gsparc.data.own_checks import Checker
@@ -147,7 +148,8 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     mask = arrays.get("mask")
     if mask is not None and mask.shape != values.shape:
         return links  # said where the mask is read
-    may_miss = measured in POWERS or links.stations is not None or mask is not None
+    silent = measured == "spectrum" and not is_big(values)  # a spectrum without power has no directions
+    may_miss = measured in POWERS or links.stations is not None or mask is not None or silent
     if values.dtype.kind not in "iufc" or values.ndim == 0 or not may_miss:
         return links
     axes = tuple(range(1, values.ndim))
@@ -174,6 +176,8 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     if mask is not None and lost.any():
         return links  # marked as measured, and is not: refused where values are read
     keep = told & ~lost
+    if silent and values.any():
+        keep &= values.any(axis=axes)
     if not keep.any():
         return check.refuse(measured, "nothing was measured; expected numbers")
     if not keep.all() or censored.any():
@@ -209,7 +213,8 @@ def _keep(raw: Raw, measured: str, keep: np.ndarray) -> None:
 def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:
     """How many links have no value, and how many were not heard, by station."""
     if not keep.all():
-        text = f"{int((~keep).sum())} of {len(keep)} values are missing"
+        silent = " or without any power" if measured == "spectrum" else ""
+        text = f"{int((~keep).sum())} of {len(keep)} values are missing{silent}"
         if links.stations is not None and links.station is not None:
             lost = np.bincount(links.station[~keep], minlength=len(links.stations))
             told = ", ".join(f"{links.stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i])
