@@ -54,10 +54,11 @@ class Rows:
 def share_of_second(parts: Sequence[Rows]) -> float:
     """Weight in [0, 1] of the second of two predictors with which the mean PSNR over all rows is largest.
 
-    0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained.
+    0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained, but not where the
+    second alone is better than the first: a query may take longer rather than lose to it.
     """
     means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
-    if 10 / np.log(10) * (means[0] - min(means)) < LEAST_GAIN_DB:
+    if means[0] <= means[-1] and 10 / np.log(10) * (means[0] - min(means)) < LEAST_GAIN_DB:
         return 0.0
     best = float(SHARES[int(np.argmin(means))])
     return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best

@@ -103,7 +103,9 @@ def arrays(world: World, seed: int) -> dict[str, np.ndarray]:
     fixed = np.c_[rng.uniform(0.3, 0.7, count) * ROOM[0], [0.2] * count, [2.6] * count]
     fixed[:, 0] += np.arange(count) - (count - 1) / 2
     place, run = _walk(world, rng)
-    other = _walk(world, rng)[0] * [1, 1, 0.5] + [0, 0, 1.5] if world.moving == "both" else fixed[:, None]
+    other = fixed[:, None]
+    if world.moving == "both":
+        other = _walk(world, rng)[0] * [1, 1, 0.5] + [0, 0, 1.5]
     other = np.broadcast_to(other, (count, world.rows, 3))
     walls = _Room(rng)
     measured = np.stack([_measured(world, walls, place, other[t], rng) for t in range(count)], 1)
@@ -166,7 +168,7 @@ def _measured(
     if world.kind == "power":
         hertz = CARRIER + np.linspace(-20e6, 20e6, 8)
         return (abs(room.channel(rx, tx, hertz)) ** 2).mean(1)
-    hertz = CARRIER + (np.linspace(-10e6, 10e6, 30) if world.kind == "tones" else np.zeros(1))
+    hertz = _tones(world)
     elements = _elements(world)
     h = np.stack([room.channel(rx + element, tx, hertz) for element in elements], 1)  # (S, A, K)
     noise = rng.standard_normal((*h.shape, 2)) @ [1, 1j]
@@ -176,6 +178,11 @@ def _measured(
     steering = np.exp(2j * np.pi * CARRIER / LIGHT * _directions() @ elements.T)  # (D, A)
     image = abs(h[:, :, 0] @ steering.conj().T)
     return (image / image.max(1, keepdims=True)).reshape(-1, *SHAPE)
+
+
+def _tones(world: World) -> np.ndarray:
+    """(K,) [Hz]"""
+    return CARRIER + (np.linspace(-10e6, 10e6, 30) if world.kind == "tones" else np.zeros(1))
 
 
 def _elements(world: World) -> np.ndarray:
@@ -232,9 +239,7 @@ def _values(world: World, measured: np.ndarray, rng: np.random.Generator) -> dic
         if "mask" in found:
             found["mask"] = found["mask"][:, 0]
     if name == "csi":
-        found["frequency_hz"] = CARRIER + (
-            np.linspace(-10e6, 10e6, 30) if world.kind == "tones" else np.zeros(1)
-        )
+        found["frequency_hz"] = _tones(world)
     else:
         found["carrier_hz"] = np.array(CARRIER)
     if len(_elements(world)) > 1:
