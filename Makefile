@@ -16,7 +16,8 @@ RFID ?= ../shared/data/rfid-s23-160
 DIST ?= dist
 # Its own objects, made anew: those of another compiler would be taken as they are.
 WHEEL ?= -Cbuild-dir=build/wheel/objects
-.PHONY: browser results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
+GRID ?=
+.PHONY: browser grid results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -78,6 +79,9 @@ test-slow: setup sionna browser $(VENV)/.docs ## slow tests: whole training runs
 
 hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md
 	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md
+
+grid: setup ## every kind of data with defaults beside the plain methods (two hours, resumable; GRID=--seed 7: others)
+	$(RUN) tests/grid/sweep.py build/grid/results$(subst $() ,,$(GRID)).jsonl $(GRID)
 
 soak: setup ## half an hour of loads and queries from four threads, with memory watched
 	$(RUN) -m pytest tests/hard_cases/test_soak.py --soak-minutes 30 --timeout 2400 -s

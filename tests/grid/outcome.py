@@ -55,6 +55,11 @@ class Outcome:
         """Whether the default lost."""
         return self.own - self.best > self.allowed
 
+    def grossly_behind(self, times: float) -> bool:
+        """Whether it lost by more than a few seconds' training explains: `times` the error that is allowed."""
+        most = self.best + self.allowed
+        return self.own > (most * times if self.best > 0 else most + 10 * math.log10(times))
+
     def line(self) -> str:
         """For a file of results."""
         return json.dumps(asdict(self))

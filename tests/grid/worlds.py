@@ -81,13 +81,18 @@ def every(rows: tuple[int, ...] = CHOICES["rows"]) -> list[World]:
 def covering(worlds: list[World], seed: int = 0) -> list[World]:
     """A small set in which every pair of values of two properties meets that meets in any of `worlds`."""
     order = np.random.default_rng(seed).permutation(len(worlds))
-    pairs = [set(itertools.combinations(enumerate(astuple(worlds[i])), 2)) for i in order]
+    pairs = [possible_pairs([worlds[i]]) for i in order]
     missing, chosen = set().union(*pairs), []
     while missing:
         best = int(np.argmax([len(own & missing) for own in pairs]))
         missing -= pairs[best]
         chosen.append(worlds[order[best]])
     return chosen
+
+
+def possible_pairs(worlds: list[World]) -> set[tuple[tuple[int, object], ...]]:
+    """Pairs of values of two properties that meet in any of them."""
+    return {pair for world in worlds for pair in itertools.combinations(enumerate(astuple(world)), 2)}
 
 
 def drawn(worlds: list[World], count: int, seed: int) -> Iterator[World]:
@@ -119,7 +124,7 @@ def arrays(world: World, seed: int) -> dict[str, np.ndarray]:
 
 
 def _walk(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Places (S, 3) [m] along lines through a part of the room, a line or more for each run, and runs (S,)."""
+    """Places (S, 3) [m] along lines through a part of the room, at least one for each run, and runs (S,)."""
     side = {30: 1.0, 300: 1.5, 3000: 3.0}[world.rows]  # dense enough for channels to be related
     lines = max(world.runs, world.rows // 30)
     line = np.arange(world.rows) * lines // world.rows

@@ -1,0 +1,94 @@
+"""`make grid`: every kind of data with defaults, resumable; a line of JSON for each, and a table at the end.
+
+python tests/grid/sweep.py RESULTS.jsonl            # the covering set: every pair of properties meets
+python tests/grid/sweep.py RESULTS.jsonl --seed 7   # 100 combinations drawn by a seed
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+
+from outcome import Outcome, repeated, run
+from product import PARTS
+from rich.console import Console
+from rich.table import Table
+from worlds import World, covering, drawn, every
+
+MANY = 100
+
+
+def one(world: World, folder: Path, more: tuple[str, ...]) -> tuple[Outcome, list[str]]:
+    """What a world came to, on fresh seeds where the first is a miss, and what did not answer."""
+    found, objects = run(world, 0, folder, more)
+    failures = []
+    if objects is None:
+        return found, failures
+    for part in PARTS:
+        try:
+            part(world, folder, objects)
+        except Exception as error:
+            failures.append(f"{part.__name__}: {type(error).__name__}: {str(error)[:200]}")
+    return (repeated(world, folder, more) if found.behind else found), failures
+
+
+def table(lines: list[dict]) -> Table:
+    """All results."""
+    shown = Table(*("combination", "seconds", "fit s", "gsparc", "best plain", "allowed", "model", "verdict"))
+    for entry in lines:
+        found = Outcome(**{key: value for key, value in entry.items() if key != "failures"})
+        verdict = found.refused or "; ".join(entry["failures"]) or ("behind" if found.behind else "")
+        figures = (f"{found.own:.4g}", f"{found.name} {found.best:.4g}", f"{found.allowed:.2g}")
+        model = found.model + (" (five seeds)" if found.seed < 0 else "")
+        shown.add_row(found.world, f"{found.seconds:.0f}", f"{found.fit_s:.1f}", *figures, model, verdict)
+    return shown
+
+
+def main() -> int:
+    """Exit status 1 where something was refused, behind or did not answer."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--seed", type=int, help="draw 100 combinations instead of the covering set")
+    parser.add_argument("--rows", type=int, nargs="+", default=[30, 300, 3000])
+    parser.add_argument("more", nargs="*", help="overrides, such as budget_s=5")
+    given = parser.parse_args()
+    logging.disable(logging.WARNING)
+    worlds = every(tuple(given.rows))
+    chosen = covering(worlds) if given.seed is None else list(drawn(worlds, MANY, given.seed))
+    given.results.parent.mkdir(parents=True, exist_ok=True)
+    done = (
+        [json.loads(line) for line in given.results.read_text().splitlines()]
+        if given.results.exists()
+        else []
+    )
+    known, console = {entry["world"] for entry in done}, Console(width=220)
+    for number, world in enumerate(chosen, 1):
+        if world.name in known:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            found, failures = one(world, Path(folder), tuple(given.more))
+        done.append({**json.loads(found.line()), "failures": failures})
+        with given.results.open("a") as file:
+            file.write(json.dumps(done[-1]) + "\n")
+        console.print(f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False)
+    console.print(table(done))
+    bad = [
+        entry
+        for entry in done
+        if entry["refused"] or entry["failures"] or entry["own"] - entry["best"] > entry["allowed"]
+    ]
+    plain = sum(entry["plain"] for entry in done)
+    console.print(
+        f"{len(done)} combinations, {len(bad)} with something wrong, {plain} no more than a plain process"
+    )
+    return int(bool(bad))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
