@@ -121,7 +121,7 @@ def test_every_station_of_every_place(town, tmp_path):
 
 
 def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
-    table = [[5, 5, 1.5, "mast"], [6, 6, 1.5, "roof-1"], [7, 7, 1.5, "mast"], [8, 8, 1.5, "0"]]
+    table = [[5, 5, 1.5, "mast"], [6, 6, 1.5, "roof-1"], [7, 7, 1.5, "mast"], [8, 8, 1.5, "roof-0"]]
     file = write_table(tmp_path / "a.csv", ["x", "y", "z", "cell"], table)
     predict(town, file)
     found = read(tmp_path / "a.predicted.csv")
@@ -149,6 +149,21 @@ def test_stations_called_by_numbers_answered_for_each_other(tmp_path):
     predict(model, write_table(tmp_path / "a.csv", "xyz", place[:4].tolist()))
     found = column(read(tmp_path / "a.predicted.csv"), "rssi_db").reshape(4, 3)
     assert np.abs(found - powers(place)[:4]).max() < 0.1
+
+
+@pytest.mark.parametrize(("names", "asked"), [(NAMES.tolist(), "0"), (["212", "33", "7"], "1")])
+def test_a_number_that_names_no_station_was_an_index(tmp_path, names, asked):
+    """`0` in a table of places answered as `roof-0`, and an unknown cell id below T as another cell."""
+    place = walk()
+    arrays = {"rx_position": place, "station_position": POSTS, "station_name": np.array(names)}
+    model = fitted({**arrays, "rssi_db": powers(place)}, tmp_path)
+    rows = [[5, 5, 1.5, names[0]], [8, 8, 1.5, asked]]
+    file = write_table(tmp_path / "a.csv", ["x", "y", "z", "cell"], rows)
+    with pytest.raises(DataError, match=f"line 3: '{asked}' is no station of the model"):
+        predict(model, file)
+    if "mast" not in names:  # names that are numbers leave none for counting, from Python and in settings too
+        with pytest.raises(ValueError, match="no station 1; there are 212, 33, 7"):
+            model.at(1)
 
 
 def test_a_station_with_too_few_rows_is_left_out_or_refused(tmp_path, caplog):

@@ -16,17 +16,20 @@ LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end m
 
 
 def station_number(wanted: str | int, names: Sequence[str], count: int) -> int | None:
-    """Which of `count` stations a name or, where none is called so, a number from 0 means; None for none.
+    """Which of `count` stations a name or, where none is called by a number, a number from 0 means.
 
     Args:
         wanted: name or number.
         names: (count,) of the stations; empty where they have none.
         count: number of stations.
+
+    Returns:
+        None where there is none: 7 is not the eighth of the cells 33, 212, ...
     """
-    for known in (list(names), [str(number) for number in range(count)]):
-        if str(wanted) in known:
-            return known.index(str(wanted))
-    return None
+    if str(wanted) in list(names):
+        return list(names).index(str(wanted))
+    numbers = [] if any(name.isdigit() for name in names) else [str(number) for number in range(count)]
+    return numbers.index(str(wanted)) if str(wanted) in numbers else None
 
 
 def numbered(places: np.ndarray) -> np.ndarray:
