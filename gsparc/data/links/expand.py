@@ -172,8 +172,9 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     if mask is not None and lost.any():
         return links  # marked as measured, and is not: refused where values are read
     keep = told & ~lost
-    if not keep.any():
-        return check.refuse(measured, "nothing was measured; expected numbers")
+    if not (keep & ~censored).any():
+        why = "nothing was heard in any row" if censored.any() else "nothing was measured"
+        return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
         _note_lost(check, measured, links, keep, censored)
         _keep(check.raw, measured, keep)
