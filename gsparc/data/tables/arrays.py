@@ -160,6 +160,8 @@ class Builder:
         """The stations, where there are; an end that is their place is taken out of `found`."""
         where = places(self.sheet, self.chosen, "station_", self.problems)
         labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
+        for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
+            self.problems.add(self.sheet.source, f"two columns of the station {label!r}; rename one")
         if len(labels) > 1:
             return self._wide(labels, where)
         column = self.chosen.get("station", (None,))[0]
@@ -204,8 +206,20 @@ class Builder:
             )
             return self.problems.add(self.sheet.source, fault)
         self._all_listed(np.array(labels), None)
+        silent = [name for name in self.listed.names if name not in labels]
+        used = {column.head for columns in self.chosen.values() for column in columns}
+        for name in silent:
+            close = difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6)
+            for head in close:
+                self.problems.add(
+                    self.sheet.source, f"no column of the listed station {name!r}, but {head!r}; the same?"
+                )
         if self.problems:
             return None
+        if silent:
+            self.notes.append(
+                f"listed, but without a column: {', '.join(silent[:8])}{', ...' * (len(silent) > 8)}"
+            )
         order = np.array([self.listed.names.index(label) for label in labels])
         for role in PER_STATION:
             if role in self.listed.extra:

@@ -163,10 +163,10 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     rest = [w for w in words if w != word and w not in _ABOUT_LEVEL and w not in ("db", "dbm")]
     label = ""
     if rest:
-        label = re.sub(
-            rf"[\W_]*(?<![a-z]){word}(?:[\W_]*dbm?(?![a-z]))?[\W_]*", " ", plain, flags=re.IGNORECASE
-        )
-        label = label.strip().strip("()[]").strip()
+        # One mark between the level and the name: a sign or # after it is the name's.
+        around = rf"(?:[\s_.:/(\[]+|-)?(?<![a-z]){word}(?:[\W_]*dbm?(?![a-z]))?(?:[\s_.:/)\]]+|-)?"
+        label = re.sub(around, " ", plain, flags=re.IGNORECASE)
+        label = label.strip("_ ").strip("()[]").strip("_ ")
     role = "rssi" if unit is not None and unit.kind == "power" else "rssi_db"
     return Head(role, label, unit, word)
 

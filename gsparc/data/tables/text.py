@@ -117,24 +117,26 @@ def _lines(text: str) -> _Lines:
 
 def _cells(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
-        return line.split()
+        line = " ".join(line.split())
     if '"' not in line:
         return line.split(delimiter)
     return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
 
 
 def _delimiter(lines: _Lines) -> str | None:
-    """The one by which most of the first lines have as many cells as the first, and that is not one."""
-    best: tuple[float, int, str] | None = None
+    """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
+    best: tuple[bool, float, int, str] | None = None
     sample = lines.text[:LOOKED_AT]
     for delimiter in DELIMITERS:
         count = len(_cells(sample[0], delimiter))
-        if count < 2 or (delimiter == " " and best is not None):
+        said = _cells(lines.comment_before, delimiter) if lines.comment_before else []
+        heads = len(said) == count and any(understand(cell).role for cell in said)
+        if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
             continue
         agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
-        if best is None or (agree, count) > best[:2]:
-            best = (agree, count, delimiter)
-    return None if best is None else best[2]
+        if best is None or (heads, agree, count) > best[:3]:
+            best = (heads, agree, count, delimiter)
+    return None if best is None else best[3]
 
 
 def _with_heads(lines: _Lines, delimiter: str, source: str) -> _Lines:
@@ -167,16 +169,20 @@ def _without_comments(lines: _Lines, delimiter: str, source: str) -> tuple[_Line
         return lines, []
     at = f"line {lines.number[marked[0]]}"
     count = len(_cells(lines.text[0], delimiter))
-    if not any(len(_cells(lines.text[i], delimiter)) == count for i in marked):
+    like = {n: lines.text[n].lstrip(" #%/") for n in marked}  # between spaces a mark may be a cell
+    if all(
+        count not in (len(_cells(lines.text[i], delimiter)), len(_cells(like[i], delimiter))) for i in marked
+    ):
         kept = sorted(set(range(len(lines.text))) - set(marked))
         note = f"{len(marked)} comments below the heads, the first in {at}"
         return _Lines([lines.text[i] for i in kept], [lines.number[i] for i in kept], ""), [note]
     first = [_cells(line, delimiter)[0].strip() for line in lines.text]
-    plain = {first[i] for i in set(range(1, len(first))) - set(marked)}
+    plain = [cell for i, cell in enumerate(first) if i and i not in set(marked)]
     numbers = bool(plain) and all(map(_is_number, plain))
     for i in marked:
-        name = first[i].lstrip("#%/")
-        if not name or name[0].isspace() or name in plain or (numbers and _is_number(name)):
+        mark = next(mark for mark in COMMENTS if first[i].startswith(mark))
+        name = first[i].removeprefix(mark).strip('"')
+        if not name.strip() or name[0].isspace() or name in first or (numbers and _is_number(name)):
             fault = f"begins with {first[i][:20]!r}: a row, or a comment? quote the cell or take the line out"
             raise DataError(f"{source}, line {lines.number[i]}: {fault}")
     return lines, [f"{len(marked)} rows begin with {first[marked[0]]!r} or the like, the first in {at}"]
@@ -186,7 +192,7 @@ def _rectangular(lines: _Lines, delimiter: str, source: str) -> list[list[str]]:
     """All cells; quotes that stay open, and lines with more or fewer cells than heads, are refused."""
     problems = Problems(source)
     for line, number in zip(lines.text, lines.number, strict=True):
-        if line.count('"') % 2 and delimiter != " ":
+        if line.count('"') % 2:
             fault = (
                 "a quotation mark is not closed on this line; close it, or remove the line break in the cell"
             )
@@ -225,9 +231,9 @@ def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
 
 def _decimal(frame: pd.DataFrame) -> str:
     """The mark that most numbers have that have one."""
-    counts = dict.fromkeys(",.", 0)
+    counts = [0, 0]
     for i in frame.columns:
-        sample = frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)]
-        counts[","] += int(sample.str.fullmatch(DECIMAL_COMMA).sum())
-        counts["."] += int(sample.str.fullmatch(DECIMAL_POINT).sum())
-    return "," if counts[","] > counts["."] else "."
+        for cell in frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)]:
+            counts[0] += re.fullmatch(DECIMAL_COMMA, cell) is not None
+            counts[1] += re.fullmatch(DECIMAL_POINT, cell) is not None
+    return "," if counts[0] > counts[1] else "."
