@@ -113,7 +113,10 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         check.problems.raise_if_any()
     assert measured is not None and links is not None
     raw = check.raw
-    check.unknown = "tx_position" if links.unknown_transmitter else None
+    lost = links.unknown_transmitter or (
+        links.stations is not None and np.isnan(links.stations.position).any()
+    )
+    check.unknown = f"{links.static_end}_position" if lost else None
     values, kind = _measured(check, measured)
     if values is None:
         for name in ("rx_position", "tx_position"):

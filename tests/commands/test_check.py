@@ -148,8 +148,8 @@ def test_advice_of_a_refusal_was_refused(tmp_path, capsys):
         str(tmp_path / "a.csv"),
         ["dataset.columns.rssi_db=lev", f"dataset.stations_file={tmp_path / 's.csv'}"],
     )
-    assert main([file, "--no-draw", said[0]]) == 1
-    assert "or say dataset.stations_file=FILE" in capsys.readouterr().out
+    assert main([file, "--no-draw", said[0]]) == 0
+    assert "unknown; dataset.stations_file=FILE gives them" in capsys.readouterr().out
     assert main([file, "--no-draw", *said]) == 0
     assert "the transmitter, b, at (9.000, 9.000, 0.000) m" in capsys.readouterr().out
     with pytest.raises(SystemExit):

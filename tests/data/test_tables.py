@@ -304,7 +304,7 @@ SPOILT = {
     "latitude and longitude swapped": (
         "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",
     ),
-    "stations without places": ("x,y,rssi,cell\n1,2,-80,a\n", {}, "stations without places; add columns"),
+    "channels of stations without places": ("x,y,re,im,cell\n1,2,1,0,a\n", {}, "stations without places; add columns"),
     "columns of stations without places": ("x,y,rssi_a,rssi_b\n1,2,-80,-81\n", {}, "say dataset.stations_file"),
     "a station that moved": (
         "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,a,5,6\n", {}, "'a' is at (5, 5) in line 2 and at (5, 6)",

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from gsparc.data.errors import DataError
+from gsparc.data.own import interpret
 from gsparc.data.tables.read import read_table, understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
@@ -18,6 +20,22 @@ def write(tmp_path):
         return path
 
     return written
+
+
+def test_stations_of_unknown_place_could_not_be_read(write):
+    """The schema had them, of powers, and methods estimate where they are."""
+    text = "x,y,rssi,cell\n1,2,-80,b\n2,3,-81,a\n4,4,-82,b\n9,4,-83,a\n"
+    table = understand_table(write(text))
+    assert any("no places of the stations: unknown" in note for note in table.notes)
+    data = interpret(table.raw, "drive").data
+    assert data.site.stations.name == ("b", "a") and np.isnan(data.site.stations.position).all()
+    assert data.station.tolist() == [0, 1, 0, 1] and np.isfinite(data.site.box).all()
+    for one, axes in ((text, "x,y"), (text.replace("x,y", "lat,lon"), "lat,lon")):
+        some = read_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv"))
+        known = np.isfinite(interpret(some, "drive").data.site.stations.position).all(axis=1)
+        assert known.tolist() == [True, False]
+    with pytest.raises(DataError, match="column 'y', line 3: no value; station_y is needed"):
+        read_table(write(text), {}, write("name,x,y\na,3,4\nb,1,\n", "stations.csv"))
 
 
 @pytest.mark.parametrize("mark", ["#", "%", "//"])

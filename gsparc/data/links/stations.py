@@ -60,12 +60,22 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
     return Links(few, stations, which.reshape(-1).astype(np.int64), numbered(moving), run=run)
 
 
-def station_table(check: Checker) -> Stations | None:
-    """The table that a file gives; None where something is wrong with it (noted)."""
+def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
+    """The table that a file gives; None where something is wrong with it (noted).
+
+    Places may be missing, NaN throughout, where powers alone are told by the stations.
+    """
+    arrays = check.raw.arrays
+    given = arrays["station_position"]
+    lost = np.zeros(len(given) if given.ndim else 0, bool)
+    if may_miss and given.ndim == 2 and given.dtype.kind == "f":
+        lost = np.isnan(given[:, :2]).all(axis=1)
+        arrays["station_position"] = np.where(lost[:, None], 0, given)
     places = check.position("station_position", None)
     if places is None or places.ndim != 2:
         return None if places is None else check.refuse("station_position", "expected shape (T, 3)")
     count = len(places)
+    places[lost] = np.nan
     names = check.raw.arrays.get("station_name")
     if names is not None and not check.fits("station_name", names, (count,)):
         return None

@@ -195,6 +195,11 @@ class Builder:
         if ends:
             one_each(self.sheet, found[ends[0]], index, names, self.problems)
             return None
+        if measured in LEVELS:
+            nowhere = np.full((len(names), 3), np.nan)
+            degrees = next(iter(found.values())).degrees
+            self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
+            return _Stations(names, index, Places(nowhere[:, :2], nowhere[:, 2], degrees))
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.problems.add(self.sheet.source, fault + "station_lon), or say dataset.stations_file=FILE")
 
