@@ -102,7 +102,9 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> list[tu
     if queries.station is None:
         every = range(len(stations)) if only is None else [only]
         return [(row, number) for row in range(len(queries)) for number in every]
-    number_of = {name: number for number, name in enumerate(names)}  # names alone: a number is one, or wrong
+    number_of: dict[str, int | None] = {
+        name: number for number, name in enumerate(names)
+    }  # names alone: a number is one, or wrong
     for row, word in enumerate(queries.station.tolist()):
         if word not in number_of:
             fault = f"{word!r} is no station of the model{suggest(word, names)}"
