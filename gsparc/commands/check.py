@@ -14,6 +14,8 @@ from gsparc.data.checks.plausibility import plausibility_warnings, steps_of
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
 
+SETTINGS = ("dataset.stations_file=", "dataset.columns.")
+
 
 def check(
     path: str,
@@ -89,10 +91,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--no-draw", action="store_true", help="no map of places, levels and what looks wrong"
     )
-    given = parser.parse_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
+    columns = dict(text.partition("=")[::2] for text in given.column)
+    for text in [text for text in given.path if text.startswith(SETTINGS)]:  # as refusals and notes say them
+        name, _, value = text.removeprefix("dataset.").partition("=")
+        given.path.remove(text)
+        if name == "stations_file":
+            given.stations_file = value
+        else:
+            columns[name.removeprefix("columns.")] = value
+    if not given.path:
+        parser.error("name a file or a folder, too")
     if given.draw is not None and (len(given.path) > 1 or not given.draw.lower().endswith(".png")):
         parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")
-    columns = dict(text.partition("=")[::2] for text in given.column)
     console = Console()
 
     def picture(path: str) -> str | None:

@@ -114,10 +114,11 @@ def assemble(
         links: of several stations, censored or unknown ends; None where there is nothing to say.
     """
     links = links or Links(static_end)
-    stations, unknown = links.stations, links.unknown_transmitter
+    stations = links.stations
     # A place far outside would put the middle there, where float32 has lost centimetres.
     usual = ~too_far(tx if static_end == "rx" else rx)
-    ends = np.concatenate([rx[usual]] if unknown else [tx[usual], rx[usual]])
+    ends = np.concatenate([tx[usual], rx[usual]])
+    ends = ends[np.isfinite(ends).all(axis=1)]  # without what stands at an unknown place
     lower, upper = ends.min(axis=0), ends.max(axis=0)
     origin = (lower + upper) / 2
     places = {"rx": tx - origin, "tx": rx - origin}
@@ -130,8 +131,9 @@ def assemble(
         "carriers_hz": None if stations is None else stations.carrier_hz,
     }  # fmt: skip
     still = None
-    if static_end is not None and (stations is None or len(stations) == 1) and not unknown:
+    if static_end is not None and (stations is None or len(stations) == 1):
         still = (rx if static_end == "rx" else tx)[0] - origin
+        still = still if np.isfinite(still).all() else None
     site = Site(
         static_end=static_end, array=array, carrier_hz=carrier_hz, subcarriers_hz=subcarriers_hz,
         origin=origin, box=np.stack([lower - origin, upper - origin]), sha256=content_hash(hashed),

@@ -16,6 +16,7 @@ import numpy as np
 
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
+from gsparc.data.checks.far_ends import far_ends
 from gsparc.data.checks.outliers import peaks, too_strong
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
@@ -112,7 +113,10 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         check.problems.raise_if_any()
     assert measured is not None and links is not None
     raw = check.raw
-    check.unknown = "tx_position" if links.unknown_transmitter else None
+    lost = links.unknown_transmitter or (
+        links.stations is not None and np.isnan(links.stations.position).any()
+    )
+    check.unknown = f"{links.static_end}_position" if lost else None
     values, kind = _measured(check, measured)
     if values is None:
         for name in ("rx_position", "tx_position"):
@@ -134,6 +138,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     release_split = check.release_split(rows)
     _in_range(check, measured, values, mask)
     _static(check, links, ends["rx"], ends["tx"], rotation)
+    _within_reach(check, links, ends)
     check.problems.raise_if_any()
     assert rotation is not None
     static_end = links.static_end
@@ -275,6 +280,19 @@ def _static(
     elif links.static_end == "rx" and links.stations is None and (rotation != rotation[0]).any():
         fault = "the receiver stands still but turns while the transmitter moves; expected one orientation"
         check.problems.add(check.source, fault)
+
+
+def _within_reach(check: Checker, links: Links, ends: Mapping[str, np.ndarray | None]) -> None:
+    """Refuse static ends that cannot be of these rows, and note those that hardly are."""
+    still = None if links.static_end is None else ends[links.static_end]
+    moving = ends["tx" if links.static_end == "rx" else "rx"]
+    if still is None or moving is None or moving.ndim < 2 or not np.isfinite(still).any():
+        return
+    fault, certain = far_ends(np.unique(np.atleast_2d(still), axis=0), moving, links.georeference)
+    if fault and certain:
+        check.problems.add(check.source, fault)
+    elif fault:
+        check.notes.append(fault)
 
 
 def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) -> None:

@@ -31,7 +31,7 @@ class QueryPlaces:
         source: the file, for messages.
         ends: places (n,) of each end that moves, as they were given.
         rows: (n,) what messages call each.
-        station: (n,) names or numbers; None where the file names none.
+        station: (n,) names; None where the file names none.
         name: (n,) what a user calls each, where a column says so; else None.
         notes: what was guessed or not used, one line each.
     """

@@ -272,9 +272,9 @@ def known_station(wanted: str | int, names: Sequence[str], count: int, said: str
     number = station_number(wanted, names, count)
     if number is not None:
         return number
-    if isinstance(wanted, int) or not names:
+    if not names or (isinstance(wanted, int) and not any(name.isdigit() for name in names)):
         raise DataError(f"{said}: {source} has stations 0 to {count - 1}")
-    raise DataError(f"{said}: no station {wanted} in {source}{suggest(wanted, names)}")
+    raise DataError(f"{said}: no station {wanted} in {source}{suggest(str(wanted), names)}")
 
 
 def _measurement(raw: Raw, source: str | Path) -> str:

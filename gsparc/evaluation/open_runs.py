@@ -240,6 +240,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
     number = np.empty(len(ours), np.int64)
     for t, name in enumerate(ours.name):
         near = np.linalg.norm(ours.position[t] + shift - theirs.position, axis=1) <= SAME_PLACE_M
+        if np.isnan(ours.position[t]).any():  # nobody knows where: by the name alone
+            near = np.isnan(theirs.position).any(axis=1) & (np.array(theirs.name) == name)
         here = np.flatnonzero(near).tolist()
         called = [i for i in here if theirs.name[i] == name]
         if len(here) != 1 and not called:

@@ -165,6 +165,7 @@ def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
     if data.site.static_end is None:
         shown.append(data.tx[:, :2] + data.site.origin[:2])
     every = np.concatenate(shown)
+    every = every[np.isfinite(every).all(axis=1)]  # but for what stands at an unknown place
     low, high = every.min(axis=0), every.max(axis=0)
     margin = 0.06 * max(float((high - low).max()), 1e-3)
     return low - margin, high + margin
@@ -223,7 +224,8 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
     if site.stations is None or len(place) > NAMED:
         return
     for number, (where, name) in enumerate(zip(place, site.stations.name, strict=True)):
-        _annotate(axis, name, where, "red" if number in jumping else "black")
+        if np.isfinite(where).all():
+            _annotate(axis, name, where, "red" if number in jumping else "black")
 
 
 def _draw_suspicious(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:

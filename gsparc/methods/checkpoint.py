@@ -173,10 +173,20 @@ def _content(path: Path) -> dict[str, Any]:
             f"{path}: written in schema {version}, this gsparc reads up to {SCHEMA_VERSION}; update gsparc"
         )
     for part in ("site", "state"):
-        where = non_finite(content.get(part), part)
+        where = non_finite(_without_unknown_places(content.get(part)), part)
         if where is not None:  # its checksum is right: it was written like this
             raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
     return content
+
+
+def _without_unknown_places(part: Any) -> Any:
+    """A site with 0 for NaN in places of stations: what nobody knows; anything else as it is."""
+    stations = part.get("stations") if isinstance(part, Mapping) else None
+    place = stations.get("position") if isinstance(stations, Mapping) else None
+    if not isinstance(place, Tensor) or not place.is_floating_point():
+        return part
+    known = torch.where(torch.isnan(place), 0, place)
+    return {**part, "stations": {**stations, "position": known}}  # type: ignore[dict-item]
 
 
 def _stored(content: Mapping[str, Any], path: Path) -> Stored:

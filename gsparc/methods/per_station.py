@@ -61,9 +61,10 @@ def of_station(site: Site, number: int) -> Site:
     stations = site.stations
     carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
     rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
+    place = stations.position[number]
     return replace(
         site, name=f"{site.name}, station {stations.name[number]}", stations=None, carrier_hz=carrier,
-        static_position=stations.position[number], rx_rotation=rotation,
+        static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
     )  # fmt: skip
 
 
@@ -118,6 +119,8 @@ class PerStation(Method):
                 names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
+        if UNHEARD in numbers and not joint and np.isnan(data.site.stations.position).any():
+            raise ValueError(f"{self.name}: places of stations are unknown, it needs them; say stations=each")
         whole = self.wrapped.own_budget_s if context.budget_s is None else context.budget_s
         share = None if whole is None else whole / len(numbers)
         seconds, notes = 0.0, []

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gsparc.methods.stored_front import Operating
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
+COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
 
 
 class Predictor:
@@ -399,6 +400,9 @@ def _positions(end: str, value: Any) -> np.ndarray:
         raise ValueError(f"{end}= holds NaN or Inf{row}")
     if np.abs(array).max() > FARTHEST:
         raise ValueError(f"{end}= holds {np.abs(array).max():.3g}; expected metres, none beyond {FARTHEST:g}")
+    step = float(np.spacing(np.float32(np.abs(array).max())))
+    if getattr(value, "dtype", None) in (np.float32, torch.float32) and step > COARSE_M:
+        raise ValueError(f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64")
     return array
 
 

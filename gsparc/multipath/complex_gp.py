@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.blocks import taken
+from gsparc.data.links.stations import numbered
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.covering import covering
@@ -112,7 +113,7 @@ class ComplexGP(Method):
     def _fit_many(self, data: Measurements, known: np.ndarray) -> tuple[str, ...]:
         """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours."""
         assert self.site is not None and self.site.wavelength is not None
-        self.targets = taken(data.target, known).reshape(len(known), -1)
+        scatter = self._places_once(data, known)
         near = self.near = Neighbourhood.of(self.places.numpy(), 0)
         row = covering(near.places, TRIED_ON, 0)
         others, _ = near.nearest(near.places[row], row, NEAREST)
@@ -120,22 +121,48 @@ class ComplexGP(Method):
         at = torch.from_numpy(near.places[rows])
         entries = np.random.default_rng(0).permutation(self.targets.shape[1])[:ENTRIES]
         values = torch.from_numpy(self.targets[rows[..., None], entries])
+        share = 1 / torch.from_numpy(self.count[rows])  # of the noise, in a mean
+        again, around = float((1 / share[:, 0] - 1).sum()), float(scatter[row].sum())
         tried = []
         for length in (length * self.site.wavelength for length in LENGTHS):
             covariance = self._correlation(at, at, length)
             for noise in NOISES:
-                gram = covariance[:, 1:, 1:] + noise * torch.eye(others.shape[1], dtype=torch.float64)
+                gram = covariance[:, 1:, 1:] + torch.diag_embed(noise * share[:, 1:])
                 weights, told = solved(gram, covariance[:, 0, 1:])
                 missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
-                variance = 1 + noise - told
-                power = float((missed.abs().square().mean(1) / variance).mean())
-                tried.append((np.log(max(power, 1e-300)) + float(variance.log().mean()), length, noise))
+                variance = 1 + noise * share[:, 0] - told
+                power = float((missed.abs().square().mean(1) / variance).sum()) + around / noise
+                power, unsure = (
+                    power / (len(row) + again),
+                    float(variance.log().sum()) + again * np.log(noise),
+                )
+                tried.append((np.log(max(power, 1e-300)) + unsure / (len(row) + again), length, noise))
         _, self.length, self.noise = min(tried, key=lambda t: t[0])
         self.power = max(float(values[:, 0].abs().square().mean()), 1e-30)
         self.runs = RunFactors.none()
         said = f"envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
-        told_by = f"each query is predicted from the {NEAREST} nearest of {len(known)} rows (Vecchia)"
+        of = f"of {len(self.places)} places, of" if len(self.places) < len(known) else "of"
+        told_by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
         return said, told_by, f"settings chosen on {len(row)} of them, each given its nearest"
+
+    def _places_once(self, data: Measurements, known: np.ndarray) -> np.ndarray:
+        """Take each place of rows (n,) once, with the mean of its channels; what was spread about it (m,).
+
+        A hundred nearest rows of one place, where a robot waited, tell of no other.
+        """
+        place = numbered(self.places.numpy())
+        _, self.first, count = np.unique(place, return_index=True, return_counts=True)
+        self.count, self.targets = count.astype(np.float64), taken(data.target, known).reshape(len(known), -1)
+        if len(count) == len(known):
+            return np.zeros(len(known))
+        order = np.argsort(place, kind="stable")
+        starts = np.cumsum(count) - count
+        sums, squares = (
+            np.add.reduceat(part[order], starts)
+            for part in (self.targets, (np.abs(self.targets) ** 2).mean(1))
+        )
+        self.places, self.targets = self.places[self.first], sums / count[:, None].astype(np.float32)
+        return np.maximum(squares - count * (np.abs(self.targets) ** 2).mean(1), 0)
 
     def _factors_note(self, names: np.ndarray, run: np.ndarray) -> str:
         """A note of the factors of runs (n,), numbers into `names` (runs,)."""
@@ -215,7 +242,7 @@ class ComplexGP(Method):
             row, _ = near.nearest(part.detach().numpy(), own, NEAREST)
             places = torch.from_numpy(near.places[row])
             gram = self._correlation(places, places, self.length)
-            gram.diagonal(dim1=-2, dim2=-1).add_(self.noise)
+            gram.diagonal(dim1=-2, dim2=-1).add_(self.noise / torch.from_numpy(self.count[row]))
             weights, told = solved(gram, self._correlation(part[:, None], places, self.length)[:, 0])
             values = torch.from_numpy(self.targets[row])
             means.append(torch.einsum("bk,bkr->br", weights.to(values.dtype), values))
@@ -223,11 +250,11 @@ class ComplexGP(Method):
         return torch.cat(means).reshape(-1, *self.shape), torch.cat(left)
 
     def leave_one_out(self) -> LeftOut:
-        """See `LeaveOneOut`; rows are those of the fit, counted from 0."""
+        """See `LeaveOneOut`; rows are those of the fit, counted from 0; of visits to a place, the first."""
         if self.near is not None:
-            rows = np.arange(len(self.places))
-            mean = self._nearest_posterior(self.near, self.places, rows)[0].flatten(1)
-            return LeftOut(rows, (torch.from_numpy(self.targets) - mean).to(torch.complex128))
+            every = np.arange(len(self.places))
+            mean = self._nearest_posterior(self.near, self.places, every)[0].flatten(1)
+            return LeftOut(self.first, (torch.from_numpy(self.targets) - mean).to(torch.complex128))
         inverse = torch.cholesky_inverse(self.factor).diagonal()
         return LeftOut(np.arange(len(self.places)), self.turned[:, None] * self.weights / inverse[:, None])
 
@@ -250,7 +277,8 @@ class ComplexGP(Method):
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
         if self.near is not None:
             arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
-            stored = {**arrays, "targets": torch.from_numpy(self.targets), "shape": list(self.shape)}
+            arrays |= {name: torch.from_numpy(getattr(self, name)) for name in ("targets", "count", "first")}
+            stored = {**arrays, "shape": list(self.shape)}
             return {**stored, "length": self.length, "noise": self.noise, "power": self.power}
         names = ("places", "weights", "factor", "length", "noise", "power", "turned")
         own = {name: getattr(self, name) for name in names}
@@ -264,6 +292,9 @@ class ComplexGP(Method):
         if "level" in state:
             self.near = Neighbourhood(self.places.numpy(), state["level"].numpy())
             self.targets = state["targets"].numpy()
+            once = torch.ones(len(self.places), dtype=torch.float64)  # earlier versions took every row
+            self.count = state.get("count", once).numpy()
+            self.first = state["first"].numpy() if "first" in state else np.arange(len(self.places))
             self.runs = RunFactors.none()
             return
         self.weights, self.factor = state["weights"], state["factor"]

@@ -49,13 +49,15 @@ def weigh(
     """
     spectra = data.site.kind == "spectrum"
     left = left if spectra else None
-    if field.size() and left is None and len(fold.val) < LEAST_HELD:
-        log.info("no Gaussian process is averaged with the field: too few rows are held out to weigh it")
-        return None, None
     process = method_class("gp")()
     process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
-    if not field.size():
-        log.info("no Gaussians: a Gaussian process alone")
+    if not field.size() or (left is None and len(fold.val) < LEAST_HELD):
+        why = (
+            f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
+            if field.size()
+            else "no Gaussians"
+        )
+        log.info("%s: a Gaussian process alone", why)
         return (process, 1.0), None
     held, explained = [], None
     val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val

@@ -42,6 +42,7 @@ from gsparc.training.initialise import prepare
 from gsparc.training.keep_best import SHORT, KeepBest, StopAt
 from gsparc.training.lightning_module import GaussianModule, LossSettings
 from gsparc.training.optimizer import OptimizerSettings
+from gsparc.training.solution_weights import LEAST_HELD
 from gsparc.training.time_budget import Pace
 
 log = logging.getLogger(__name__)
@@ -408,7 +409,7 @@ def _choices(stored: dict[str, Any]) -> Choices:
 def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
     known = np.sort(np.concatenate([fold.train, fold.val]))
-    if len(known) < 2 * LEAST_TOLD:
+    if len(known) < 3 * LEAST_HELD:
         return fold
     cut = cut_inside(data, fold, context.split, 3, context.seed).folds[0]
     return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)

@@ -136,3 +136,21 @@ def test_a_file_is_drawn_unless_said_otherwise(tmp_path, arrays, monkeypatch):
     write_own(tmp_path / "hall.npz", arrays)
     assert main(["hall.npz", "--no-draw"]) == 0 and not (tmp_path / "outputs").exists()
     assert main(["hall.npz"]) == 0 and (tmp_path / "outputs" / "check" / "hall.png").exists()
+
+
+def test_advice_of_a_refusal_was_refused(tmp_path, capsys):
+    """It advised dataset.stations_file=FILE, and took that for a file of measurements."""
+    (tmp_path / "a.csv").write_text(
+        "x,y,lev,cell\n" + "".join(f"{i},{i % 3},-{60 + i},b\n" for i in range(30))
+    )
+    (tmp_path / "s.csv").write_text("name,x,y\nb,9,9\n")
+    file, said = (
+        str(tmp_path / "a.csv"),
+        ["dataset.columns.rssi_db=lev", f"dataset.stations_file={tmp_path / 's.csv'}"],
+    )
+    assert main([file, "--no-draw", said[0]]) == 0
+    assert "unknown; dataset.stations_file=FILE gives them" in capsys.readouterr().out
+    assert main([file, "--no-draw", *said]) == 0
+    assert "the transmitter, b, at (9.000, 9.000, 0.000) m" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(said)

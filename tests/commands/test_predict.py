@@ -20,6 +20,7 @@ from gsparc.commands.train import train
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
+from gsparc.evaluation.open_runs import aligned
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.per_station import for_links
@@ -121,7 +122,7 @@ def test_every_station_of_every_place(town, tmp_path):
 
 
 def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
-    table = [[5, 5, 1.5, "mast"], [6, 6, 1.5, "roof-1"], [7, 7, 1.5, "mast"], [8, 8, 1.5, "0"]]
+    table = [[5, 5, 1.5, "mast"], [6, 6, 1.5, "roof-1"], [7, 7, 1.5, "mast"], [8, 8, 1.5, "roof-0"]]
     file = write_table(tmp_path / "a.csv", ["x", "y", "z", "cell"], table)
     predict(town, file)
     found = read(tmp_path / "a.predicted.csv")
@@ -151,6 +152,21 @@ def test_stations_called_by_numbers_answered_for_each_other(tmp_path):
     assert np.abs(found - powers(place)[:4]).max() < 0.1
 
 
+@pytest.mark.parametrize(("names", "asked"), [(NAMES.tolist(), "0"), (["212", "33", "7"], "1")])
+def test_a_number_that_names_no_station_was_an_index(tmp_path, names, asked):
+    """`0` in a table of places answered as `roof-0`, and an unknown cell id below T as another cell."""
+    place = walk()
+    arrays = {"rx_position": place, "station_position": POSTS, "station_name": np.array(names)}
+    model = fitted({**arrays, "rssi_db": powers(place)}, tmp_path)
+    rows = [[5, 5, 1.5, names[0]], [8, 8, 1.5, asked]]
+    file = write_table(tmp_path / "a.csv", ["x", "y", "z", "cell"], rows)
+    with pytest.raises(DataError, match=f"line 3: '{asked}' is no station of the model"):
+        predict(model, file)
+    if "mast" not in names:  # names that are numbers leave none for counting, from Python and in settings too
+        with pytest.raises(ValueError, match="no station 1; there are 212, 33, 7"):
+            model.at(1)
+
+
 def test_a_station_with_too_few_rows_is_left_out_or_refused(tmp_path, caplog):
     place = walk()
     arrays = {
@@ -165,6 +181,37 @@ def test_a_station_with_too_few_rows_is_left_out_or_refused(tmp_path, caplog):
     assert facts["predict/stations"] == 2 and "left out: gp: station mast had too few" in caplog.text
     with pytest.raises(DataError, match="line 2: gp: station mast had too few training rows"):
         predict(model, file, station="mast", overwrite=True)
+
+
+def test_stations_at_unknown_places(tmp_path):
+    """They are told apart by their names; what needs their places, together, says so."""
+    place, posts = walk(), POSTS.copy()
+    posts[1:] = np.nan
+    arrays = {
+        "rx_position": place,
+        "station_position": posts,
+        "station_name": NAMES,
+        "rssi_db": powers(place),
+    }
+    model = fitted(arrays, tmp_path, "distance_law")
+    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:4].tolist()))
+    found = column(read(tmp_path / "a.predicted.csv"), "rssi_db").reshape(4, 3)
+    assert np.abs(found - powers(place)[:4]).max() < 1
+    data = from_arrays(arrays)
+    back = from_arrays(
+        {
+            **arrays,
+            "station_position": posts[::-1],
+            "station_name": NAMES[::-1],
+            "rssi_db": arrays["rssi_db"][:, ::-1],
+        }
+    )
+    same = aligned(back, model.site)
+    assert [NAMES[t] for t in same.station[:3]] == ["mast", "roof-1", "roof-0"]
+    rows = np.arange(len(data))
+    method = for_links(method_class("gp"), data)
+    with pytest.raises(ValueError, match="places of stations are unknown, it needs them; say stations=each"):
+        method.fit(data, Fold(rows, rows[:0], rows[:5]), FitContext(tmp_path, stations="together"))
 
 
 def test_an_unknown_transmitter(tmp_path):

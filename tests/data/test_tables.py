@@ -224,6 +224,27 @@ def test_channels(write):
     assert interpret(raw, "drive.csv").data.site.kind == "csi"
 
 
+ENDS = {"rx_x": 0, "rx_y": 0, "rx_z": 0, "frequency_hz": "1e9:5e9"}
+
+
+def test_negative_numbers_of_tones_lost_their_sign(write):
+    """csi_re_-2 and csi_re_2 were one tone: 2 of 4 loaded, or in the order 1, 2, -1, -2."""
+    heads = [f"csi_{part}_{tone}" for tone in (1, -2, 2, -1) for part in ("re", "im")]
+    text = ",".join(["x,y,z", *heads]) + "\n1,2,3,1,0,-2,0,2,0,-1,0\n4,5,6,1,9,-2,8,2,7,-1,6\n"
+    for said in ({}, {"csi_re": "csi_re_*", "csi_im": "csi_im_*"}):
+        table = understand_table(write(text), {**ENDS, **said})
+        assert table.raw.arrays["csi"].real.tolist() == [[-2, -1, 1, 2]] * 2
+        assert table.raw.arrays["csi"][1].imag.tolist() == [8, 6, 9, 7]
+        assert table.raw.arrays["frequency_hz"].tolist() == [1e9, 2e9, 4e9, 5e9]
+        assert any("spaced as the numbers of the tones" in note for note in table.notes)
+    same = text.replace("csi_re_-1", "csi_re_02")
+    with pytest.raises(DataError, match="'csi_re_02': the same tone as 'csi_re_2'"):
+        read_table(write(same), ENDS)
+    for head in ("csi_re-1", "csi_re_m1", "csi_re_0_1"):
+        with pytest.raises(DataError, match=f"'{head}': .* is no number of a tone"):
+            read_table(write(text.replace("csi_re_-1", head)), ENDS)
+
+
 def test_runs_and_names_of_rows(write):
     arrays = read_table(write("x,y,rssi,run,row_name\n1,2,-3,7,p\n2,2,-3,8,q\n")).arrays
     assert arrays["run"].tolist() == ["7", "8"] and arrays["row_name"].tolist() == ["p", "q"]
@@ -283,7 +304,7 @@ SPOILT = {
     "latitude and longitude swapped": (
         "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",
     ),
-    "stations without places": ("x,y,rssi,cell\n1,2,-80,a\n", {}, "stations without places; add columns"),
+    "channels of stations without places": ("x,y,re,im,cell\n1,2,1,0,a\n", {}, "stations without places; add columns"),
     "columns of stations without places": ("x,y,rssi_a,rssi_b\n1,2,-80,-81\n", {}, "say dataset.stations_file"),
     "a station that moved": (
         "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,a,5,6\n", {}, "'a' is at (5, 5) in line 2 and at (5, 6)",
@@ -293,6 +314,20 @@ SPOILT = {
     ),
     "half of a channel": ("x,y,h_re_0,h_im_0,h_re_1\n1,2,3,4,5\n", {}, "'h_re_1' has no csi_im beside it"),
     "degrees and metres": ("lat,lon,rssi,cell,cell_x,cell_y\n40,8,-80,a,5,5\n", {}, "of stations in metres"),
+    "a row that may be a comment": (
+        "cell,x,y,rssi\na,1,2,-80\n#a,1,3,-81\n", {}, "line 3: begins with '#a': a row, or a comment?",
+    ),
+    "a comment that may be a row": ("x,y,z,rssi\n1,2,3,-80\n# 1,2,4,-99\n", {}, "line 3: begins with '# 1': a row, or"),
+    "heads said again in a comment": ("x,y,rssi\n1,2,-80\n# x,y,rssi\n2,2,-81\n", {}, "line 3: begins with '# x'"),
+    "a trailing comma": ("x,y,rssi\n1,2,-80,\n2,2,-81,\n", {}, "3 heads, but every line below has 4 cells, the last of them empty"),
+    "a trailing comma of heads": ("x,y,rssi,\n1,2,-80\n", {}, "4 heads, but every line below has 3 cells, the last of them empty"),
+    "a no-break space": ("x y z rssi\n1 2 3 -80\n1 2 3\xa0 -80\xa0dBm\n", {}, "line 3 (5 cells): expected 4 cells"),
+    "something about a level": ("x,y,rssi_delta,predicted_rssi,signal_gain,battery_level\n1,2,3,-80,1,2\n", {},
+                                "no column of levels, powers or channels"),
+    "perhaps a level": ("x,y,rssi_ema\n1,2,-80\n", {}, "'rssi_ema': a received level or power, or something else?"),
+    "a field strength": ("x,y,level (dBuV/m)\n1,2,80\n", {}, "[dBuV/m] is no known unit; expected one of dB, dBm, dBW"),
+    "percent": ("x,y,signal (%)\n1,2,80\n", {}, "[%] is no known unit"),
+    "millimetres beside nothing": ("x_mm,y,rssi\n1,2,-80\n", {}, "'x_mm' is in mm, 'y' says no unit; rename one, e.g. to 'y [m]'"),
     "Excel": (b"PK\x03\x04" + bytes(50), {}, "not a table of text but an Excel workbook"),
     "gzip": (b"\x1f\x8b" + bytes(50), {}, "compressed by gzip"),
     "JSON": ('{"x": 1}', {}, "not a table of text but JSON"),
@@ -312,6 +347,13 @@ def test_a_spoilt_table_is_refused_in_a_line(write, name, monkeypatch, tmp_path)
     assert words in problems[0], problems
     assert all("\n" not in p and ("drive.csv" in p or "dataset." in p) for p in problems)
     assert len(problems) <= 3, problems
+
+
+def test_channels_of_several_tones_and_stations(write):
+    """They were refused with the advice to take one tone."""
+    text = "x,y,station,station_x,station_y,csi_re_1,csi_im_1,csi_re_0,csi_im_0\n1,2,a,0,0,1,2,3,4\n1,2,b,5,5,5,6,7,8\n"
+    arrays = read_table(write(text), {"frequency_hz": "1e9:2e9"}).arrays
+    assert arrays["csi"].tolist() == [[3 + 4j, 1 + 2j], [7 + 8j, 5 + 6j]]
 
 
 def test_all_bad_cells_are_listed_at_once(write):

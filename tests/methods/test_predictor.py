@@ -185,6 +185,21 @@ def test_degrees_that_mean_nothing_are_refused(abroad, spectra):
         gsparc.Predictor(abroad.method, several).metres(47, 11)
 
 
+def test_utm_places_in_float32_were_half_a_metre_off(abroad):
+    """The origin is taken away in float64, but steps of 5,000 km in float32 are 0.5 m: phases were lost."""
+    utm = np.array([691_500.0, 5_334_500, 0])
+    site = dataclasses.replace(abroad.site, origin=abroad.site.origin + utm)
+    far, place = gsparc.Predictor(abroad.method, site).at(0), abroad.metres(47.004, 11.002)
+    there = place + utm
+    assert np.allclose(far.rssi(rx=there), abroad.at(0).rssi(rx=place), rtol=1e-5)
+    for rough in (torch.tensor(there, dtype=torch.float32), there.astype(np.float32)):
+        with pytest.raises(
+            ValueError, match=r"rx= is float32, which moves in steps of 0.5 m there; give float64"
+        ):
+            far.rssi(rx=rough)
+    abroad.at(0).rssi(rx=place.astype(np.float32))
+
+
 def test_two_stations_at_one_place_have_models_of_their_own(abroad):
     """Both carriers of a mast were answered by the model of the first."""
     place = abroad.metres(47.004, 11.002)

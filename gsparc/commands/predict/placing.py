@@ -102,11 +102,11 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> list[tu
     if queries.station is None:
         every = range(len(stations)) if only is None else [only]
         return [(row, number) for row in range(len(queries)) for number in every]
-    number_of = {
-        word: station_number(word, names, len(names)) for word in np.unique(queries.station).tolist()
-    }
+    number_of: dict[str, int | None] = {
+        name: number for number, name in enumerate(names)
+    }  # names alone: a number is one, or wrong
     for row, word in enumerate(queries.station.tolist()):
-        if number_of[word] is None:
+        if word not in number_of:
             fault = f"{word!r} is no station of the model{suggest(word, names)}"
             raise DataError(f"{queries.source}, column of stations, {queries.rows[row]}: {fault}")
     pairs = [(row, number_of[word]) for row, word in enumerate(queries.station.tolist())]

@@ -148,12 +148,15 @@ def _static(site: Site) -> str:
     if site.static_end is None:
         return "neither end"
     end = ENDS[site.static_end]
-    if site.stations is not None and len(site.stations) == 1:
+    if site.stations is not None and len(site.stations) == 1 and site.static_position is not None:
         place = site.stations.position[0] + site.origin
         return f"the {end}, {site.stations.name[0]}, at ({', '.join(f'{x:.3f}' for x in place)}) m"
     if site.stations is not None:
-        extent = " x ".join(f"{e:.2f}" for e in np.ptp(site.stations.position, axis=0))
-        return f"the {end}, {len(site.stations)} stations in a box of {extent} m: {_some(site.stations.name)}"
+        known = site.stations.position[np.isfinite(site.stations.position).all(axis=1)]
+        lost = len(site.stations) - len(known)
+        box = f" in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(known, axis=0))} m" if len(known) else ""
+        box += f", {lost} of them at unknown places" if lost else ""
+        return f"the {end}, {len(site.stations)} stations{box}: {_some(site.stations.name)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64

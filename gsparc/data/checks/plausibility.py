@@ -255,6 +255,7 @@ def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     for t in stations:
         used = np.flatnonzero(levels.station == t)
         where = None if levels.station_position is None else levels.station_position[t]
+        where = where if where is not None and np.isfinite(where).all() else None
         for step in level_steps(levels.position[used], levels.level_db[used], where, blocks):
             found.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return found

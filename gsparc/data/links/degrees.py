@@ -31,7 +31,9 @@ def in_metres(check: Checker) -> Georeference | None:
     end = _moving(check)
     for prefix, name in (("", end), ("station_", "station")):
         if prefix in places:
-            arrays[f"{name}_position"] = origin.from_degrees(*places[prefix])
+            known = np.isfinite(places[prefix][0])
+            arrays[f"{name}_position"] = np.full((known.size, 2), np.nan)
+            arrays[f"{name}_position"][known] = origin.from_degrees(*(part[known] for part in places[prefix]))
             if f"{name}_height" not in arrays:
                 arrays[f"{name}_height"] = np.array(0.0)
                 check.notes.append(f"no {name}_height: taken as 0 m")
@@ -62,7 +64,8 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
     if len(latitude) != len(longitude):
         check.refuse(names[1], f"{len(longitude)} values for {len(latitude)} latitudes")
         return np.zeros(0), np.zeros(0)
-    for row in range(len(latitude)) if bad_degrees(latitude, longitude) else ():
+    absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
+    for row in np.flatnonzero(~absent).tolist() if bad_degrees(latitude, longitude) else ():
         fault = bad_degrees(latitude[row], longitude[row])
         if fault:
             check.refuse(names[0], f"row {row}: {fault}")

@@ -70,7 +70,7 @@ def _without_table(check: Checker, measured: str) -> Links | None:
 def _with_table(check: Checker, measured: str) -> Links | None:
     """A file with a table of stations, wide or long, as one row per link."""
     before = len(check.problems)
-    stations = station_table(check)
+    stations = station_table(check, measured in POWERS)
     given = check.given("rx_position", "tx_position")
     if len(given) != 1:
         found = " and ".join(given) or "neither"
@@ -178,8 +178,9 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     keep = told & ~lost
     if silent and values.any():
         keep &= values.any(axis=axes)
-    if not keep.any():
-        return check.refuse(measured, "nothing was measured; expected numbers")
+    if not (keep & ~censored).any():
+        why = "nothing was heard in any row" if censored.any() else "nothing was measured"
+        return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
         _note_lost(check, measured, links, keep, censored)
         _keep(check.raw, measured, keep)

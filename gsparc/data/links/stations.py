@@ -16,17 +16,20 @@ LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end m
 
 
 def station_number(wanted: str | int, names: Sequence[str], count: int) -> int | None:
-    """Which of `count` stations a name or, where none is called so, a number from 0 means; None for none.
+    """Which of `count` stations a name or, where none is called by a number, a number from 0 means.
 
     Args:
         wanted: name or number.
         names: (count,) of the stations; empty where they have none.
         count: number of stations.
+
+    Returns:
+        None where there is none: 7 is not the eighth of the cells 33, 212, ...
     """
-    for known in (list(names), [str(number) for number in range(count)]):
-        if str(wanted) in known:
-            return known.index(str(wanted))
-    return None
+    if str(wanted) in list(names):
+        return list(names).index(str(wanted))
+    numbers = [] if any(name.isdigit() for name in names) else [str(number) for number in range(count)]
+    return numbers.index(str(wanted)) if str(wanted) in numbers else None
 
 
 def numbered(places: np.ndarray) -> np.ndarray:
@@ -57,12 +60,22 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
     return Links(few, stations, which.reshape(-1).astype(np.int64), numbered(moving), run=run)
 
 
-def station_table(check: Checker) -> Stations | None:
-    """The table that a file gives; None where something is wrong with it (noted)."""
+def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
+    """The table that a file gives; None where something is wrong with it (noted).
+
+    Places may be missing, NaN throughout, where powers alone are told by the stations.
+    """
+    arrays = check.raw.arrays
+    given = arrays["station_position"]
+    lost = np.zeros(len(given) if given.ndim else 0, bool)
+    if may_miss and given.ndim == 2 and given.dtype.kind == "f":
+        lost = np.isnan(given[:, :2]).all(axis=1)
+        arrays["station_position"] = np.where(lost[:, None], 0, given)
     places = check.position("station_position", None)
     if places is None or places.ndim != 2:
         return None if places is None else check.refuse("station_position", "expected shape (T, 3)")
     count = len(places)
+    places[lost] = np.nan
     names = check.raw.arrays.get("station_name")
     if names is not None and not check.fits("station_name", names, (count,)):
         return None

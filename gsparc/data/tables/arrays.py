@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsparc.data.errors import Problems
-from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen
+from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column
 from gsparc.data.tables.places import UNKNOWN_HEIGHT, Places, one_each, places
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.tables.stations import PER_STATION, StationList
@@ -34,6 +35,7 @@ class Builder:
         self.sheet, self.chosen, self.listed, self.problems = sheet, chosen, listed, problems
         self.notes: list[str] = []
         self.arrays: dict[str, np.ndarray] = {}
+        self.tones = np.zeros(1, int)
 
     def build(self) -> dict[str, np.ndarray]:
         """All arrays; what is wrong is in `problems`."""
@@ -76,18 +78,16 @@ class Builder:
         return role
 
     def _channels(self) -> None:
-        pairs = [{c.label: c for c in self.chosen.get(part, ())} for part in CHANNELS]
-        labels = sorted(set(pairs[0]) | set(pairs[1]), key=lambda label: (len(label), label))
+        pairs = [self._tones(part) for part in CHANNELS]
+        self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
         parts: list[list[np.ndarray]] = [[], []]
-        for label in labels:
+        for tone in self.tones.tolist():
             for part, columns, other in zip(CHANNELS, pairs, pairs[::-1], strict=True):
-                if label not in columns:
-                    fault = (
-                        f"{other[label].head!r} has no {part} beside it; say dataset.columns.{part}=COLUMN"
-                    )
+                if tone not in columns:
+                    fault = f"{other[tone].head!r} has no {part} beside it; say dataset.columns.{part}=COLUMN"
                     self.problems.add(self.sheet.source, fault)
                     continue
-                values = columns[label].numbers(self.sheet, self.problems)
+                values = columns[tone].numbers(self.sheet, self.problems)
                 if values is not None:
                     parts[CHANNELS.index(part)].append(values)
         if self.problems:
@@ -97,6 +97,19 @@ class Builder:
         self.arrays["csi"] = csi
         if np.isnan(csi).any():
             self.arrays["mask"] = ~np.isnan(csi)
+
+    def _tones(self, part: str) -> dict[int, Column]:
+        """Columns by the number of their tone, which may be negative; 0 of a single one without."""
+        found: dict[int, Column] = {}
+        for column in self.chosen.get(part, ()):
+            label = column.label.strip(" _.:()[]")
+            where = self.sheet.where(column.head or "")
+            if not re.fullmatch(r"[-+]?\d+|", label):
+                fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
+                self.problems.add(where, f"{fault}, or say dataset.columns.{part}='NAME*'")
+            elif found.setdefault(int(label or 0), column) is not column:
+                self.problems.add(where, f"the same tone as {found[int(label or 0)].head!r}; rename one")
+        return found
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
@@ -147,6 +160,8 @@ class Builder:
         """The stations, where there are; an end that is their place is taken out of `found`."""
         where = places(self.sheet, self.chosen, "station_", self.problems)
         labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
+        for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
+            self.problems.add(self.sheet.source, f"two columns of the station {label!r}; rename one")
         if len(labels) > 1:
             return self._wide(labels, where)
         column = self.chosen.get("station", (None,))[0]
@@ -180,6 +195,11 @@ class Builder:
         if ends:
             one_each(self.sheet, found[ends[0]], index, names, self.problems)
             return None
+        if measured in LEVELS:
+            nowhere = np.full((len(names), 3), np.nan)
+            degrees = next(iter(found.values())).degrees
+            self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
+            return _Stations(names, index, Places(nowhere[:, :2], nowhere[:, 2], degrees))
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.problems.add(self.sheet.source, fault + "station_lon), or say dataset.stations_file=FILE")
 
@@ -191,8 +211,20 @@ class Builder:
             )
             return self.problems.add(self.sheet.source, fault)
         self._all_listed(np.array(labels), None)
+        silent = [name for name in self.listed.names if name not in labels]
+        used = {column.head for columns in self.chosen.values() for column in columns}
+        for name in silent:
+            close = difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6)
+            for head in close:
+                self.problems.add(
+                    self.sheet.source, f"no column of the listed station {name!r}, but {head!r}; the same?"
+                )
         if self.problems:
             return None
+        if silent:
+            self.notes.append(
+                f"listed, but without a column: {', '.join(silent[:8])}{', ...' * (len(silent) > 8)}"
+            )
         order = np.array([self.listed.names.index(label) for label in labels])
         for role in PER_STATION:
             if role in self.listed.extra:
@@ -294,11 +326,16 @@ class Builder:
             self.problems.add(self.sheet.where(column.head or ""), fault)
 
     def _frequency(self, channels: bool) -> None:
+        """Add frequencies of tones, or the carrier."""
         if "frequency_hz" in self.chosen:
             column = self.chosen["frequency_hz"][0]
             if len(column.value) == 2:
-                shape = self.arrays["csi"].shape if channels else ()
-                self.arrays["frequency_hz"] = np.linspace(*column.value, shape[1] if len(shape) > 1 else 1)
+                if not channels or len(self.tones) == 1:
+                    fault = f"two frequencies {column.value} for one tone"
+                    return self.problems.add(self.sheet.source, f"dataset.columns.frequency_hz: {fault}")
+                self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], column.value)
+                if np.ptp(np.diff(self.tones)):
+                    self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
             else:
                 self._one("frequency_hz")
         if "carrier_hz" not in self.chosen:

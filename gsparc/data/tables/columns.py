@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import math
+import re
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -18,6 +19,7 @@ from gsparc.data.tables.heads import (
     KINDS,
     MANY,
     OTHER_NAMES,
+    STATION_WORDS,
     Head,
     suits,
     understand,
@@ -29,6 +31,25 @@ from gsparc.data.tables.units import SCHEMA, UNITS, Unit, known
 
 LEVELS = ("rssi_db", "rssi")
 CHANNELS = ("csi_re", "csi_im")
+# Beside the word for a level: which radio, antenna or cell it is of.
+PLAIN = {
+    "wifi",
+    "wlan",
+    "lte",
+    "nr",
+    "5g",
+    "gsm",
+    "umts",
+    "ble",
+    "bluetooth",
+    "lora",
+    "zigbee",
+    "uwb",
+    "serving",
+}
+STATION = re.compile(
+    r"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|" + "|".join(STATION_WORDS) + r")?[\W_]*\d+)[\W_]*$"
+)
 REPEATED = 4  # rows for each name of a column that may hold stations
 
 
@@ -85,6 +106,7 @@ def choose(
         only: quantities that are guessed; None: all.
     """
     chosen: Chosen = {}
+    labelled = set(labelled)
     for key, value in said.items():
         if value is not None:
             role = OTHER_NAMES.get(key, key)
@@ -97,7 +119,7 @@ def choose(
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
         found = understand(head) if head and head not in taken else Head()
-        if head not in taken and head in set(labelled):
+        if head not in taken and head in labelled:
             found = Head("rssi_db", label=head, word="station")
         if (
             found.role is None
@@ -116,7 +138,8 @@ def choose(
         _one_system(sheet, guesses, end, problems)
     notes = []
     for role, candidates in guesses.items():
-        several = role in MANY and len(candidates) > 1 and "station" not in {**chosen, **guesses}
+        one_each = role in CHANNELS or "station" not in {**chosen, **guesses}  # of a row: tones, or stations
+        several = role in MANY and len(candidates) > 1 and one_each
         several &= (
             all(column.label for column in candidates) and len({column.word for column in candidates}) == 1
         )
@@ -124,11 +147,16 @@ def choose(
         if len(candidates) > 1 and not several and not exact:
             _ambiguous(sheet, role, candidates, problems)
             continue
+        if role in LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled):
+            fault = "a received level or power, or something else? if it is one, say dataset.columns."
+            problems.add(sheet.where(candidates[0].head or ""), f"{fault}{role}={candidates[0].head}")
+            continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact:
             notes.append(_note(chosen[role]))
     for columns in chosen.values():
         notes += [_conversion(c) for c in columns[:1] if not c.word and c.unit is not None and c.unit.changes]
+    _one_unit(sheet, chosen, problems)
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head and head not in used]
     if unused:
@@ -251,6 +279,24 @@ def _one_measurement(sheet: Sheet, guesses: dict[str, list[Column]], problems: P
     problems.add(sheet.source, f"{_names(first)} are different measurements; say {choices}")
     for name in (*LEVELS, *CHANNELS):
         guesses.pop(name, None)
+
+
+def _is_plain(column: Column, stations: Container[str]) -> bool:
+    """Whether the head of a guessed column says a level and nothing beyond that it may be of a station."""
+    absolute = column.unit is not None and column.unit.name != "dB"
+    named = column.label in stations or re.fullmatch(r"\W*", column.label)
+    return bool(absolute or named or set(words_of(column.label)) <= PLAIN or STATION.search(column.label))
+
+
+def _one_unit(sheet: Sheet, chosen: Chosen, problems: Problems) -> None:
+    """Refuse a column in another unit than the schema's beside one of its kind that says none."""
+    for kind in SCHEMA:
+        columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
+        turned = [c for c in columns if c.unit is not None and c.unit.changes]
+        silent = [c for c in columns if c.unit is None]
+        if turned and silent and turned[0].unit is not None:
+            said = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} says no unit"
+            problems.add(sheet.source, f"{said}; rename one, e.g. to '{silent[0].head} [{SCHEMA[kind]}]'")
 
 
 def _ambiguous(sheet: Sheet, role: str, columns: list[Column], problems: Problems) -> None:

@@ -27,7 +27,7 @@ OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "heigh
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
 END_WORDS = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
-_STATION = (
+STATION_WORDS = (
     *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb", "ap"),
     *("anchor", "pci", "bssid"),
 )
@@ -37,7 +37,18 @@ _AXIS |= dict.fromkeys(("lat", "latitude"), "latitude")
 _AXIS |= dict.fromkeys(("lon", "lng", "long", "longitude"), "longitude")
 _PLACE = ("position", "pos", "coordinate", "coord", "location", "loc", "gps", "local", "wgs84")
 _LEVEL = ("rssi", "rsrp", "rss", "rxlev", "power", "level", "signal", "prx")
-_ABOUT_LEVEL = ("rx", "received", "receive", "strength", "signal", "mean", "avg", "average", "median")
+_ABOUT_LEVEL: tuple[str, ...] = (
+    "rx",
+    "received",
+    "receive",
+    "strength",
+    "signal",
+    "mean",
+    "avg",
+    "average",
+    "median",
+)
+_ABOUT_LEVEL += ("measured", "value")
 _NO_LEVEL: tuple[str, ...] = (
     "tx",
     "transmit",
@@ -52,6 +63,8 @@ _NO_LEVEL: tuple[str, ...] = (
     "count",
 )
 _NO_LEVEL += ("loss", "delay", "angle", "interference", "quality", "headroom", "class", "control")
+_NO_LEVEL += ("delta", "diff", "difference", "change", "error", "residual", "offset", "threshold", "limit")
+_NO_LEVEL += ("predicted", "prediction", "estimated", "expected", "simulated", "gain", "battery", "supply")
 _LABEL = ("name", "id", "nr", "no", "number", "index", "mac", "address", "label")
 _CHANNEL = ("csi", "h", "channel", "cfr")
 _PART = {"re": "csi_re", "real": "csi_re", "i": "csi_re", "im": "csi_im", "imag": "csi_im", "q": "csi_im"}
@@ -106,7 +119,9 @@ def unit_of(text: str) -> tuple[str, Unit | None, str]:
     inside = next(part for part in match.groups() if part is not None).strip()
     if inside.lower() in UNITS:
         return text[: match.start()], UNITS[inside.lower()], ""
-    if match[1] is None:  # round brackets and what follows a slash may be words: RSRP (serving)
+    if re.fullmatch(r"[-+]?\d+", inside):  # csi_re[3]
+        return text, None, ""
+    if match[1] is None and not re.search(r"%|^dB", inside):  # may be words: RSRP (serving)
         return text, None, ""
     return text[: match.start()], None, inside
 
@@ -125,7 +140,7 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
         return Head(joined, unit=unit, word=joined)
     if joined in OTHER_NAMES:
         return Head(OTHER_NAMES[joined], unit=unit, word=joined)
-    return _axis(rest, unit) or _level(words, unit, plain) or _channel(words) or _text(words, unit)
+    return _axis(rest, unit) or _level(words, unit, plain) or _channel(words, plain) or _text(words, unit)
 
 
 def _axis(rest: list[str], unit: Unit | None) -> Head | None:
@@ -135,7 +150,7 @@ def _axis(rest: list[str], unit: Unit | None) -> Head | None:
         return None
     if not ends:
         return Head(_AXIS[axes[0]], unit=unit, word=axes[0])
-    end = "station_" if ends[0] in _STATION else END_WORDS.get(ends[0])
+    end = "station_" if ends[0] in STATION_WORDS else END_WORDS.get(ends[0])
     return None if end is None else Head(end + _AXIS[axes[0]], unit=unit, word=axes[0])
 
 
@@ -148,27 +163,35 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     rest = [w for w in words if w != word and w not in _ABOUT_LEVEL and w not in ("db", "dbm")]
     label = ""
     if rest:
-        label = re.sub(
-            rf"[\W_]*(?<![a-z]){word}(?:[\W_]*dbm?(?![a-z]))?[\W_]*", " ", plain, flags=re.IGNORECASE
-        )
-        label = label.strip().strip("()[]").strip()
+        # One mark between the level and the name: a sign or # after it is the name's.
+        around = rf"(?:[\s_.:/(\[]+|-)?(?<![a-z]){word}(?:[\W_]*dbm?(?![a-z]))?(?:[\s_.:/)\]]+|-)?"
+        label = re.sub(around, " ", plain, flags=re.IGNORECASE)
+        label = label.strip("_ ").strip("()[]").strip("_ ")
     role = "rssi" if unit is not None and unit.kind == "power" else "rssi_db"
     return Head(role, label, unit, word)
 
 
-def _channel(words: list[str]) -> Head | None:
+def _channel(words: list[str], plain: str) -> Head | None:
     numbers = [word for word in words if word.isdigit()]
     parts = [word for word in words if word in _PART]
     others = [word for word in words if word not in _PART and not word.isdigit() and word not in _CHANNEL]
-    said = any(word in _CHANNEL for word in words) or parts[:1] in (["re"], ["im"], ["real"], ["imag"])
-    if len(parts) != 1 or len(numbers) > 1 or others or not said:
+    named = any(word in _CHANNEL for word in words)
+    if len(parts) != 1 or not (named or parts[0] in ("re", "im", "real", "imag")):
         return None
-    return Head(_PART[parts[0]], numbers[0] if numbers else "", word=parts[0])
+    if others or len(numbers) > 1:  # of a channel, but not plainly the number of a tone: refused by its label
+        return Head(_PART[parts[0]], " ".join(numbers + others), word=parts[0]) if named else None
+    label = numbers[0] if numbers else ""
+    dash = re.search(rf"(.?)[-\u2212]{label}(?!\d)", plain) if numbers else None
+    if dash is not None and not dash[1].isalnum():
+        label = f"-{label}"
+    elif dash is not None and "-" not in plain[: dash.start()]:  # csi-re-2 has the mark between all words
+        label = f"{label} or -{label}"
+    return Head(_PART[parts[0]], label, word=parts[0])
 
 
 def _text(words: list[str], unit: Unit | None) -> Head:
     rest = [word for word in words if word not in _LABEL]
-    if len(rest) == 1 and rest[0] in _STATION:
+    if len(rest) == 1 and rest[0] in STATION_WORDS:
         return Head("station", word=rest[0])
     if rest == ["run"]:
         return Head("run", word="run")

@@ -37,8 +37,13 @@ class Places:
         return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
 
 
-def places(sheet: Sheet, chosen: Chosen, end: str, problems: Problems) -> Places | None:
-    """Coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none of it."""
+def places(
+    sheet: Sheet, chosen: Chosen, end: str, problems: Problems, unknown: bool = False
+) -> Places | None:
+    """Coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none of it.
+
+    Where places may be `unknown`, rows without any coordinate are NaN.
+    """
     for degrees, axes in ((False, ("x", "y")), (True, ("latitude", "longitude"))):
         roles = [f"{end}{axis}" for axis in axes]
         given = [role for role in roles if role in chosen]
@@ -48,8 +53,12 @@ def places(sheet: Sheet, chosen: Chosen, end: str, problems: Problems) -> Places
             missing = next(role for role in roles if role not in chosen)
             fault = f"{given[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
             return problems.add(sheet.source, fault)
-        found = [_complete(sheet, chosen, role, problems) for role in roles]
-        height = _complete(sheet, chosen, f"{end}z", problems) if f"{end}z" in chosen else None
+        absent = np.zeros(len(sheet), bool)
+        if unknown:
+            given = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
+            absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in given], axis=0)
+        found = [_complete(sheet, chosen, role, problems, absent) for role in roles]
+        height = _complete(sheet, chosen, f"{end}z", problems, absent) if f"{end}z" in chosen else None
         if found[0] is None or found[1] is None:
             return None
         across = np.stack([found[0], found[1]], axis=1)
@@ -59,11 +68,13 @@ def places(sheet: Sheet, chosen: Chosen, end: str, problems: Problems) -> Places
     return None
 
 
-def _complete(sheet: Sheet, chosen: Chosen, role: str, problems: Problems) -> np.ndarray | None:
+def _complete(
+    sheet: Sheet, chosen: Chosen, role: str, problems: Problems, absent: np.ndarray
+) -> np.ndarray | None:
     column = chosen[role][0]
     values = column.numbers(sheet, problems)
-    if values is not None and np.isnan(values).any():
-        rows = (sheet.rows[i] for i in np.flatnonzero(np.isnan(values)))
+    if values is not None and (np.isnan(values) & ~absent).any():
+        rows = (sheet.rows[i] for i in np.flatnonzero(np.isnan(values) & ~absent))
         problems.add_rows(
             sheet.where(column.head or ""), rows, f"no value; {role} is needed, or take the row out"
         )
@@ -73,7 +84,7 @@ def _complete(sheet: Sheet, chosen: Chosen, role: str, problems: Problems) -> np
 
 def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray, problems: Problems) -> None:
     for i, (role, low, high) in enumerate(zip(roles, (-90, -180), (90, 360), strict=True)):
-        bad = np.flatnonzero(~((across[:, i] >= low) & (across[:, i] <= high)))
+        bad = np.flatnonzero((across[:, i] < low) | (across[:, i] > high))
         swapped = i == 0 and len(bad) and (np.abs(across[:, 1]) <= 90).all()
         hint = "; are latitude and longitude swapped?" if swapped else ""
         rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in bad)

@@ -59,15 +59,14 @@ class Sheet:
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
             bad = np.isinf(values)
         else:
-            text = column.astype(str)
+            cells = [str(cell) for cell in column]
             if self.decimal == ",":
                 # A point in such a file is a second sort of mark, or stands between thousands: refused.
-                text = text.where(~text.str.contains(".", regex=False), "x").str.replace(
-                    ",", ".", regex=False
-                )
-            values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64)
+                cells = ["x" if "." in cell else cell.replace(",", ".") for cell in cells]
+            values = pd.to_numeric(np.array(cells, dtype=object), errors="coerce").astype(np.float64)
             bad = ~np.isfinite(values)
-            bad[bad] = self.words(head)[bad] != ""
+            if bad.any():
+                bad[bad] = self.words(head)[bad] != ""
         if bad.any():
             shown = column.astype(str).to_numpy(dtype=object)
             rows = (f"{self.rows[i]}: {_shown(shown[i])}" for i in np.flatnonzero(bad))

@@ -30,14 +30,14 @@ class StationList:
 
 
 def read_stations(sheet: Sheet, problems: Problems) -> tuple[StationList | None, list[str]]:
-    """The stations of a table with the columns name, and x, y, z or latitude, longitude, height."""
+    """The stations of a table: name, and x, y, z or latitude, longitude, height, empty where nobody knows."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
     chosen, notes = choose(sheet, {"station": called[0]} if len(called) == 1 else {}, problems)
     chosen = {columns[0].role: columns for columns in (tuple(map(as_station, c)) for c in chosen.values())}
     notes = [f"{sheet.source}: {note}" for note in notes if not note.startswith("not used")]
     if "station" not in chosen:
         return problems.add(sheet.source, "no column of names; expected one called name or station"), notes
-    found = places(sheet, chosen, "station_", problems)
+    found = places(sheet, chosen, "station_", problems, unknown=True)
     if found is None:
         if not problems:
             problems.add(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import csv
-import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 
 from gsparc.data.errors import DataError, Problems
+from gsparc.data.tables.heads import understand
 from gsparc.data.tables.sheet import DECIMAL_COMMA, DECIMAL_POINT, Sheet
 
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
@@ -61,20 +61,21 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     if delimiter is None or not lines.text:
         fault = f"line 1 ({lines.text[0][:40]!r}) is a single column" if lines.text else "no heads"
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
-    lines = _with_heads(lines, delimiter, source)
-    _rectangular(lines, delimiter, source)
-    heads = tuple(cell.strip() for cell in _cells(lines.text[0], delimiter))
+    lines, dropped = _without_comments(_with_heads(lines, delimiter, source), delimiter, source)
+    notes += dropped
+    heads, *rows = _rectangular(lines, delimiter, source)
+    heads = [cell.strip() for cell in heads]
     _distinct(heads, source)
-    if len(lines.text) == 1:
+    if not rows:
         raise DataError(f"{source}: line {lines.number[0]} names columns, but there are no rows below it")
-    frame = _parsed(lines.text[1:], delimiter)
+    frame = pd.DataFrame(rows, dtype=object)
     decimal = "." if delimiter == "," and not _quoted_decimals(text, frame) else _decimal(frame)
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
     if decimal == ",":
         notes.append("decimal commas")
     columns = tuple(frame[i] for i in range(len(heads)))
-    return Sheet(source, heads, columns, tuple(f"line {n}" for n in lines.number[1:]), decimal), notes
+    return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines.number[1:]), decimal), notes
 
 
 def _decoded(path: Path) -> tuple[str, str]:
@@ -106,8 +107,8 @@ def _lines(text: str) -> _Lines:
     # Not str.splitlines, which also ends lines at characters that may stand in a cell.
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
         stripped = line.strip()
-        if stripped.startswith(COMMENTS):
-            comment = comment if found else stripped.lstrip("#%/ ")
+        if stripped.startswith(COMMENTS) and not found:
+            comment = stripped.lstrip("#%/ ")
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
             found.append(line)
             numbers.append(number)
@@ -116,33 +117,38 @@ def _lines(text: str) -> _Lines:
 
 def _cells(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
-        return line.split()
+        line = " ".join(line.split())
     if '"' not in line:
         return line.split(delimiter)
     return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
 
 
 def _delimiter(lines: _Lines) -> str | None:
-    """The one by which most of the first lines have as many cells as the first, and that is not one."""
-    best: tuple[float, int, str] | None = None
+    """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
+    best: tuple[bool, float, int, str] | None = None
     sample = lines.text[:LOOKED_AT]
     for delimiter in DELIMITERS:
         count = len(_cells(sample[0], delimiter))
-        if count < 2 or (delimiter == " " and best is not None):
+        said = _cells(lines.comment_before, delimiter) if lines.comment_before else []
+        heads = len(said) == count and any(understand(cell).role for cell in said)
+        if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
             continue
         agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
-        if best is None or (agree, count) > best[:2]:
-            best = (agree, count, delimiter)
-    return None if best is None else best[2]
+        if best is None or (heads, agree, count) > best[:3]:
+            best = (heads, agree, count, delimiter)
+    return None if best is None else best[3]
 
 
 def _with_heads(lines: _Lines, delimiter: str, source: str) -> _Lines:
-    """The lines, the first of them heads; a comment before numbers is taken for them where it fits."""
+    """The lines, the first of them heads; a comment before values is taken for them where it fits."""
     first = _cells(lines.text[0], delimiter)
-    if not all(_is_number(cell) for cell in first):
-        return lines
+    values = all(_is_number(cell) for cell in first)
     heads = _cells(lines.comment_before, delimiter) if lines.comment_before else []
-    if len(heads) == len(first) and not all(_is_number(cell) for cell in heads):
+    named = [sum(understand(cell).role is not None for cell in cells) for cells in (heads, first)]
+    fits = len(heads) == len(first) and not all(_is_number(cell) for cell in heads)
+    if not values and not (fits and named[0] > named[1]):
+        return lines
+    if fits:
         return _Lines([lines.comment_before, *lines.text], [lines.number[0] - 1, *lines.number], "")
     fault = f"line {lines.number[0]} holds numbers; expected the names of the columns above them"
     raise DataError(f"{source}: {fault}")
@@ -152,43 +158,67 @@ def _is_number(cell: str) -> bool:
     return re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE) is not None
 
 
-def _rectangular(lines: _Lines, delimiter: str, source: str) -> None:
-    """Refuse quotes that stay open, and lines with more or fewer cells than there are heads."""
+def _without_comments(lines: _Lines, delimiter: str, source: str) -> tuple[_Lines, list[str]]:
+    """The lines without comments below the heads, and a note.
+
+    A line that begins like a comment and has as many cells as there are heads is a row, as stations may be
+    called #1; it is refused where it may be a row that somebody took out.
+    """
+    marked = [i for i, line in enumerate(lines.text) if i and line.lstrip().startswith(COMMENTS)]
+    if not marked:
+        return lines, []
+    at = f"line {lines.number[marked[0]]}"
+    count = len(_cells(lines.text[0], delimiter))
+    like = {n: lines.text[n].lstrip(" #%/") for n in marked}  # between spaces a mark may be a cell
+    if all(
+        count not in (len(_cells(lines.text[i], delimiter)), len(_cells(like[i], delimiter))) for i in marked
+    ):
+        kept = sorted(set(range(len(lines.text))) - set(marked))
+        note = f"{len(marked)} comments below the heads, the first in {at}"
+        return _Lines([lines.text[i] for i in kept], [lines.number[i] for i in kept], ""), [note]
+    first = [_cells(line, delimiter)[0].strip() for line in lines.text]
+    plain = [cell for i, cell in enumerate(first) if i and i not in set(marked)]
+    numbers = bool(plain) and all(map(_is_number, plain))
+    for i in marked:
+        mark = next(mark for mark in COMMENTS if first[i].startswith(mark))
+        name = first[i].removeprefix(mark).strip('"')
+        if not name.strip() or name[0].isspace() or name in first or (numbers and _is_number(name)):
+            fault = f"begins with {first[i][:20]!r}: a row, or a comment? quote the cell or take the line out"
+            raise DataError(f"{source}, line {lines.number[i]}: {fault}")
+    return lines, [f"{len(marked)} rows begin with {first[marked[0]]!r} or the like, the first in {at}"]
+
+
+def _rectangular(lines: _Lines, delimiter: str, source: str) -> list[list[str]]:
+    """All cells; quotes that stay open, and lines with more or fewer cells than heads, are refused."""
     problems = Problems(source)
     for line, number in zip(lines.text, lines.number, strict=True):
-        if line.count('"') % 2 and delimiter != " ":
+        if line.count('"') % 2:
             fault = (
                 "a quotation mark is not closed on this line; close it, or remove the line break in the cell"
             )
             raise DataError(f"{source}, line {number}: {fault}")
-    counts = [len(_cells(line, delimiter)) for line in lines.text]
+    cells = [_cells(line, delimiter) for line in lines.text]
+    counts = [len(row) for row in cells]
     wrong = [i for i, count in enumerate(counts) if count != counts[0]]
     if wrong and len(wrong) == len(counts) - 1 and len(set(counts[1:])) == 1:
         hint = "; decimal commas need semicolons or tabs between columns" if delimiter == "," else ""
+        longer = cells[1:] if counts[1] > counts[0] else cells[:1]
+        if abs(counts[1] - counts[0]) == 1 and not any(row[-1].strip() for row in longer):
+            hint = ", the last of them empty: end heads and rows alike"
         fault = f"{counts[0]} heads, but every line below has {counts[1]} cells{hint}"
         raise DataError(f"{source}, line {lines.number[0]}: {fault}")
     names = (f"line {lines.number[i]} ({counts[i]} cells)" for i in wrong)
     mark = DELIMITERS.get(delimiter, delimiter)
     problems.add_rows(source, names, f"expected {counts[0]} cells between {mark}, as there are heads")
     problems.raise_if_any()
+    return cells
 
 
-def _distinct(heads: tuple[str, ...], source: str) -> None:
+def _distinct(heads: list[str], source: str) -> None:
     for i, head in enumerate(heads):
         if head and head in heads[:i]:
             where = f"columns {heads.index(head) + 1} and {i + 1}"
             raise DataError(f"{source}: {where} are both named {head!r}; rename one")
-
-
-def _parsed(lines: list[str], delimiter: str) -> pd.DataFrame:
-    """Cells as text, columns numbered from 0; the lines are rectangular already."""
-    spaces = delimiter == " "
-    return pd.read_csv(
-        io.StringIO("\n".join(line.strip() if spaces else line for line in lines)),
-        sep=r"\s+" if spaces else delimiter,
-        header=None, index_col=False, dtype=str, na_filter=False, skipinitialspace=True, encoding="utf-8",
-        quoting=csv.QUOTE_NONE if spaces else csv.QUOTE_MINIMAL,
-    )  # fmt: skip
 
 
 def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
@@ -201,9 +231,9 @@ def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
 
 def _decimal(frame: pd.DataFrame) -> str:
     """The mark that most numbers have that have one."""
-    counts = dict.fromkeys(",.", 0)
+    counts = [0, 0]
     for i in frame.columns:
-        sample = frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)]
-        counts[","] += int(sample.str.fullmatch(DECIMAL_COMMA).sum())
-        counts["."] += int(sample.str.fullmatch(DECIMAL_POINT).sum())
-    return "," if counts[","] > counts["."] else "."
+        for cell in frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)]:
+            counts[0] += re.fullmatch(DECIMAL_COMMA, cell) is not None
+            counts[1] += re.fullmatch(DECIMAL_POINT, cell) is not None
+    return "," if counts[0] > counts[1] else "."

@@ -268,3 +268,10 @@ def test_powers_of_zero_raise_a_warning():
     powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
     data = read({**town(rssi_db=None), "rssi": powers}).data
     assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in suspicious_values(data)[0]
+
+
+def test_nothing_heard_in_any_row_was_zero_everywhere():
+    """It said that every measured value is zero."""
+    arrays = {"rx_position": np.eye(3) * 4, "rssi_db": np.full(3, np.nan), "sensitivity_db": np.array(-100.0)}
+    with pytest.raises(DataError, match="rssi_db: nothing was heard in any row"):
+        interpret(Raw(arrays), "drive")

@@ -1,0 +1,68 @@
+"""Text of tables: comments, heads in comments, spaces of other kinds."""
+
+import numpy as np
+import pytest
+
+from gsparc.data.errors import DataError
+from gsparc.data.own import interpret
+from gsparc.data.tables.read import read_table, understand_table
+
+PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    """`write(text, name)`: a file of it."""
+
+    def written(content, name="drive.csv"):
+        path = tmp_path / name
+        path.write_text(content)
+        return path
+
+    return written
+
+
+def test_stations_of_unknown_place_could_not_be_read(write):
+    """The schema had them, of powers, and methods estimate where they are."""
+    text = "x,y,rssi,cell\n1,2,-80,b\n2,3,-81,a\n4,4,-82,b\n9,4,-83,a\n"
+    table = understand_table(write(text))
+    assert any("no places of the stations: unknown" in note for note in table.notes)
+    data = interpret(table.raw, "drive").data
+    assert data.site.stations.name == ("b", "a") and np.isnan(data.site.stations.position).all()
+    assert data.station.tolist() == [0, 1, 0, 1] and np.isfinite(data.site.box).all()
+    for one, axes in ((text, "x,y"), (text.replace("x,y", "lat,lon"), "lat,lon")):
+        some = read_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv"))
+        known = np.isfinite(interpret(some, "drive").data.site.stations.position).all(axis=1)
+        assert known.tolist() == [True, False]
+    with pytest.raises(DataError, match="column 'y', line 3: no value; station_y is needed"):
+        read_table(write(text), {}, write("name,x,y\na,3,4\nb,1,\n", "stations.csv"))
+
+
+@pytest.mark.parametrize("mark", ["#", "%", "//"])
+def test_rows_that_begin_like_comments_vanished(write, mark):
+    """Stations called #1, #2: two thirds of the rows were gone, and the rest was good."""
+    rows = "".join(
+        f"{name},{i},{i * i},-{60 + i}\n" for i, name in enumerate([mark + "1", mark + "2", "A"] * 9)
+    )
+    listed = write(f"name,x,y\nA,0,0\n{mark}1,9,9\n{mark}2,5,5\n", "stations.csv")
+    table = understand_table(write("station,x,y,rssi\n" + rows), {}, listed)
+    assert table.raw.arrays["rssi_db"].tolist() == [-60.0 - i for i in range(27)]
+    assert table.raw.arrays["station"].tolist() == [1, 2, 0] * 9
+    assert f"18 rows begin with '{mark}1' or the like, the first in line 2" in table.notes
+
+
+def test_comments_below_the_heads_are_said(write):
+    table = understand_table(write(PLAIN + "# turned back here, see notes\n7,8,9,-70\n"))
+    assert table.raw.arrays["rssi_db"].tolist() == [-80, -81.5, -70]
+    assert "1 comments below the heads, the first in line 4" in table.notes
+
+
+def test_heads_in_a_comment_above_text(write):
+    arrays = read_table(write("# station,x,y,rssi,cell_x,cell_y\na,1,2,-80,0,0\nb,1,2,-81,5,5\n")).arrays
+    assert arrays["station_name"].tolist() == ["a", "b"] and arrays["rssi_db"].tolist() == [-80, -81]
+
+
+def test_a_no_break_space_between_columns(write):
+    """Cells were counted by one rule and parsed by another: KeyError: 3."""
+    arrays = read_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).arrays
+    np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
