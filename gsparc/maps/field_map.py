@@ -36,7 +36,7 @@ class FieldMap:
         server_chance: (ny, nx) probability that it is, and is above its floor; see `server_chance`.
         sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
         outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
-        share: of the truth that the intervals hold.
+        share: of measurements that the intervals hold; the field alone lies in them more often.
         calibrated: whether held-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
         extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`.

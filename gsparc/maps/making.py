@@ -64,7 +64,7 @@ def map_of(
         plan: beneath the map.
         promise: evidence of held-out blocks; None: intervals are the model's own deviations, and nothing is
             refused.
-        share: of the truth that intervals are to hold.
+        share: of measurements that intervals are to hold.
         tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
             every cell. Known places must be stored with the model.
         asked: called with the share of the work that is done.
