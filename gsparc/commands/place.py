@@ -61,21 +61,22 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(
         run_dir / "place.csv", {name: np.asarray(values).tolist() for name, values in columns.items()}
     )
-    draw_placing(found, run_dir / "place.png", float(config.threshold_db))
+    level, unit = float(config.threshold_db), predictor.site.level_unit
+    draw_placing(found, run_dir / "place.png", level, unit)
     x, y, z = found.places[0]
     facts = {
         "place/x": x, "place/y": y, "place/z": z, "place/goal": found.what, "place/before": found.before,
         "place/after": found.goal[0], "place/low": found.low[0], "place/high": found.high[0],
-        "place/candidates": len(found.places), "place/threshold_db": float(config.threshold_db),
+        "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
         **provenance(), **machine_facts(),
     }  # fmt: skip
     write_summary(run_dir / "summary.json", facts)
-    level = float(config.threshold_db)
+    low, high = (number(found.what, ends[0], unit) for ends in (found.low, found.high))
     lines = [
-        f"now {in_words(found.what, found.before, level)}",
-        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {in_words(found.what, found.goal[0], level)} "
-        f"(90 % interval {number(found.what, found.low[0])} to {number(found.what, found.high[0])})",
+        f"now {in_words(found.what, found.before, level, unit)}",
+        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {in_words(found.what, found.goal[0], level, unit)} "
+        f"(90 % interval {low} to {high})",
     ]
     if not error.stations:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")

@@ -249,12 +249,12 @@ def draw_plan_picture(
     save(figure, path, 100)
 
 
-def draw_placing(found: Placing, path: Path, threshold_db: float) -> None:
+def draw_placing(found: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
     """The goal at every candidate, the stations that stand, and the best place."""
     left, right, low, high = found.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
-    label = f"share of the area with {threshold_db:g} dB or more"
-    label = label if found.what == "coverage" else "power that nine tenths of the area exceed [dB]"
+    label = f"share of the area with {threshold_db:g} {unit} or more"
+    label = label if found.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
     drawn = axis.scatter(*found.places[:, :2].T, c=found.goal, s=60, marker="s", cmap="viridis")
     figure.colorbar(drawn, ax=axis, label=f"{label}, with a station here", shrink=0.85)
     how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}

@@ -215,13 +215,13 @@ def unheard_refused(what: str) -> DataError:
     )
 
 
-def number(what: Goal, value: float) -> str:
+def number(what: Goal, value: float, unit: str = "dB") -> str:
     """A goal's value with its unit."""
-    return f"{value:.1%}" if what == "coverage" else f"{value:.1f} dB"
+    return f"{value:.1%}" if what == "coverage" else f"{value:.1f} {unit}"
 
 
-def in_words(what: Goal, value: float, threshold_db: float) -> str:
+def in_words(what: Goal, value: float, threshold_db: float, unit: str = "dB") -> str:
     """A goal's value in words."""
     if what == "coverage":
-        return f"{number(what, value)} of the area with {threshold_db:g} dB or more"
-    return f"nine tenths of the area have {number(what, value)} or more"
+        return f"{number(what, value)} of the area with {threshold_db:g} {unit} or more"
+    return f"nine tenths of the area have {number(what, value, unit)} or more"
