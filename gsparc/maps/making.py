@@ -309,15 +309,17 @@ def _usual(
 
     The floor is the level below which it is not heard, else the weakest but for 1 % that was measured of it.
     """
-    usual, floor = np.full((len(numbers), 2), np.nan), np.full(len(numbers), -np.inf)
-    for row, number in enumerate(numbers if promise is not None else ()):
+    least = -np.inf if noise_db is None else noise_db
+    usual, floor = np.full((len(numbers), 2), np.nan), np.full(len(numbers), least)
+    if promise is None:
+        return usual, floor
+    for row, number in enumerate(numbers):
         own = promise.evidence.at(np.flatnonzero(promise.evidence.station == number))
         if len(own):
             usual[row] = own.level_db.mean(), own.level_db.std()
-            floor[row] = (
-                own.level_db[own.silent].max() if own.silent.any() else np.quantile(own.level_db, 0.01)
-            )
-    return usual, np.maximum(floor, -np.inf if noise_db is None else noise_db)
+            quiet = own.level_db[own.silent]
+            floor[row] = max(least, quiet.max() if len(quiet) else np.quantile(own.level_db, 0.01))
+    return usual, floor
 
 
 def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str, np.ndarray]:

@@ -280,10 +280,13 @@ class Gsparc(LearnedField):
 
         What other solutions and the residual add to channels is in no path.
         """
-        field = self.field
-        stacked = isinstance(field, StackedField)
-        members = zip(field.weights, field.members, strict=True) if stacked else [(1.0, field)]
-        parts = [(w, one.field if isinstance(one, CompletedField) else one) for w, one in members]
+        field: Any = self.field
+        members: list[tuple[float, Any]] = [(1.0, field)]
+        if isinstance(field, StackedField):
+            members = list(zip(field.weights, field.members, strict=True))
+        parts: list[tuple[float, Any]] = [
+            (w, one.field if isinstance(one, CompletedField) else one) for w, one in members
+        ]
         made = [(w, one.method) for w, one in parts if isinstance(getattr(one, "method", None), HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
