@@ -36,6 +36,7 @@ MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is
 MOST_SILENT = 3_000  # of them, where nothing was heard
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
+LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
 TWO_LENGTHS_NEED = 100
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
@@ -223,7 +224,8 @@ def _trends(rows: Rows, site: Site, mean: MeanName) -> list[tuple[Trend, float, 
         return [constant]
     law, notes = law_of(rows, site)
     trend = Trend.of(rows, law)
-    by_distance = trend, 4 if notes else 1 - LAW_ODDS, notes  # its floor, and a place that was sought
+    odds = LAW_ODDS if law.exponent >= LEAST_FALL else 0.0
+    by_distance = trend, 4 if notes else 1 - odds, notes  # its floor, and a place that was sought
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
