@@ -139,6 +139,12 @@ def title_of(found: FieldMap, predictor: Predictor) -> str:
 def lines_of(found: FieldMap, kept: Coverage | None) -> list[str]:
     """What a reader of the map must know."""
     said = [*found.notes]
+    share = found.figures()["map/server_unsure"]
+    if share and len(found.stations) > 1:
+        said.append(
+            f"best_server: in {share:.1%} of the cells (hatched) the station named is less likely than not "
+            "the strongest and above its floor; noise_db=... says where noise lies"
+        )
     if kept is None:
         said.append(
             "no promise: intervals are the model's own deviations, and places far from data are not refused"
@@ -146,8 +152,8 @@ def lines_of(found: FieldMap, kept: Coverage | None) -> list[str]:
         return said
     refused = found.figures()["map/refused"]
     said.append(
-        f"{found.share:.0%} of the cells are promised to lie in their interval: of {kept.rows} rows in "
-        f"{kept.blocks} held-out blocks {kept.share:.1%} did (mean width {kept.width_db:.1f} dB; the "
+        f"in {found.share:.0%} of the cells a measurement is promised to lie in its interval: of {kept.rows} "
+        f"rows in {kept.blocks} held-out blocks {kept.share:.1%} did (mean width {kept.width_db:.1f} dB; the "
         f"model's own deviations: {kept.own_share:.1%}, {kept.own_width_db:.1f} dB)"
     )
     if refused:

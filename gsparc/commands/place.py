@@ -13,9 +13,17 @@ from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 from gsparc.maps.pictures import draw_placing
-from gsparc.maps.placing import NewStation, in_words, new_station_error, number, place_next
+from gsparc.maps.placing import (
+    NewStation,
+    in_words,
+    new_station_error,
+    number,
+    place_next,
+    unheard_refused,
+)
 from gsparc.maps.promise import PromiseSettings
 from gsparc.methods import checkpoint
+from gsparc.methods.per_station import UNHEARD
 from gsparc.methods.predictor import load
 from gsparc.methods.registry import build
 from gsparc.methods.timing import machine_facts
@@ -25,17 +33,19 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Try candidates, draw and write; returns the facts of `summary.json`."""
     RunSettings.of(config)
     run_dir, settings, path = run_directory(), plain(config), str(config.ckpt)
+    stored = checkpoint.read(path)
+    if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):
+        raise unheard_refused(path)  # before the copies of all stations are restored
     predictor = load(path)
     asked = {
         "area": settings["area"], "goal": config.goal, "threshold_db": float(config.threshold_db),
         "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
     }  # fmt: skip
-    place_next(predictor, count=1, **asked)  # refuses what cannot be before anything is fitted
+    place_next(predictor, count=1, dry=True, **asked)  # refuses what cannot be before anything is fitted
     promise, error = None, NewStation()
     if config.promised:
         promise = promise_of(path, settings["dataset"], PromiseSettings(**settings["promise"]), False)
     if config.left_out:
-        stored = checkpoint.read(path)
         run = opened(path, settings["dataset"])
         make = partial(build, stored.configuration["model"], trusted=False)
         context = context_of_stored(stored.configuration)
@@ -51,21 +61,22 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(
         run_dir / "place.csv", {name: np.asarray(values).tolist() for name, values in columns.items()}
     )
-    draw_placing(found, run_dir / "place.png", float(config.threshold_db))
+    level, unit = float(config.threshold_db), predictor.site.level_unit
+    draw_placing(found, run_dir / "place.png", level, unit)
     x, y, z = found.places[0]
     facts = {
         "place/x": x, "place/y": y, "place/z": z, "place/goal": found.what, "place/before": found.before,
         "place/after": found.goal[0], "place/low": found.low[0], "place/high": found.high[0],
-        "place/candidates": len(found.places), "place/threshold_db": float(config.threshold_db),
+        "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
         **provenance(), **machine_facts(),
     }  # fmt: skip
     write_summary(run_dir / "summary.json", facts)
-    level = float(config.threshold_db)
+    low, high = (number(found.what, ends[0], unit) for ends in (found.low, found.high))
     lines = [
-        f"now {in_words(found.what, found.before, level)}",
-        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {in_words(found.what, found.goal[0], level)} "
-        f"(90 % interval {number(found.what, found.low[0])} to {number(found.what, found.high[0])})",
+        f"now {in_words(found.what, found.before, level, unit)}",
+        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {in_words(found.what, found.goal[0], level, unit)} "
+        f"(90 % interval {low} to {high})",
     ]
     if not error.stations:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")

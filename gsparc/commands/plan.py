@@ -51,6 +51,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts = {
         "plan/places": len(found.places), "plan/before_db": found.before_db, "plan/after_db": found.after_db,
         "plan/length_m": found.length_m, "plan/stopped": found.stopped or None,
+        "plan/scatter_db": found.scatter_db, "plan/in_vain": int(bool(found.in_vain)),
         "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
         **provenance(), **machine_facts(),
     }  # fmt: skip
@@ -58,5 +59,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     said = f"{len(found.places)} places: expected error {found.before_db:.2f} -> {found.after_db:.2f} dB"
     if config.route or config.route_m is not None:
         said += f", a walk of {found.length_m:.4g} m"
-    show(run_dir, lines=[found.stopped] if found.stopped else [], before=f"{said}; plan ")
+    lines = [line for line in (found.stopped, found.in_vain) if line]
+    show(run_dir, lines=lines, before=f"{said}; plan ")
     return facts

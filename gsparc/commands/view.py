@@ -77,11 +77,11 @@ def view_of(config: DictConfig, settings: dict[str, Any]) -> SiteView:
     """
     plan = plan_of(config)
     given = Given(plan, None if config.walls is None else read_walls(config.walls))
-    viewed = open_viewed(config.ckpt, settings["dataset"], config.station, str(config.unit))
+    viewed = open_viewed(config.ckpt, settings["dataset"], config.station, config.unit)
     made: tuple[Any, ...] = ()
     if config.map is not None:
         found = FieldMap.read(config.map)
-        made = tuple((found.grid, layer) for layer in layers(found, str(config.unit)) if not layer.words)
+        made = tuple((found.grid, layer) for layer in layers(found, viewed.unit) if not layer.words)
     return SiteView(
         viewed, given, grid_for(viewed, settings, plan), made, _place("at", settings["at"]),
         _place("other_end", settings["other_end"]),

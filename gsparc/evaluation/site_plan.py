@@ -126,7 +126,7 @@ def draw_site(
         axis = figure.add_subplot(place)
         axis.grid(alpha=0.3)
         for one, t in zip(axes[:, 1], jumping, strict=True):
-            _draw_level(one, levels, t, [step for u, step in steps if u == t])
+            _draw_level(one, levels, t, [step for u, step in steps if u == t], data.site.level_unit)
     _draw_map(axis, data, found, low, high, jumping)
     legend = figure.legend(loc="outside lower left", ncols=4, fontsize="small", frameon=False)
     mark: Any
@@ -272,7 +272,7 @@ def _labels(data: Measurements) -> dict[str, str]:
     return {"xlabel": f"metres east of {where}", "ylabel": f"metres north of {north}"}
 
 
-def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[LevelStep]) -> None:
+def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[LevelStep], unit: str) -> None:
     """Levels of a station by row; those between two steps in one colour."""
     rows = np.flatnonzero(levels.station == station)
     level = levels.level_db[rows]
@@ -295,5 +295,5 @@ def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[Lev
     wild = [bad for t, bad, _ in wild_of(levels.station, levels.level_db) if t == station]
     for row in np.concatenate([np.zeros(0, np.int64), *wild]):
         axis.plot(np.searchsorted(rows, row), levels.level_db[row], "o", mec="red", mfc="none")
-    axis.set(title=f"{levels.names[station]}: steps that the places do not explain", ylabel="level [dB]")
+    axis.set(title=f"{levels.names[station]}: steps that the places do not explain", ylabel=f"level [{unit}]")
     axis.set_xlabel("place, in the order of measuring")

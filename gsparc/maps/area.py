@@ -113,7 +113,10 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
     if isinstance(area, str | Path):
         if Path(area).suffix.lower() not in (".geojson", ".json"):
             raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
-        shapes = read_shapes(area, "area", None if site is None else site.georeference)
+        box = None if site is None else site.moving_box
+        width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
+        origin = None if site is None else site.georeference
+        shapes = read_shapes(area, "area", origin, site_m=width)
         return *shapes.bounds(), shapes.contains
     if area is not None:
         return *_rectangle(area), None

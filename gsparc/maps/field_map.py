@@ -9,13 +9,17 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from scipy.stats import norm
 
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.maps.area import Grid
 
 REFUSED = -1  # of `best_server`
-ARRAYS = ("power_db", "lower_db", "upper_db", "expected_error_db", "best_server", "sinr_db", "outage")
+ARRAYS = (
+    "power_db", "lower_db", "upper_db", "expected_error_db", "best_server", "server_chance", "sinr_db",
+    "outage",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,10 @@ class FieldMap:
         lower_db, upper_db: (T, ny, nx) ends of the interval.
         expected_error_db: (T, ny, nx) root mean square error.
         best_server: (ny, nx) int16, number of the strongest station; `REFUSED`.
+        server_chance: (ny, nx) probability that it is, and is above its floor; see `server_chance`.
         sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
         outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
-        share: of the truth that the intervals hold.
+        share: of measurements that the intervals hold; the field alone lies in them more often.
         calibrated: whether held-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
         extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`.
@@ -47,6 +52,7 @@ class FieldMap:
     upper_db: np.ndarray
     expected_error_db: np.ndarray
     best_server: np.ndarray
+    server_chance: np.ndarray
     sinr_db: np.ndarray
     outage: np.ndarray
     share: float
@@ -62,6 +68,11 @@ class FieldMap:
         """Cells (ny, nx) bool of the area about which nothing is said."""
         return self.grid.inside & (self.best_server == REFUSED)
 
+    @property
+    def unsure(self) -> np.ndarray:
+        """Cells (ny, nx) bool whose best server is less likely than not strongest and above its floor."""
+        return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
+
     def strongest(self, layers: np.ndarray) -> np.ndarray:
         """Of layers (T, ny, nx), that of each cell's strongest station (ny, nx); NaN where refused."""
         number = np.maximum(self.best_server, 0).astype(np.int64)
@@ -72,12 +83,9 @@ class FieldMap:
         """Write as npz, whole or not at all."""
         arrays = {
             "x": self.grid.x, "y": self.grid.y, "height": np.array(self.grid.height),
-            "inside": self.grid.inside, "stations": np.array(self.stations), "power_db": self.power_db,
-            "lower_db": self.lower_db, "upper_db": self.upper_db,
-            "expected_error_db": self.expected_error_db, "best_server": self.best_server,
-            "sinr_db": self.sinr_db, "outage": self.outage, "share": np.array(self.share),
+            "inside": self.grid.inside, "stations": np.array(self.stations), "share": np.array(self.share),
             "calibrated": np.array(self.calibrated), "threshold_db": np.array(self.threshold_db),
-            **self.extra,
+            **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
         }  # fmt: skip
         with whole_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -130,7 +138,7 @@ class FieldMap:
             "width_db": mean(width),
             "expected_error_db": mean(self.strongest(self.expected_error_db)[told]),
             "threshold_db": self.threshold_db, "outage": mean(self.outage[told]),
-            "sinr_db": mean(self.sinr_db[told]),
+            "sinr_db": mean(self.sinr_db[told]), "server_unsure": mean(self.unsure[told].astype(float)),
         }  # fmt: skip
         return {f"map/{name}": value for name, value in found.items()}
 
@@ -140,6 +148,31 @@ def best_server(power_db: np.ndarray) -> np.ndarray:
     known = np.isfinite(power_db)
     number = np.where(known, power_db, -np.inf).argmax(axis=0)
     return np.where(known.any(axis=0), number, REFUSED).astype(np.int16)
+
+
+def server_chance(
+    power_db: np.ndarray, error_db: np.ndarray, usual_db: np.ndarray, floor_db: np.ndarray
+) -> np.ndarray:
+    """Least probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
+
+    Errors are taken for normal and independent; who beats one station is likelier to beat another, so that
+    the product of all is a lower bound (D. Slepian, Bell Syst. Tech. J. 41 (1962)).
+
+    Args:
+        power_db, error_db: predicted, and expected errors; NaN where unknown.
+        usual_db: (T, 2) mean and deviation that a station has where it is unknown; NaN: it is left out there.
+        floor_db: (T,) power below which a station is not told from noise; -inf: any is.
+
+    Returns:
+        NaN where no power is known.
+    """
+    number, known = best_server(power_db), np.isfinite(power_db)
+    first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
+    mean, spread = power_db[first, cell], error_db[first, cell]
+    rival, wrong = (np.where(known, one, usual_db[:, k, None]) for k, one in enumerate((power_db, error_db)))
+    beats = np.nan_to_num(norm.cdf((mean - rival) / np.hypot(spread, wrong)), nan=1.0)
+    beats[first, cell] = norm.cdf((mean - floor_db[first]) / spread)
+    return np.where(number == REFUSED, np.nan, beats.prod(axis=0)).astype(np.float32)
 
 
 def sinr(power_db: np.ndarray, load: np.ndarray, noise_db: float | None) -> np.ndarray:

@@ -15,6 +15,7 @@ from gsparc.data.errors import DataError, reason
 from gsparc.data.links.georeference import Georeference
 
 CORNERS = 3  # of a polygon, at least
+SPECK = 1e-3  # of a site's width, that nobody draws: in degrees a site is 1e-5 as wide as in metres
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ class Shapes:
         return every.min(axis=0), every.max(axis=0)
 
 
-def read_shapes(path: str | Path, key: str, origin: Georeference | None, wanted: str = "polygon") -> Shapes:
+def read_shapes(
+    path: str | Path, key: str, origin: Georeference | None, wanted: str = "polygon", site_m: float = 0.0
+) -> Shapes:
     """Polygons and lines of a file; coordinates are degrees where the model knows its place on Earth.
 
     Args:
@@ -53,9 +56,10 @@ def read_shapes(path: str | Path, key: str, origin: Georeference | None, wanted:
         key: setting that named it, for messages.
         origin: of the model's metres; None: the file's coordinates are metres themselves.
         wanted: `polygon`, `line` or `either`, at least one of which must be there.
+        site_m: width of the site [m], of which everything drawn must not be a speck: it is in degrees then.
 
     Raises:
-        DataError: no file, no GeoJSON, nothing of what is wanted, or a shape without extent.
+        DataError: no file, no GeoJSON, nothing of what is wanted, a shape without extent, or degrees.
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -78,7 +82,14 @@ def read_shapes(path: str | Path, key: str, origin: Georeference | None, wanted:
         raise DataError(f"{key}={path}: holds no polygon; draw the area as a Polygon or MultiPolygon")
     if not lines and wanted == "line":
         raise DataError(f"{key}={path}: holds no line; draw corridors as LineString or MultiLineString")
-    return Shapes(tuple(polygons), tuple(lines))
+    found = Shapes(tuple(polygons), tuple(lines))
+    low, high = found.bounds()
+    if origin is None and (high - low).max() < SPECK * site_m:
+        raise DataError(
+            f"{key}={path}: all of it is {(high - low).max():.2g} m wide, the site {site_m:.3g} m; the model "
+            "was trained in metres about an unknown origin, which degrees mean nothing to"
+        )
+    return found
 
 
 def _geometries(content: Any, where: str) -> list[dict[str, Any]]:

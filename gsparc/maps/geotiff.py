@@ -31,8 +31,8 @@ def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> No
     """Write float32 bands, north up; named, NaN where nothing is said.
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
-    `outage`, `best_server` (number of the station), and then the power of each of several stations. The
-    projection is the one that `Georeference` describes, azimuthal equidistant about its place.
+    `outage`, `best_server` (number of the station), `server_chance`, and then the power of each of several
+    stations. The projection is the one that `Georeference` describes, azimuthal equidistant about its place.
     """
     import rasterio
     from rasterio.transform import from_origin
@@ -41,7 +41,8 @@ def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> No
     bands = {name: found.strongest(getattr(found, name)) for name in ("power_db", "lower_db", "upper_db")}
     bands |= {
         "expected_error_db": found.strongest(found.expected_error_db), "sinr_db": found.sinr_db,
-        "outage": found.outage, "best_server": best, **found.extra,
+        "outage": found.outage, "best_server": best,
+        "server_chance": found.server_chance, **found.extra,
     }  # fmt: skip
     if len(found.stations) > 1:
         bands |= {

@@ -1,5 +1,6 @@
-"""Intervals that hold the truth as often as they say, learned from whole blocks of places held out.
+"""Intervals that hold a measurement as often as they say, learned from whole blocks of places held out.
 
+The field alone, without the noise of a measurement, lies in them more often.
 A prediction's own deviation is scaled by what it took to cover the errors of held-out rows as far from data
 (split conformal prediction with a scale, J. Lei et al., J. Amer. Stat. Assoc. 113 (2018), in bins of
 distance). Farther than any held-out row nothing is known, and nothing is said.
@@ -78,7 +79,7 @@ class Calibration:
     """What scales a prediction's own deviation.
 
     Attributes:
-        share: of the truth that intervals hold.
+        share: of measurements that intervals hold.
         distance: (K,) middles of bins [m].
         half: (K,) half of an interval, in deviations.
         rms: (K,) expected error, in deviations.
@@ -104,7 +105,7 @@ class Calibration:
         return self._of(self.rms, spread_db, distance, station)
 
     def below(self, level_db: float, mean_db: np.ndarray, expected_db: np.ndarray) -> np.ndarray:
-        """Probability (n,) that the truth lies below a level; NaN where it is not known."""
+        """Probability (n,) that a measurement lies below a level; NaN where it is not known."""
         standard = (level_db - mean_db) / expected_db
         if self.tail is None:
             return norm.cdf(standard)
@@ -124,7 +125,7 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
 
     Args:
         evidence: of held-out rows.
-        share: of the truth that intervals are to hold.
+        share: of measurements that intervals are to hold.
 
     Raises:
         ValueError: too few rows.
@@ -181,7 +182,7 @@ def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.n
 
 
 def held(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (n,) bool whose truth lies in the interval, and widths (n,) [dB], NaN where nothing is said.
+    """Rows (n,) bool whose measurement lies in the interval, and widths (n,) [dB], NaN where nothing is said.
 
     A silent row is in an interval that reaches below its level.
     """

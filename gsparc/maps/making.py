@@ -17,7 +17,7 @@ from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.maps.area import Grid, grid_of
-from gsparc.maps.field_map import FieldMap, best_server, loads, sinr
+from gsparc.maps.field_map import FieldMap, best_server, loads, server_chance, sinr
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.intervals import Calibration
 from gsparc.maps.levels import MAPPED, predicted
@@ -64,7 +64,7 @@ def map_of(
         plan: beneath the map.
         promise: evidence of held-out blocks; None: intervals are the model's own deviations, and nothing is
             refused.
-        share: of the truth that intervals are to hold.
+        share: of measurements that intervals are to hold.
         tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
             every cell. Known places must be stored with the model.
         asked: called with the share of the work that is done.
@@ -110,15 +110,18 @@ def map_of(
             f"within about {tolerance_db:g} dB"
         )
     power, lower, upper, error = arrays
-    best, ratio, outage = _over_stations(power, error, share_of, noise_db, threshold_db, calibration)
+    numbers = [0 if site.stations is None else site.stations.name.index(name) for name in names]
+    usual, floor = _usual(promise, numbers, noise_db)
+    over = _over_stations(power, error, share_of, noise_db, threshold_db, calibration, usual, floor)
+    best, chance, ratio, outage = over
     if calibration is not None and not np.isfinite(power).any():
         raise DataError(
             f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
             "that held-out blocks tell anything of; map where was measured, or give a larger promise.block_m"
         )
     return FieldMap(
-        grid, tuple(names), power, lower, upper, error, best, ratio, outage, share, calibration is not None,
-        threshold_db, _path_layers(predictor, grid, best),
+        grid, tuple(names), power, lower, upper, error, best, chance, ratio, outage, share,
+        calibration is not None, threshold_db, _path_layers(predictor, grid, best),
         np.zeros((0, 2)) if promise is None else _measured_places(promise, site), _still(site, names),
         tuple(notes),
     )  # fmt: skip
@@ -277,14 +280,17 @@ def _over_stations(
     noise_db: float | None,
     threshold_db: float,
     calibration: Calibration | None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Best server, SINR and outage (ny, nx)."""
+    usual: np.ndarray,
+    floor: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Best server, the chance that it is, SINR and outage (ny, nx)."""
     flat, wrong = (array.reshape(len(array), -1) for array in (power, error))
     best = np.empty(flat.shape[1], np.int16)
-    ratio, outage = (np.empty(flat.shape[1], np.float32) for _ in range(2))
+    chance, ratio, outage = (np.empty(flat.shape[1], np.float32) for _ in range(3))
     for start in range(0, flat.shape[1], BANDS):
         part = slice(start, start + BANDS)
         best[part] = number = best_server(flat[:, part])
+        chance[part] = server_chance(flat[:, part], wrong[:, part], usual, floor)
         ratio[part] = sinr(flat[:, part], load, noise_db)
         cell = np.arange(len(number))
         mean, spread = (array[:, part][np.maximum(number, 0), cell] for array in (flat, wrong))
@@ -293,7 +299,27 @@ def _over_stations(
         else:
             outage[part] = calibration.below(threshold_db, mean, spread)
     shape = power.shape[1:]
-    return best.reshape(shape), ratio.reshape(shape), outage.reshape(shape)
+    return best.reshape(shape), chance.reshape(shape), ratio.reshape(shape), outage.reshape(shape)
+
+
+def _usual(
+    promise: Promise | None, numbers: Sequence[int], noise_db: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and deviation (T, 2) of each station's measured levels, and its floor (T,) [dB].
+
+    The floor is the level below which it is not heard, else the weakest but for 1 % that was measured of it.
+    """
+    least = -np.inf if noise_db is None else noise_db
+    usual, floor = np.full((len(numbers), 2), np.nan), np.full(len(numbers), least)
+    if promise is None:
+        return usual, floor
+    for row, number in enumerate(numbers):
+        own = promise.evidence.at(np.flatnonzero(promise.evidence.station == number))
+        if len(own):
+            usual[row] = own.level_db.mean(), own.level_db.std()
+            quiet = own.level_db[own.silent]
+            floor[row] = max(least, quiet.max() if len(quiet) else np.quantile(own.level_db, 0.01))
+    return usual, floor
 
 
 def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str, np.ndarray]:

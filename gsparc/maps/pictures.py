@@ -23,7 +23,8 @@ from gsparc.methods.predictor import Predictor
 
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
-MOST_POINTS = 4000  # measured places that are drawn
+MOST_POINTS = 1500  # measured places that are drawn
+UNSURE = "hatched: less likely than not the strongest and above its floor"
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -38,6 +39,7 @@ class Layer:
         colours: a matplotlib colour map.
         limits: of the colours; None: the 1 and 99 % quantiles.
         words: names of whole numbers, for a layer of classes.
+        unsure: (ny, nx) bool, cells that are hatched, and why; None: none.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Layer:
     colours: str = "viridis"
     limits: tuple[float, float] | None = None
     words: tuple[str, ...] = ()
+    unsure: tuple[np.ndarray, str] | None = None
 
     def range(self) -> tuple[float, float]:
         """Of the colours."""
@@ -68,7 +71,8 @@ def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
     yield Layer("power", f"received power{of} [{unit}]", found.strongest(found.power_db))
     if several:
         values = np.where(found.best_server == REFUSED, np.nan, found.best_server.astype(float))
-        yield Layer("best_server", "strongest station", values, words=found.stations)
+        doubt = (found.unsure, UNSURE) if found.unsure.any() else None
+        yield Layer("best_server", "strongest station", values, words=found.stations, unsure=doubt)
     if np.isfinite(found.sinr_db).any():
         yield Layer("sinr", "signal over interference and noise [dB]", found.sinr_db)
     level = f"{found.threshold_db:g} {unit}"
@@ -121,7 +125,7 @@ def draw_layer(
     how |= {"alpha": 1.0 if plan is None else 0.65, "zorder": 2}
     if layer.words:
         count = len(layer.words)
-        colours = ListedColormap(colormaps["tab20"](np.arange(count) % 20))
+        colours = ListedColormap(class_colours(count))
         drawn = axis.imshow(
             layer.values, cmap=colours, norm=BoundaryNorm(np.arange(count + 1) - 0.5, count), **how
         )
@@ -134,6 +138,8 @@ def draw_layer(
         ends = "neither" if layer.limits else "both"
         bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends)
     bar.set_label(layer.label)
+    if layer.unsure is not None:
+        _hatch(axis, found, *layer.unsure)
     draw_places(axis, found)
     axis.set(
         xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title
@@ -152,6 +158,15 @@ def draw_layer(
     save(figure, path, 110)
 
 
+def _hatch(axis: Any, found: FieldMap, cells: np.ndarray, why: str) -> None:
+    """Hatch cells (ny, nx) of a map; a map of a single row or column has no area to hatch."""
+    if min(cells.shape) > 1:
+        how: dict[str, Any] = {"hatches": ["", "////"], "levels": [-0.5, 0.5, 1.5], "colors": "none"}
+        drawn = axis.contourf(found.grid.x, found.grid.y, cells.astype(float), zorder=2.5, **how)
+        drawn.set(edgecolor="black", linewidth=0.0)
+        axis.fill([], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why)
+
+
 def draw_plan(axis: Any, plan: FloorPlan) -> None:
     """The floor plan, where it lies."""
     height, width = plan.image.shape[:2]
@@ -163,12 +178,7 @@ def draw_plan(axis: Any, plan: FloorPlan) -> None:
 def draw_places(axis: Any, found: FieldMap) -> None:
     """Measured points and stations; those outside the map are left out."""
     left, right, low, high = found.grid.extent
-    places = found.places
-    if len(places):
-        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
-        size = float(np.clip(2500 / len(few), 0.3, 8.0))
-        rim = {"markeredgecolor": "white", "markeredgewidth": 0.12 * size}  # seen on dark cells as well
-        axis.plot(*few.T, "k.", markersize=size, alpha=0.6, label="measured", zorder=3, linestyle="", **rim)
+    draw_measured(axis, found.places)
     known = found.station_place
     inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
     if inside.any():
@@ -182,6 +192,20 @@ def draw_places(axis: Any, found: FieldMap) -> None:
                 ha="right" if edge else "left", path_effects=OUTLINE, zorder=5,
             )  # fmt: skip
             note.set_in_layout(False)
+
+
+def draw_measured(axis: Any, places: np.ndarray) -> None:
+    """Places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
+    if len(places):
+        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
+        rim = {"markerfacecolor": "black", "markeredgecolor": "white", "markeredgewidth": 0.2 * size}
+        axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
+
+
+def class_colours(count: int) -> np.ndarray:
+    """Colours (count, 4) of a layer of classes."""
+    return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
 
 
 def draw_plan_picture(
@@ -209,8 +233,7 @@ def draw_plan_picture(
         scale_bar(axis, right - left)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
-        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
-        before.plot(*few.T, "k.", markersize=float(np.clip(2500 / len(few), 0.3, 6.0)), alpha=0.5, zorder=2)
+        draw_measured(before, places)
     how: dict[str, Any] = {"marker": "o", "color": "red", "markeredgecolor": "white", "markersize": 6}
     after.plot(*found.places[:, :2].T, linestyle="-" if found.walk else "", linewidth=1, zorder=3, **how)
     for number, place in enumerate(found.places[:60], 1):
@@ -219,18 +242,19 @@ def draw_plan_picture(
     figure.colorbar(drawn, ax=[before, after], label="expected error [dB]", shrink=0.8)
     curve.plot(np.append(found.before_db, found.expected_db[np.argsort(found.chosen)]), ".-")
     curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
+    curve.set_ylim(bottom=0)  # what the walk gains is seen beside what is left
     curve.grid(alpha=0.3)
     engine: Any = figure.get_layout_engine()
     engine.set(w_pad=0.12, h_pad=0.1)
     save(figure, path, 100)
 
 
-def draw_placing(found: Placing, path: Path, threshold_db: float) -> None:
+def draw_placing(found: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
     """The goal at every candidate, the stations that stand, and the best place."""
     left, right, low, high = found.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
-    label = f"share of the area with {threshold_db:g} dB or more"
-    label = label if found.what == "coverage" else "power that nine tenths of the area exceed [dB]"
+    label = f"share of the area with {threshold_db:g} {unit} or more"
+    label = label if found.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
     drawn = axis.scatter(*found.places[:, :2].T, c=found.goal, s=60, marker="s", cmap="viridis")
     figure.colorbar(drawn, ax=axis, label=f"{label}, with a station here", shrink=0.85)
     how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}

@@ -84,6 +84,7 @@ def place_next(
     promise: Promise | None = None,
     error: NewStation | None = None,
     asked: Callable[[float], None] = lambda share: None,
+    dry: bool = False,
 ) -> Placing:
     """Try one more station at every candidate.
 
@@ -97,6 +98,7 @@ def place_next(
         promise: see `map_of`, of the stations that stand.
         error: see `new_station_error`; None: the model's own deviations.
         asked: called with the share of the work that is done.
+        dry: predict one cell of each station that stands alone: whether everything asked for is possible.
 
     Raises:
         DataError: the model cannot predict a station that was never there, or anything else that is wrong.
@@ -121,6 +123,7 @@ def place_next(
         step_m=grid.step,
         threshold_db=threshold_db,
         promise=promise,
+        dry=dry,
     )
     flat = grid.inside.reshape(-1)
     old_power = np.nan_to_num(now.strongest(now.power_db).reshape(-1)[flat], nan=-np.inf)
@@ -201,19 +204,24 @@ def _refuse_unheard(predictor: Predictor, place: np.ndarray, cell: np.ndarray) -
     try:
         _new(predictor, place, cell)
     except ValueError as error:
-        raise DataError(
-            f"{predictor.method.name} answers only for the stations that it heard ({error}); train with "
-            "stations=together, for example model=gp or distance_law"
-        ) from None
+        raise unheard_refused(f"{predictor.method.name} ({error})") from None
 
 
-def number(what: Goal, value: float) -> str:
+def unheard_refused(what: str) -> DataError:
+    """For models that know no station but those they learned from."""
+    return DataError(
+        f"{what}: answers only for the stations that it heard; train with stations=together, for example "
+        "model=gp or distance_law"
+    )
+
+
+def number(what: Goal, value: float, unit: str = "dB") -> str:
     """A goal's value with its unit."""
-    return f"{value:.1%}" if what == "coverage" else f"{value:.1f} dB"
+    return f"{value:.1%}" if what == "coverage" else f"{value:.1f} {unit}"
 
 
-def in_words(what: Goal, value: float, threshold_db: float) -> str:
+def in_words(what: Goal, value: float, threshold_db: float, unit: str = "dB") -> str:
     """A goal's value in words."""
     if what == "coverage":
-        return f"{number(what, value)} of the area with {threshold_db:g} dB or more"
-    return f"nine tenths of the area have {number(what, value)} or more"
+        return f"{number(what, value)} of the area with {threshold_db:g} {unit} or more"
+    return f"nine tenths of the area have {number(what, value, unit)} or more"

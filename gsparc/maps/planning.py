@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
@@ -25,6 +26,7 @@ from gsparc.methods.predictor import Predictor
 
 TARGETS = 900  # places that the error is averaged over, about
 CANDIDATES = 900  # where somebody may measure, at most
+WORTH = 0.02  # share of the expected error over an area, that places must take away to be worth their walk
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Plan:
         grid: the area.
         error_before, error_after: (S,) expected error at `at` [dB].
         at: (S, 3) places that errors were averaged over [m].
+        scatter_db: of these errors, that of a single measurement, which no other place takes away [dB].
         walk: whether the order is one.
         stopped: why there are fewer than were asked for; "" where there are not.
     """
@@ -54,6 +57,7 @@ class Plan:
     error_before: np.ndarray
     error_after: np.ndarray
     at: np.ndarray
+    scatter_db: float
     walk: bool = False
     stopped: str = ""
 
@@ -61,6 +65,18 @@ class Plan:
     def after_db(self) -> float:
         """Expected error once all are measured [dB]."""
         return float(self.expected_db[self.chosen.argmax()]) if len(self.places) else self.before_db
+
+    @property
+    def in_vain(self) -> str:
+        """Why these places are hardly worth measuring; "" where they are."""
+        gain = self.before_db - self.after_db
+        if not len(self.places) or gain >= WORTH * self.before_db:
+            return ""
+        return (
+            f"hardly worth it: {len(self.places)} places (a walk of {self.length_m:.4g} m) take {gain:.2g} "
+            f"dB off {self.before_db:.2f} dB, {self.scatter_db:.2f} dB of which are the scatter of single "
+            "measurements; area=... where less was measured needs them more"
+        )
 
 
 def plan_next(
@@ -88,7 +104,7 @@ def plan_next(
     Args:
         predictor: of powers; None before anything is measured, with `area` or `plan`.
         count: places wanted.
-        area, height_m, plan: see `grid_of`.
+        area, height_m, plan: see `grid_of`; with a promise and neither area nor plan, what it answers for.
         walkable: GeoJSON file of where somebody may measure: polygons, or lines such as corridors; None: the
             whole area.
         stations, other_end: see `map_of`; what is measured at a place is measured of all of them.
@@ -111,7 +127,7 @@ def plan_next(
     if length_m is not None and not (np.isfinite(length_m) and length_m > 0):
         raise DataError(f"length_m={length_m}: metres above 0 are needed")
     origin = None if predictor is None else predictor.site.georeference
-    grid = coarse_grid(predictor, area, height_m, plan)
+    grid = coarse_grid(predictor, area, height_m, plan, promise)
     targets = grid.places()
     allowed = targets if walkable is None else walkable_places(walkable, grid, origin)
     places, free, wanted = _joined(targets, allowed)
@@ -129,18 +145,27 @@ def plan_next(
     order = tour.order() if walk else np.arange(len(chosen))
     picked = places[chosen] if len(chosen) else np.zeros((0, 3))
     first = _mean_db(before, wanted)
+    scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
         picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
-        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted], walk,
-        stopped,
+        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted],
+        scatter, walk, stopped,
     )  # fmt: skip
 
 
 def coarse_grid(
-    predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None = None
+    predictor: Predictor | None,
+    area: Any,
+    height_m: float | None,
+    plan: FloorPlan | None = None,
+    promise: Promise | None = None,
 ) -> Grid:
-    """About `TARGETS` cells."""
+    """About `TARGETS` cells; where nobody says which, those that a promise reaches."""
     fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
+    if area is None and plan is None and promise is not None and predictor is not None:
+        local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
+        far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.shape)
+        fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
     left, right, low, high = fine.extent
     share = fine.inside.mean()
     step = float(np.sqrt((right - left) * (high - low) * share / TARGETS))
@@ -155,7 +180,8 @@ def coarse_grid(
 
 def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
     """Places (n, 3) in polygons or along lines of a file."""
-    shapes: Shapes = read_shapes(path, key, origin, "either")
+    left, right, south, north = grid.extent
+    shapes: Shapes = read_shapes(path, key, origin, "either", max(right - left, north - south))
     found = [np.zeros((0, 2))]
     if shapes.polygons:
         low, high = (np.array(v) for v in Shapes(shapes.polygons, ()).bounds())

@@ -31,7 +31,7 @@ class PromiseSettings(Checked):
     """How evidence is gathered.
 
     Attributes:
-        share: of the truth that intervals hold.
+        share: of measurements that intervals hold.
         folds: fits, each without other blocks.
         rows: of each fold that are asked about, at most, drawn evenly.
         block_m: side of the blocks, every second fold's twice that [m]; None: a tenth of the longer side.

@@ -40,6 +40,16 @@ class Paths:
     cosines: np.ndarray | None = None
     direction: np.ndarray | None = None
 
+    def channel(self, frequency_hz: np.ndarray) -> np.ndarray:
+        """The sum of the paths (B, A, K) complex64 at tones (K,) [Hz], of paths at positions.
+
+        `csi` less this is what the model adds to channels that are no paths: a residual, or other solutions.
+        """
+        tones = np.atleast_1d(np.asarray(frequency_hz, np.float64))
+        turns = ((tone - self.reference_hz) * self.delay_s for tone in tones)
+        summed = [(self.gain * np.exp(-2j * np.pi * turn)).sum(axis=-1) for turn in turns]
+        return (np.stack(summed, axis=-1) * self.reference_hz / tones).astype(np.complex64)
+
 
 def judged(method: Method, site: Site, uplink: Any) -> Prediction:
     """Channels of the measured tones in stored units with their confidence and variance; see `heard`."""
@@ -71,7 +81,7 @@ def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
 def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
     """The paths of a coherent field at positions in local coordinates.
 
-    Of several models that answer together (`model.effects.hybrid`, `directions`) these are the first's.
+    Of several solutions that are averaged these are those of each that is made of paths, by its weight.
 
     Raises:
         ValueError: the model's channels are not made of paths.

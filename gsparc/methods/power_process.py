@@ -35,6 +35,8 @@ WEIGHED_ON = 600  # the same where some rows were silent: each look factors seve
 MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
 MOST_SILENT = 3_000  # of them, where nothing was heard
 LAW_NEEDS = 8  # rows that were heard, for a distance law
+LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
+LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
 TWO_LENGTHS_NEED = 100
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
@@ -153,7 +155,7 @@ def fit_about(
 
 
 def _fitted(
-    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, chosen_on: int | None
+    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int | None
 ) -> tuple[Process, tuple[str, ...]]:
     """The process about the best of `trends`, and what must be said of it."""
     trend, kernel, said = _settings(rows, trends, seed, chosen_on)
@@ -182,12 +184,12 @@ class _Candidate:
     score: float
     trend: Trend
     kernel: PowerKernel
-    cost: int
+    cost: float
     notes: tuple[str, ...] = ()
 
 
 def _settings(
-    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, chosen_on: int | None
+    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int | None
 ) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
     """Mean, lengths and noise, chosen on a part of many rows, and what must be said of the choice."""
     loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
@@ -211,14 +213,19 @@ def _settings(
     return best.trend, best.kernel, best.notes
 
 
-def _trends(rows: Rows, site: Site, mean: MeanName) -> list[tuple[Trend, int, tuple[str, ...]]]:
-    """Candidate means, the number of their parameters that the covariance leaves out, and notes."""
-    constant: tuple[Trend, int, tuple[str, ...]] = (Trend.of(rows, None), 0, ())
+def _trends(rows: Rows, site: Site, mean: MeanName) -> list[tuple[Trend, float, tuple[str, ...]]]:
+    """Candidate means, their cost, and notes.
+
+    The cost is the number of parameters that the covariance leaves out, less the prior odds of a
+    law: near the rows both predict alike, and far from them powers fall.
+    """
+    constant: tuple[Trend, float, tuple[str, ...]] = (Trend.of(rows, None), 0.0, ())
     if mean == "constant" or (mean == "auto" and int((~rows.silent).sum()) < LAW_NEEDS):
         return [constant]
     law, notes = law_of(rows, site)
     trend = Trend.of(rows, law)
-    by_distance = trend, 4 if notes else 1, notes  # its floor, and a place that was sought
+    odds = LAW_ODDS if law.exponent >= LEAST_FALL else 0.0
+    by_distance = trend, 4 if notes else 1 - odds, notes  # its floor, and a place that was sought
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
@@ -229,7 +236,7 @@ def _views(rows: Rows, trend: Trend) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return distance, trend.terms(places).numpy(), rows.decibels - trend.mean(places).numpy()
 
 
-def _one_length(rows: Rows, trend: Trend, cost: int, notes: tuple[str, ...]) -> _Candidate:
+def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> _Candidate:
     distance, terms, values = _views(rows, trend)
     scale = float(np.median(distance)) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,8 +167,16 @@ class Predictor:
         return import_module("gsparc.maps.making").mapped(self, area, **how)
 
     def cycling(self, places: np.ndarray) -> Call:
-        """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time."""
-        ask = getattr(self, self.site.kind)
+        """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time.
+
+        Of several stations the first that the model answers for is asked.
+        """
+        asked = self
+        for name in () if self.site.stations is None else self.site.stations.name:
+            with suppress(ValueError):
+                asked = self.at(name)
+                break
+        ask = getattr(asked, self.site.kind)
         return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
 
     def spectrum(self, tx: Any = None, rx: Any = None) -> Any:
@@ -242,11 +251,15 @@ class Predictor:
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """Whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
 
+        None is where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
+
         Raises:
             ValueError: the model was never calibrated, or for another kind of confidence.
         """
         if self.trusted.promise is None:
-            raise ValueError("accepts: no threshold is stored; run gsparc calibrate ckpt=FILE")
+            raise ValueError(
+                "accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not"
+            )
         if self.kind not in (None, self.trusted.kind):
             raise ValueError(
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"

@@ -307,11 +307,24 @@ class Gsparc(LearnedField):
         return super().mean_at(tx, rx)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
-        """See `HasPaths`; of the heaviest member, without the residual."""
-        method = self._method()
-        if not isinstance(method, HasPaths):
+        """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.
+
+        What other solutions and the residual add to channels is in no path.
+        """
+        field: Any = self.field
+        members: list[tuple[float, Any]] = [(1.0, field)]
+        if isinstance(field, StackedField):
+            members = list(zip(field.weights, field.members, strict=True))
+        parts: list[tuple[float, Any]] = [
+            (w, one.field if isinstance(one, CompletedField) else one) for w, one in members
+        ]
+        made = [(w, one.method) for w, one in parts if isinstance(getattr(one, "method", None), HasPaths)]
+        if not made:
             raise ValueError("its channels are not made of paths")
-        return method.paths(tx, rx)
+        found = [(weight, method.paths(tx, rx)) for weight, method in made]
+        gain = torch.cat([weight * one[0] for weight, one in found], dim=2)
+        delay = torch.cat([one[1] for _, one in found], dim=2)
+        return gain, delay, torch.cat([one[2] for _, one in found], dim=1), found[0][1][3]
 
     def trainer_options(self) -> bool:
         """See `TrainsByGradient`."""

@@ -185,7 +185,7 @@ def open_viewed(
     path: str | Path,
     dataset: Mapping[str, Any] | None = None,
     station: str | int | None = None,
-    unit: str = "dB",
+    unit: str | None = None,
 ) -> Viewed:
     """Read a checkpoint, and its data where they are still there.
 
@@ -193,7 +193,7 @@ def open_viewed(
         path: of the checkpoint.
         dataset: settings that replace those stored.
         station: the only one to show; None: all that the model answers for.
-        unit: of powers.
+        unit: of powers; None: as measured.
 
     Raises:
         DataError: no station is called that.
@@ -228,8 +228,9 @@ def open_viewed(
     trained = Predictor(method, site, trusted=trusted, extra=stored.extra)
     ways.append(Way("as trained", trained, None, known, figure))
     return Viewed(
-        str(path), tuple(ways), data, test, _stations(ways[-1].predictor, station), tuple(notes), unit
-    )
+        str(path), tuple(ways), data, test, _stations(ways[-1].predictor, station), tuple(notes),
+        unit or site.level_unit,
+    )  # fmt: skip
 
 
 def _stations(predictor: Predictor, wanted: str | int | None) -> tuple[str | None, ...]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from campaigns import brief, compose, spectra
 
+from gsparc.commands.calibrate import command
 from gsparc.commands.calibrate.command import collect, figures, tables
 from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.commands.calibrate.trial import Trial, best_kind, cells, divided, divisible, trials
@@ -68,6 +70,22 @@ def test_too_few_to_test_promise_nothing() -> None:
     score = np.linspace(1, 0, 15)
     found = choose(score, np.zeros(15, bool), levels_of(score), Promise(alpha=0.1, delta=0.1))
     assert found.accepted == 0  # 0.9^15 = 0.2 > delta
+
+
+def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
+    evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
+    monkeypatch.setattr(command, "_unseen", lambda *_: run)
+    for name in ("rows_of", "known_positions", "position_kernel", "keep"):
+        monkeypatch.setattr(command, name, lambda *_: None)
+    monkeypatch.setattr(command, "gather", lambda *_: evidence)
+    how = "auto", False, 0
+    stored, said = command.store("", {}, {}, Promise(-40.0), *how)
+    assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
+    better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
+    assert -25 < better < 0 and "accepted from" in command.store("", {}, {}, Promise(better), *how)[1]
+    assert "no threshold" in command.store("", {}, {}, Promise(better - 1), *how)[1]
+    evidence.error[:] = 10.0
+    assert "no limit_db= up to 6 is kept" in command.store("", {}, {}, Promise(), *how)[1]
 
 
 @pytest.mark.parametrize("how", ["random", "spatial"])

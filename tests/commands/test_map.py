@@ -101,6 +101,15 @@ def test_errors_come_before_anything_is_written(model, tmp_path, monkeypatch, co
     assert not list(tmp_path.iterdir())
 
 
+def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_path, monkeypatch):
+    runtime = type("R", (), {"output_dir": tmp_path})
+    monkeypatch.setattr(HydraConfig, "get", lambda: type("C", (), {"runtime": runtime}))
+    place = import_module("gsparc.commands.place")
+    monkeypatch.setattr(place, "load", lambda path: pytest.fail("all stations are restored"))
+    with pytest.raises(ValueError, match="train with stations=together"):
+        place.task(compose(f"ckpt='{model}'", config="place"))
+
+
 def test_errors_are_one_line(model, tmp_path):
     done = run("map", f"ckpt={model}", "step_m=0", folder=tmp_path / "run")
     assert done.returncode == 1 and "above 0 metres" in done.stderr

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from releases import real
 
+from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.link_levels import link_levels
 from gsparc.data.checks.plausibility import steps_of
 from gsparc.data.load import load
@@ -58,6 +59,15 @@ def test_levels_are_means_over_what_was_heard():
     expected[3] = -75
     assert np.allclose(found.level_db, expected, atol=1e-4) and not found.suspicious.any()
     assert found.label == "received power, mean of the stations heard [dB]"
+
+
+def test_levels_in_dbm_were_drawn_as_db(figures):
+    place, level = scattered(), np.linspace(-90, -40, 80)
+    arrays = {"rx_position": place, "station_position": np.array([[3.0, 3, 5]]), "rssi_db": level[:, None]}
+    data = from_arrays(arrays, {"level_unit": "dBm"})
+    levels = link_levels(data)
+    draw_site(data, "unused.png", levels, [(0, LevelStep(39, 40, -25.0, 9.0))])
+    assert {axis.get_ylabel() for axis in figures[-1].axes} >= {"level [dBm]", "received power [dBm]"}
 
 
 def test_channels_are_means_of_power():

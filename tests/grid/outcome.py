@@ -56,7 +56,7 @@ class Outcome:
         return self.own - self.best > self.allowed
 
     def grossly_behind(self, times: float) -> bool:
-        """Whether it lost by more than a few seconds' training explains: `times` the error that is allowed."""
+        """Whether its error is `times` what is allowed: more than few seconds of training explain."""
         most = self.best + self.allowed
         return self.own > (most * times if self.best > 0 else most + 10 * math.log10(times))
 

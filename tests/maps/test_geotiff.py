@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from towns import town_model
@@ -10,6 +13,7 @@ import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
 from gsparc.maps.geotiff import wanted, write_geotiff
+from gsparc.maps.planning import plan_next
 
 ORIGIN = Georeference(47.2, 11.3)
 
@@ -21,7 +25,7 @@ def test_read_back_at_the_right_place(tmp_path):
     found = gsparc.load(town_model()).map([0, 0, 80, 60], step_m=4.0)
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
-        assert file.descriptions[0] == "power_db" and file.count == 9
+        assert file.descriptions[0] == "power_db" and file.count == 10
         for row, column in ((0, 0), (14, 19), (7, 3)):
             x, y = file.xy(len(found.grid.y) - 1 - row, column)
             longitude, latitude = transform(file.crs, "EPSG:4326", [x], [y])
@@ -30,6 +34,39 @@ def test_read_back_at_the_right_place(tmp_path):
             assert np.allclose([latitude[0], longitude[0]], np.ravel(expected), atol=1e-7)
             (value,) = next(file.sample([(x, y)], indexes=1))
             assert value == pytest.approx(found.strongest(found.power_db)[row, column])
+
+
+def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
+    """Drawn in degrees with heights and a hole; rasterio masks the file's cells by the same polygon."""
+    pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
+    import rasterio
+    from rasterio.features import geometry_mask
+    from rasterio.warp import transform_geom
+
+    predictor = gsparc.load(town_model())
+    predictor.site = replace(predictor.site, georeference=ORIGIN)
+    rings = [[[5, 5], [75, 10], [60, 55], [10, 50], [5, 5]], [[30, 20], [50, 20], [40, 40], [30, 20]]]
+    degrees = [np.stack([*ORIGIN.to_degrees(np.array(ring, float))[::-1], np.full(len(ring), 570.0)], 1)
+               for ring in rings]  # fmt: skip
+    drawn = {"type": "Polygon", "coordinates": [ring.tolist() for ring in degrees]}
+    (tmp_path / "area.geojson").write_text(json.dumps({"type": "Feature", "geometry": drawn}))
+    found = predictor.map(tmp_path / "area.geojson", step_m=1.0)
+    write_geotiff(tmp_path / "map.tif", found, ORIGIN)
+    with rasterio.open(tmp_path / "map.tif") as file:
+        power = file.read(1)
+        outside = geometry_mask([transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform)
+    assert (np.isnan(power) == outside).mean() > 0.999  # centres on an edge go either way
+    np.testing.assert_array_equal(np.flipud(power), found.strongest(found.power_db))
+
+
+def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
+    ring = [[11.3, 47.2], [11.301, 47.2], [11.301, 47.2008], [11.3, 47.2]]
+    (tmp_path / "area.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    predictor = gsparc.load(town_model())
+    with pytest.raises(DataError, match="degrees mean nothing to"):
+        predictor.map(tmp_path / "area.geojson")
+    with pytest.raises(DataError, match="degrees mean nothing to"):
+        plan_next(predictor, 3, walkable=tmp_path / "area.geojson")
 
 
 def test_asked_for_without_a_place_on_earth():

@@ -11,9 +11,10 @@ import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
-from gsparc.maps.field_map import REFUSED, best_server, loads, sinr
+from gsparc.maps.field_map import REFUSED, best_server, loads, server_chance, sinr
 from gsparc.maps.intervals import Evidence
-from gsparc.maps.making import answering, map_of
+from gsparc.maps.making import _usual, answering, map_of
+from gsparc.maps.pictures import layers
 from gsparc.maps.promise import Promise
 from gsparc.maps.refining import refined
 from gsparc.methods.method import FitContext
@@ -72,6 +73,29 @@ def test_ratio_of_signal_to_interference_by_hand():
     assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
     assert best_server(power).tolist() == [0, 1, REFUSED]
     assert loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
+
+
+def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(predictor):
+    power = np.array([[-60.0, -60.0, np.nan, -60.0], [-90.0, -60.0, np.nan, np.nan]])
+    error, never = np.full((2, 4), 5.0), np.full((2, 2), np.nan)
+    free = server_chance(power, error, never, np.full(2, -np.inf))
+    assert free[:2] == pytest.approx([1.0, 0.5], abs=1e-4) and np.isnan(free[2]) and free[3] == 1
+    usual = np.array([[-80.0, 5.0], [-50.0, 5.0]])  # the second is unknown in the last cell, mostly louder
+    told = server_chance(power, error, usual, np.array([-60.0, -100.0]))
+    assert told[0] == pytest.approx(0.5, abs=1e-4) and told[3] == pytest.approx(0.5 * 0.0786, abs=1e-3)
+    quiet = predictor.map(step_m=10.0)
+    loud = predictor.map(step_m=10.0, noise_db=0.0)
+    assert not quiet.unsure.any() and loud.unsure.all() and loud.figures()["map/server_unsure"] == 1
+    unsure = {layer.name: layer.unsure for layer in layers(loud)}
+    assert unsure["best_server"] is not None and unsure["power"] is None
+
+
+def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
+    level, row = np.append(np.linspace(-100, -50, 101), -90.0), np.arange(102)
+    evidence = Evidence(level, level, np.ones(102), np.zeros(102), row, (row == 101) * 1, row == 101)
+    usual, floor = _usual(Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0), [0, 1], None)
+    assert floor == pytest.approx([-99.5, -90]) and usual[0] == pytest.approx([-75, 14.58], abs=0.01)
+    assert _usual(None, [0, 1], -95.0)[1].tolist() == [-95, -95]
 
 
 def test_saved_and_read_back(predictor, tmp_path):

@@ -6,12 +6,15 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from towns import town_model
 
 import gsparc
 from gsparc.data.errors import DataError
 from gsparc.maps.covariance import ErrorCovariance
+from gsparc.maps.intervals import Evidence
 from gsparc.maps.planning import plan_next
+from gsparc.maps.promise import Promise
 from gsparc.maps.route import Tour
 
 
@@ -61,6 +64,25 @@ def test_it_stops_where_a_place_gains_too_little(predictor):
     found = plan_next(predictor, 50, [-40, 0, 80, 60], least_gain_db=0.1)
     assert 0 < len(found.places) < 50 and "less than 0.1 dB" in found.stopped
     assert len(plan_next(predictor, 50, least_gain_db=50).places) == 0
+
+
+def test_a_plan_went_to_corners_of_the_bounding_box_where_nothing_is_known(predictor):
+    rng = np.random.default_rng(0)
+    level, spread, row = rng.normal(size=60), np.ones(60), np.arange(60)
+    evidence = Evidence(level, 0 * level, spread, row / 10, row, row % 2, row < 0)
+    known = np.column_stack([rng.uniform(0, [40, 60], (120, 2)), np.full(120, 1.5)]) - predictor.site.origin
+    promise = Promise(evidence, known, np.arange(120) % 2, 5.0)
+    found = plan_next(predictor, 6, promise=promise)
+    reach = promise.calibration().reach
+    assert cKDTree(known + predictor.site.origin).query(found.at)[0].max() <= reach + found.grid.step < 10
+    assert found.places[:, 0].max() < 50 and not found.grid.inside[:, -1].any()
+    assert plan_next(predictor, 6, [0, 0, 80, 60], promise=promise).at[:, 0].max() > 70
+
+
+def test_a_long_walk_for_nothing_was_not_called_so(predictor):
+    found = plan_next(predictor, 1, route=True)
+    assert "hardly worth it: 1 places" in found.in_vain and 0 < found.scatter_db < found.before_db
+    assert not plan_next(None, 9, [0, 0, 30, 30]).in_vain
 
 
 def test_a_walk_is_not_longer_than_it_must_be():

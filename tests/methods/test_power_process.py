@@ -188,3 +188,21 @@ def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():
     away = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
     there = Pose(batch.rx.position[:5] + 3000.0 * away, batch.rx.rotation[:5])
     assert method.predict(batch.tx[:5], there).confidence.max() < 0.01
+
+
+def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
+    """Rows at nearly one distance tell the two means hardly apart; 2 km farther the constant stayed."""
+    rng = np.random.default_rng(0)
+    places = np.c_[rng.uniform(-100, 100, 80), rng.uniform(380, 420, 80), np.full(80, 1.5)]
+    station, waves = np.array([0.0, 0.0, 20.0]), rng.normal(size=(2, 100)) / 40
+    shadow = np.cos(places[:, :2] @ waves + rng.uniform(0, 2 * np.pi, 100)).sum(axis=1) / 7
+    decibels = (
+        -30 - 30 * np.log10(np.linalg.norm(places - station, axis=1)) + 3 * shadow + rng.normal(size=80)
+    )
+    arrays = {"rx_position": places, "tx_position": station, "rssi_db": decibels}
+    data = from_arrays(arrays, {"name": "street"})
+    process, notes = fit_powers(rows_of(data, np.arange(80)), data.site)
+    assert process.trend.law is not None and "a distance law" in notes[0]
+    near, far = np.array([[0.0, 400.0, 1.5], [0.0, 2400.0, 1.5]]) - data.site.origin
+    mean, *_ = process.mean_and_variance(np.stack([near, far]))
+    assert mean[0] - mean[1] > 10

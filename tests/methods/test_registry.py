@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from gsparc.data import instantiate
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import Method
 from gsparc.methods.registry import METHODS, build, method_class
@@ -60,3 +61,13 @@ def test_text_from_a_file_builds_our_classes_only(target, tmp_path):
         with pytest.raises(ValueError, match="refused"):
             build(config, trusted=False)
     assert build({"_target_": "gsparc.methods.gp.GaussianProcess"}, trusted=False).limit > 0
+
+
+def test_entry_points_of_plugins_were_read_for_every_class_of_a_checkpoint(monkeypatch):
+    """65 times for a model of four stations: most of the seconds of `gsparc.load`."""
+    monkeypatch.setattr(instantiate, "plugins", lambda group: pytest.fail("entry points are read"))
+    instantiate.refuse_foreign("gsparc.methods.gp.GaussianProcess")
+    monkeypatch.setattr(instantiate, "plugins", lambda group: {})
+    for path in ("gsparc.data.instantiate.find", "os.system", "gsparc.methods.gp.torch.nn.Linear", None):
+        with pytest.raises(ValueError, match="not a class of gsparc"):
+            instantiate.refuse_foreign(path)

@@ -1,5 +1,6 @@
 """The method end to end on rooms whose every source is known."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -13,11 +14,14 @@ from shoeboxes import as_arrays
 from gsparc import load
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
+from gsparc.field.conditional import StackedField
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
+from gsparc.methods.predictor import Predictor
 from gsparc.methods.registry import method_class
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.rows import gather
+from gsparc.multipath.source_field import SourceField
 
 QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0}
 
@@ -71,10 +75,7 @@ def test_paths_sum_to_the_prediction(small, tmp_path):
     predictor = load(tmp_path / "m.ckpt")
     world = data.moving[fold.test[:5]] + data.site.origin
     found = predictor.paths(rx=world)
-    frequency = np.atleast_1d(data.site.subcarriers_hz)[:, None]
-    turns = (frequency - found.reference_hz) * found.delay_s[:, :, None]
-    waves = found.gain[:, :, None] * np.exp(-2j * np.pi * turns)
-    summed = (waves * found.reference_hz / frequency).sum(-1)
+    summed = found.channel(data.site.subcarriers_hz)
     assert np.allclose(summed, predictor.csi(rx=world), atol=1e-3 * np.abs(summed).max())
     loudest = np.abs(found.gain[:, 0]).argmax(1)
     towards = data.tx[fold.test[:5]] - data.moving[fold.test[:5]]
@@ -82,6 +83,19 @@ def test_paths_sum_to_the_prediction(small, tmp_path):
     rows = np.arange(5)
     assert np.abs((found.direction[rows, loudest] * towards).sum(1) / distance - 1).max() < 1e-3
     assert np.abs(found.delay_s[rows, 0, loudest] * 299_792_458.0 - distance).max() < 0.05
+
+
+def test_paths_of_averaged_solutions_were_those_of_the_heaviest(small):
+    _, data, fold, method, _ = small
+    other = copy.deepcopy(method)
+    other.weights = 0.5 * other.weights
+    model = method_class("gsparc")()
+    model.site, model.field = data.site, StackedField([SourceField(method), SourceField(other)], [0.6, 0.4])
+    predictor, world = Predictor(model, data.site), data.moving[fold.test[:5]] + data.site.origin
+    channel, found = predictor.csi(rx=world), predictor.paths(rx=world)
+    assert found.direction.shape[1] == found.gain.shape[2] >= 14
+    summed = found.channel(data.site.subcarriers_hz)
+    assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
 
 
 def _shifted(data, index, metres):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from campaigns import compose
@@ -11,6 +13,7 @@ from towns import town_model
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
 from gsparc.maps.field_map import FieldMap
+from gsparc.methods import checkpoint
 from gsparc.view.building import SPLATS, Given, build
 from gsparc.view.viewed import open_viewed
 
@@ -78,6 +81,18 @@ def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
     assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
     scene = build(viewed, Given(), "west", viewed.measured("west"))
     assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
+
+
+def test_powers_in_dbm_were_shown_in_db_by_default(monkeypatch):
+    read = checkpoint.read
+    monkeypatch.setattr(checkpoint, "read", lambda path: in_dbm(read(path)))
+    given = compose("ckpt=x", config="view").unit
+    viewed = open_viewed(town_model(), {"file": "gone.npz"}, "west", given)
+    assert viewed.unit == "dBm" and open_viewed(town_model(), {"file": "gone.npz"}, unit="dBW").unit == "dBW"
+
+
+def in_dbm(stored):
+    return replace(stored, site=replace(stored.site, level_unit="dBm"))
 
 
 def test_test_rows_have_errors_and_training_rows_have_none(power_view):

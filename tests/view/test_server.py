@@ -305,6 +305,13 @@ def test_a_page_says_what_it_is_and_what_it_cannot_do(power_view):
     assert text.rstrip().endswith("</html>") and len(text) > 500_000
 
 
+def test_a_page_showed_one_of_several_stations(power_view):
+    text = page(power_view, steps=8)
+    assert "for 2 of 2 stations (west, east), one after another" in text and "plays 8 recorded places" in text
+    assert "west: measured received power" in text and "east: measured received power" in text
+    assert "for 1 of 2 stations (west); station=NAME shows another" in page(power_view, steps=2)
+
+
 @pytest.mark.slow
 def test_a_page_opens_from_its_file_and_asks_for_nothing(browser, tmp_path, spectrum_view):
     file = tmp_path / "page.html"

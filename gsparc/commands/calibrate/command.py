@@ -11,7 +11,16 @@ from rich.table import Table
 
 from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.commands.calibrate.pictures import draw
-from gsparc.commands.calibrate.trial import How, Trial, accept, divisible, too_few, trials
+from gsparc.commands.calibrate.trial import (
+    MOST_LAX_DB,
+    How,
+    Trial,
+    accept,
+    divisible,
+    laxer,
+    too_few,
+    trials,
+)
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.campaigns.argos import published_figures, published_normalisation
@@ -54,8 +63,8 @@ def store(
     kind: str,
     spatial: bool,
     seed: int,
-) -> Trusted:
-    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model."""
+) -> tuple[Trusted, str]:
+    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; and how it went."""
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     evidence = gather(method, data, fold, rows_of(fold, "test"))
@@ -63,7 +72,19 @@ def store(
     threshold = threshold_of(used, found)
     stored = Trusted(used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
     keep(path, stored)
-    return stored
+    if np.isfinite(threshold):
+        return stored, f"accepted from {threshold:.4g}"
+    if too_few(len(evidence), promise) is not None:
+        return stored, "no threshold keeps the bound"
+    bad, limit = promise.bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
+    other = laxer(evidence, promise, kind, spatial, seed)
+    hint = (
+        f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
+    )
+    return stored, (
+        f"no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse than {limit}, "
+        f"and the others are not told from them surely enough; {hint} kept, more training rows may help"
+    )
 
 
 def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened:
@@ -136,10 +157,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.store:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for path in paths:
-            stored = store(path, settings["dataset"], settings["split"], *how)
+            stored, bound = store(path, settings["dataset"], settings["split"], *how)
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
-            bound = "no threshold keeps the bound" if threshold is None else f"accepted from {threshold:.4g}"
             stored_lines.append(f"{path}: confidence={stored.kind}, {bound}")
         write_summary(run_dir / "summary.json", facts)
     show(run_dir, *tables(facts, evidence, found), lines=stored_lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from gsparc.methods.risk_threshold import Promise, Threshold, binomial_interval,
 
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
+MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
 CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
 
 
@@ -114,6 +115,15 @@ def too_few(count: int, promise: Promise) -> str | None:
         f"{count} test positions can promise nothing: alpha={promise.alpha:g}, delta={promise.delta:g} need "
         f"{promise.least} good ones to calibrate on, {needed} in all; measure more, or promise less"
     )
+
+
+def laxer(evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int) -> Promise | None:
+    """The same promise with the least larger limit, in whole decibels, that these positions keep; or None."""
+    for limit in range(int(np.floor(promise.limit_db)) + 1, MOST_LAX_DB + 1):
+        other = replace(promise, limit_db=float(limit))
+        if np.isfinite(accept(evidence, other, kind, spatial, seed)[1].value):
+            return other
+    return None
 
 
 def _units(evidence: Evidence, how: How) -> np.ndarray:

@@ -28,8 +28,9 @@ from gsparc.evaluation.summary import provenance, table, write_samples, write_su
 from gsparc.methods import checkpoint, stored_front
 from gsparc.methods.method import Method
 from gsparc.methods.pareto import Point, cost_of_halving, front, worded
+from gsparc.methods.per_station import PerStation
 from gsparc.methods.predictor import Predictor
-from gsparc.methods.reduced import combinations, contributions, reduced
+from gsparc.methods.reduced import combinations, contributions, knobs, reduced
 from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
 from gsparc.training import tracking
 
@@ -82,7 +83,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     with tracking.opened(config.logger) as loggers:
         tracking.picture(loggers, "operating points", run_dir / "tradeoff.png", 0)
         tracking.table(loggers, "operating points", heads, lines)
-    show(run_dir, table(title, ["not beaten"], heads[1:], lines), lines=_slope(facts))
+    show(run_dir, table(title, ["not beaten"], heads[1:], lines), lines=[*_alone(method), *_slope(facts)])
     for p in best:
         other = beaten_by(p, beside, figure)
         if other is not None:
@@ -179,6 +180,16 @@ def _cells(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]]:
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
         rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
     return ["point", "ms p50", "ms p95", figure, "difference to full"], rows
+
+
+def _alone(method: Method) -> list[str]:
+    """What is said where there is nothing to weigh against time."""
+    if knobs(method):
+        return []
+    why = "it has no Gaussians, sources, components or variances to spare"
+    if isinstance(method, PerStation):
+        why = "one of several stations is asked as it was trained"
+    return [f"{method.name}: nothing of it can be reduced, so that there is one point ({why})"]
 
 
 def _slope(facts: dict[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import html
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,18 +16,19 @@ from gsparc.view.building import PATHS, SPHERE, rays_of
 from gsparc.view.panel import panel_image
 from gsparc.view.plane import refining, sheet
 from gsparc.view.reasons import Usual
-from gsparc.view.scene import EXTENT, Legend, Points, Scene, Sheet
+from gsparc.view.scene import EXTENT, Legend, Part, Points, Scene, Sheet
 from gsparc.view.server.draw import draw, first_view, floor
 from gsparc.view.site_view import SiteView, walk
 from gsparc.view.words import ENDS, headline, legend_html
 
-STEPS = 24  # places of the walk
+STEPS = 24  # places of the walk, of all stations together
+LEAST = 4  # of each station
 PAUSE_S = 0.6  # at each
 UP = 0.17  # widths that the camera looks above the middle, for the panel that stands behind
 LIMITS = (
     "A saved scene: nothing is computed here. Drag to turn it, scroll to come nearer; the bar at the bottom "
-    "plays {steps} recorded places of the {end}. To drag it anywhere, to change the operating point or to "
-    "lift the plane: gsparc view ckpt=FILE."
+    "plays {steps} recorded places of the {end}{stations}. To drag it anywhere, to change the operating "
+    "point or to lift the plane: gsparc view ckpt=FILE."
 )
 
 
@@ -34,7 +36,7 @@ def page(view: SiteView, steps: int = STEPS) -> str:
     """The page as text; about 1 MB, most of it the viewer.
 
     Args:
-        view: the model; its first station is shown.
+        view: the model; its stations are shown one after another, as many as get `LEAST` places.
         steps: places of the walk.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # viser's banner, of a server that nobody is to visit
@@ -48,44 +50,69 @@ def page(view: SiteView, steps: int = STEPS) -> str:
 
 
 def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
-    name = view.viewed.stations[0]
-    one, viewed, api = view.station(name), view.viewed, server.scene
-    scene, moving = one.scene, viewed.moving[-1]
+    viewed, api = view.viewed, server.scene
+    names = viewed.stations[: max(steps // LEAST, 1)]
     api.set_up_direction("+z")
     first_view(server.initial_camera, 0.0, UP)
-    for part in scene.parts:
-        if part.name not in scene.hidden:
-            draw(api, scene.frame, part)
+    scene, moving = view.station(names[0]).scene, viewed.moving[-1]
     side = floor(api, scene)
-    legends = [legend for part, legend in scene.legends.items() if part not in scene.hidden]
-    if view.grid is not None:
-        *_, plane = refining(viewed.asked(name), view.grid, _other(view))
-        assert plane is not None
-        legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
-        legends.append(legend)
-        draw(api, scene.frame, sheet("plane", view.grid, plane.level_db, legend, one.dot / 2))
-    places = walk(view, name, steps)
-    answers = [ask(viewed.asked(name), {**view.starts(name), moving: place}) for place in places]
+    nodes, legends = _still(api, view, names[0], {})
     recorder = server.get_scene_serializer()
     dot = api.add_icosphere("/end", radius=0.016 * EXTENT, color=(214, 39, 40))
     label = api.add_label("/end/says", "", position=(0, 0, 0.03 * EXTENT), anchor="bottom-center")
-    sphere = view.sphere(name)
-    for place, answer in zip(places, answers, strict=True):
-        dot.position = scene.frame.drawn(place)
-        label.text = headline(answer, view.unit)
-        if sphere is not None and answer.spectrum is not None and "rx" in answer.ends:
-            dots = Points(
-                SPHERE, answer.ends["rx"] + sphere.offsets, sphere.colours(answer.spectrum), sphere.size
+    count = 0
+    for name in names:
+        if name != names[0]:
+            nodes, more = _still(api, view, name, nodes)
+            legends += more
+        sphere, extent = view.sphere(name), view.extent(name)
+        for place in walk(view, name, steps // len(names)):
+            answer = ask(viewed.asked(name), {**view.starts(name), moving: place})
+            dot.position = scene.frame.drawn(place)
+            label.text = (
+                headline(answer, view.unit) if len(names) == 1 else f"{name}: {headline(answer, view.unit)}"
             )
-            draw(api, scene.frame, dots)
-        if (rays := rays_of(answer, view.extent(name))) is not None:
-            legends = [*legends, PATHS] if PATHS not in legends else legends
-            for part in rays:
-                draw(api, scene.frame, part)
-        draw(api, scene.frame, _upright(answer, view, one.about.usual, scene.frame.middle, view.extent(name)))
-        recorder.insert_sleep(PAUSE_S)
-    said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=len(places), end=ENDS[moving])]
-    return recorder.as_html(), _side_panel(scene, said, legends)
+            parts: list[Part] = list(rays_of(answer, extent) or ())
+            legends += [PATHS] if parts else []
+            if sphere is not None and answer.spectrum is not None and "rx" in answer.ends:
+                around = answer.ends["rx"] + sphere.offsets
+                parts.append(Points(SPHERE, around, sphere.colours(answer.spectrum), sphere.size))
+            usual = view.station(name).about.usual
+            parts.append(_upright(answer, view, usual, scene.frame.middle, extent))
+            nodes |= {part.name: draw(api, scene.frame, part) for part in parts}
+            recorder.insert_sleep(PAUSE_S)
+            count += 1
+    shown = ""
+    if len(viewed.stations) > 1:
+        shown = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
+        shown += (
+            "; station=NAME shows another" if len(names) < len(viewed.stations) else ", one after another"
+        )
+    said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=shown)]
+    title = scene.title if len(names) == 1 else scene.title.removesuffix(f": {names[0]}")
+    return recorder.as_html(), _side_panel(replace(scene, title=title), said, legends)
+
+
+def _still(
+    api: Any, view: SiteView, name: str | None, before: dict[str, Any]
+) -> tuple[dict[str, Any], list[Legend]]:
+    """Draw what stands still of a station in place of the nodes `before`; its nodes, and their colours."""
+    for node in before.values():
+        node.remove()
+    one = view.station(name)
+    scene = one.scene
+    nodes = {part.name: draw(api, scene.frame, part) for part in scene.parts if part.name not in scene.hidden}
+    legends = [legend for part, legend in scene.legends.items() if part not in scene.hidden]
+    if view.grid is not None:
+        *_, plane = refining(view.viewed.asked(name), view.grid, _other(view))
+        assert plane is not None
+        legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
+        legends.append(legend)
+        level = sheet("plane", view.grid, plane.level_db, legend, one.dot / 2)
+        nodes["plane"] = draw(api, scene.frame, level)
+    if len(view.viewed.stations) > 1:
+        legends = [replace(legend, label=f"{name}: {legend.label}") for legend in legends]
+    return nodes, legends
 
 
 def _other(view: SiteView) -> list[float] | None:

@@ -12,12 +12,14 @@ import pytest
 import torch
 from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
+from towns import town_model
 
 import gsparc
-from gsparc.commands.tradeoff.command import task
+from gsparc.commands.tradeoff.command import _alone, task
 from gsparc.commands.tradeoff.sweep import Recorded, closeness
 from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint, operating_point, stored_front
+from gsparc.methods.distance_law import DistanceLaw
 from gsparc.methods.pareto import Point
 from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.training import tracking
@@ -146,3 +148,15 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         stored_front.keep(ckpt, [point], "psnr_db", {})
     assert ckpt.read_bytes() == before and list(tmp_path.iterdir()) == [ckpt]
+
+
+def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
+    whole = gsparc.load(town_model())
+    method, single = whole.method, whole.at("west").method
+    assert "of several stations is asked as it was trained" in _alone(method)[0]
+    assert "no Gaussians, sources" in _alone(DistanceLaw())[0] and not _alone(single)
+
+
+def test_a_model_of_several_stations_could_not_be_timed():
+    ask = gsparc.load(town_model()).cycling(np.array([[10.0, 20.0, 1.5], [30.0, 20.0, 1.5]]))
+    assert ask(0) > 0 and ask(1) != ask(2)
