@@ -41,7 +41,7 @@ def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
 def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path):
     """Published cells would vanish from the table with every edit of a method."""
     cell = Cell("toy", "random", "gp", None, None)
-    problem = Problem("toy", "random", "spectrum", ("d", "s"))
+    problem = Problem("toy", "random", "spectrum", ("d", "s", "i"))
     prepared = Prepared(cell, problem, None, tmp_path / "toy-random-gp-today")
     facts = {
         "seed": None, "budget_s": None, "git": "0123456789",
@@ -53,6 +53,9 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
         (tmp_path / name / "cell.json").write_text(json.dumps({**facts, **changes}))
 
     write("toy-random-gp-other", **{"dataset/sha256": "e"})
+    write("toy-random-gp-grid", **{"dataset/identity": "of another grid"})
+    write("toy-random-gp-cut")
+    (tmp_path / "toy-random-gp-cut" / "cell.json").write_text("{")
     assert prepared.found() is None and prepared.found_earlier() is None
     write("toy-random-gp-old", made="2026-01-01")
     write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
@@ -61,6 +64,9 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     write("toy-random-gp-today")
     assert prepared.found().earlier is None
     random, sparse = SplitChoice("random"), SplitChoice("sparse")
+    for name in ("old", "newer", "today"):
+        kept = {**facts, "dataset/identity": "i"}
+        (tmp_path / f"toy-random-gp-{name}" / "cell.json").write_text(json.dumps(kept))
     assert stored_problems(tmp_path, "toy", [random, sparse]) == [problem]
     assert not stored_problems(tmp_path, "t", [random])
 
@@ -82,7 +88,7 @@ def test_an_unknown_setting_of_a_split_is_named():
 @pytest.mark.parametrize("model", ["gsparc", "moving_array"])
 def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_path):
     """A model was trained as if there were no budget: one of 5 s was found again as one of 60 s."""
-    problem = Problem("own", "random", "spectrum", ("d", "s"))
+    problem = Problem("own", "random", "spectrum", ("d", "s", "i"))
     contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         short, long = (
@@ -95,7 +101,7 @@ def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_
 @pytest.mark.parametrize("model", ["gsparc", "auto", "moving_array"])
 def test_every_seed_is_a_cell_of_its_own(model, tmp_path):
     """The first seed of gsparc stood for all three: a spread of 0.00."""
-    problem = Problem("own", "random", "spectrum", ("d", "s"))
+    problem = Problem("own", "random", "spectrum", ("d", "s", "i"))
     contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         folders = [
