@@ -197,7 +197,9 @@ def test_two_comparisons_at_once_share_their_cells(tmp_path):
     assert sorted(one.returncode for one in done) == [0, 0, 1], [one.stderr[-300:] for one in done]
     (told,) = (one.stderr for one in done if one.returncode)
     assert "another run writes here" in told and "Traceback" not in told
-    filled = [line for one in done for line in one.stdout.splitlines() if " dB after " in line]
+    filled = [
+        line for one in done for line in one.stdout.splitlines() if line[0:1] == "[" and " dB after " in line
+    ]
     assert len(filled) == 3, "each by one of them"
     tables = [(run / "compare.csv").read_text().splitlines() for run in runs[:2]]
     assert [line.split(",")[:5] for line in tables[0]] == [line.split(",")[:5] for line in tables[1]]
