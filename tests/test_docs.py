@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
+from pages import FOLDERS, PAGES, PRESENT, ROOT, commands, said
 
-from gsparc.commands.listing import COMMANDS
 from gsparc.commands.plugins import offer_scenes
 from gsparc.methods.registry import METHODS
 from gsparc.simulate.scenes.shipped import shipped
 
-ROOT = Path(__file__).parents[1]
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
-TOP = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG")]
 SITE = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-FOLDERS = ("docs", "docs/tutorials", "docs/reference")
-PAGES = [*TOP, *(page for folder in FOLDERS for page in sorted((ROOT / folder).glob("*.md")))]
-PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]  # which also speaks of names that are gone
 PER_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}/{page.name}")
 TODAY = pytest.mark.parametrize("page", PRESENT, ids=lambda page: f"{page.parent.name}/{page.name}")
 README_LINES = 150
@@ -74,40 +68,11 @@ def test_headings_that_are_linked_exist(page):
             assert anchor in anchors(page.parent / link if link else page), f"{link}#{anchor}"
 
 
-def said(page: Path) -> list[str]:
-    """Lines of code blocks without a language, and inline code."""
-    text = page.read_text(encoding="utf-8")
-    blocks = re.findall(r"^ *```\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
-    inline = re.findall(r"`([^`]+)`", re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE))
-    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
-    return lines + [code.replace("\n", " ") for code in inline]
-
-
 @PER_PAGE
 def test_whoever_installed_a_wheel_stopped_at_a_file_of_the_clone(page):
     """Most pages of the site said `python train.py`."""
     if page.parent.name == "docs":
         assert not re.search(r"python train\.py (?!\.\.\.)", page.read_text(encoding="utf-8"))
-
-
-COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
-
-
-def commands() -> dict[tuple[str, ...], str]:
-    """Configuration and overrides of every command in the documents, and the line it stands in."""
-    found = {}
-    for line in dict.fromkeys(line.strip() for page in PRESENT for line in said(page)):
-        match = COMMAND.match(line)
-        if match is None:
-            continue
-        name = match["name"] or "train"
-        assert name in COMMANDS, line
-        words = shlex.split(match["rest"], comments=True)
-        given = [word for word in words if "=" in word or word.startswith("~")]
-        given = [word for word in given if not word.endswith(("=NAME", "=..."))]
-        # Of the values of a sweep the first.
-        found[name, *(word if "[" in word else word.partition(",")[0] for word in given)] = line
-    return {key: line for key, line in found.items() if (ROOT / "conf" / f"{key[0]}.yaml").exists()}
 
 
 def test_commands_compose():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import logging
 from dataclasses import fields
 from pathlib import Path
@@ -11,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.array.phase_retrieval import Recovered, recover
+from gsparc.data.assemble import identity
 from gsparc.data.files import whole_file
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Measurements
 from gsparc.methods.target_rows import training_targets
 from gsparc.methods.time_budget import Spent, TimeBudget
 
@@ -37,7 +37,7 @@ def recovered(
         cache: folder; None for no cache.
         seed: of the random starts.
     """
-    path = None if cache is None else Path(cache) / f"array-v{VERSION}" / f"{_key(data.site)}.npz"
+    path = None if cache is None else Path(cache) / f"array-v{VERSION}" / f"{identity(data)[:24]}.npz"
     known = _read(path, len(data))
     have = np.zeros(len(data), dtype=bool) if known is None else known["wall"] >= 0
     missing = rows[~have[rows]]
@@ -76,14 +76,6 @@ def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) 
             "%d spectra do not fit this array (see %s): %s%s",
             len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
         )  # fmt: skip
-
-
-def _key(site: Site) -> str:
-    assert site.array is not None
-    facts = f"{site.sha256} {site.wavelength!r} {site.normalisation} {site.grid} "
-    return hashlib.sha256(
-        facts.encode() + np.ascontiguousarray(site.array, dtype="<f8").tobytes()
-    ).hexdigest()[:24]
 
 
 def _empty(count: int, like: Recovered) -> dict[str, np.ndarray]:

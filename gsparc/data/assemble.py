@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -78,6 +78,26 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
         for part in contents(array):
             digest.update(part)
     return digest.hexdigest()
+
+
+def identity(data: Measurements) -> str:
+    """SHA-256 of all that a method learns from, for the names of kept results.
+
+    The content hash of a site (`Site.sha256`) is of the measurements alone: on another grid, in another unit
+    or about another origin they are other data.
+    """
+    directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
+    auxiliary = content_hash({**directions, "uplink": data.uplink})
+    return hashlib.sha256(f"{_told(data.site)} {auxiliary}".encode()).hexdigest()
+
+
+def _told(fact: Any) -> str:
+    """A fact of a site as text: the same before and after a checkpoint."""
+    if isinstance(fact, np.ndarray):
+        return content_hash({"": fact})
+    if is_dataclass(fact):
+        return str({one.name: _told(getattr(fact, one.name)) for one in fields(fact)})
+    return repr(fact.item() if isinstance(fact, np.generic) else fact)
 
 
 def assemble(

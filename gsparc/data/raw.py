@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,41 @@ def is_archive(path: Path) -> bool:
         return zipfile.is_zipfile(path)
     except zipfile.BadZipFile:  # a damaged directory of a large archive
         return False
+
+
+def stored_archive(path: Path) -> BytesIO:
+    """What `torch.save` wrote, written anew from bytes whose checksums are right.
+
+    torch looks at no checksum, takes entries marked as folders for read, and inflates what is deflated
+    whatever its size.
+
+    Raises:
+        ValueError: it is damaged, or nothing that torch writes.
+    """
+    clean = BytesIO()
+    if not is_archive(path):
+        raise ValueError("not a gsparc checkpoint, or cut short")
+    try:
+        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(clean, "w") as copy:
+            entries = archive.infolist()
+            names = {entry.filename for entry in entries}
+            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+            size = sum(entry.file_size for entry in entries)
+            wrong = None
+            if not any(name.endswith("/data.pkl") for name in names):
+                wrong = "an archive, but not a gsparc checkpoint"
+            elif len(names) < len(entries):
+                wrong = "damaged (an entry is there twice)"
+            elif not stored or size > path.stat().st_size:
+                wrong = "damaged (entries are compressed, or larger than the file)"
+            for entry in () if wrong else entries:
+                copy.writestr(entry.filename, archive.read(entry))
+    except Exception as error:  # whatever a damaged archive raises
+        wrong = f"damaged ({type(error).__name__}: {error})"
+    if wrong:
+        raise ValueError(wrong)
+    clean.seek(0)
+    return clean
 
 
 def _read_npz(path: Path) -> Raw:

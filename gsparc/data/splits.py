@@ -111,6 +111,8 @@ class SplitSettings:
             close = difflib.get_close_matches(self.name, [*NAMES, "file"], n=1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
             raise DataError(f"split: {self.name!r} is none of {', '.join(NAMES)}, file{hint}")
+        if not isinstance(self.seed, int):
+            raise DataError(f"split.seed={self.seed}: a whole number is needed")
         spacing, count = self.spacing_m, self.train_count
         for key, good, expected in (
             ("test_fraction", 0 < self.test_fraction < 1, "a share between 0 and 1"),

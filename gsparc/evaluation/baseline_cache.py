@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.data.assemble import identity
 from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
@@ -75,10 +76,7 @@ def baseline(
     """
     unseen = eval_on == "val"
     # The same data may be in another model's local coordinates and units, and count its stations.
-    stations = data.site.stations
-    listed = "" if stations is None else f" {stations.name} {stations.position.tolist()}"
-    frame = f"{data.site.origin.tolist()} {data.site.target_scale}{listed}"
-    key = hashlib.sha256(f"{data.site.sha256} {split.sha256} {frame}".encode()).hexdigest()[:24]
+    key = hashlib.sha256(f"{identity(data)} {split.sha256}".encode()).hexdigest()[:24]
     folder = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key
     folder = folder and folder / (f"{name}-train" if unseen else name)
     methods, seconds = [], []

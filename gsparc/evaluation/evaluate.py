@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.assemble import identity
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
@@ -162,6 +163,7 @@ def dataset_facts(data: Measurements) -> dict[str, Any]:
     seconds = data.provenance.get("simulate_s")
     return {
         **{f"dataset/{name}": getattr(data.site, name) for name in names},
+        "dataset/identity": identity(data),
         "dataset/rows": len(data),
         "dataset/simulate_s": None if seconds is None else float(seconds),
     }

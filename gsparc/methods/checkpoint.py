@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import pickle
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ import yaml
 from torch import Tensor
 
 from gsparc.data.files import whole_file
-from gsparc.data.raw import is_archive
+from gsparc.data.raw import stored_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.methods.method import Method
 from gsparc.methods.old_names import OLD_NAMES, renamed
@@ -28,6 +26,7 @@ from gsparc.ops import SphereGrid
 
 SCHEMA_VERSION = 1
 FORMAT = "gsparc-checkpoint"
+DEEPEST = 50  # of containers in containers
 MODEL = "model.ckpt"  # of a run's folder
 SEARCHES = "searches"  # what `gsparc.multipath.search_cache` calls its own in a last.ckpt
 
@@ -63,10 +62,17 @@ class Stored:
         """The configuration as plain containers; empty when there was none.
 
         Raises:
-            CheckpointError: it is not YAML.
+            CheckpointError: it is not YAML, or has aliases.
         """
         try:
+            events = yaml.parse(self.config, yaml.SafeLoader) if "*" in self.config else ()
+            if any(isinstance(event, yaml.AliasEvent) for event in events):
+                raise CheckpointError(
+                    f"{self.path}: its configuration has YAML aliases, which gsparc never writes"
+                )
             loaded = yaml.safe_load(self.config) or {}
+        except CheckpointError:
+            raise
         except (yaml.YAMLError, RecursionError, ValueError):
             damaged = f"{self.path}: its configuration is not YAML; the file is damaged"
             raise CheckpointError(damaged) from None
@@ -150,9 +156,11 @@ def _content(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint")
     try:
-        content = torch.load(_checked(path), map_location="cpu", weights_only=True)
-    except CheckpointError:
-        raise
+        archive = stored_archive(path)
+    except ValueError as refused:
+        raise CheckpointError(f"{path}: {refused}") from None
+    try:
+        content = torch.load(archive, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:
         raise CheckpointError(
             f"{path}: holds Python objects that a checkpoint never holds; not loaded, it could run code"
@@ -172,6 +180,8 @@ def _content(path: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: written in schema {version}, this gsparc reads up to {SCHEMA_VERSION}; update gsparc"
         )
+    if _overgrown(content):  # what walks over it would not end
+        raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")
     for part in ("site", "state"):
         where = non_finite(_without_unknown_places(content.get(part)), part)
         if where is not None:  # its checksum is right: it was written like this
@@ -202,31 +212,6 @@ def _stored(content: Mapping[str, Any], path: Path) -> Stored:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
-
-
-def _checked(path: Path) -> BytesIO:
-    """The archive, written anew from bytes whose checksums are right.
-
-    torch looks at no checksum, and takes entries marked as folders for read without reading them.
-    """
-    clean = BytesIO()
-    try:
-        if not is_archive(path):
-            raise CheckpointError(f"{path}: not a gsparc checkpoint, or cut short")
-        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(clean, "w") as copy:
-            names = archive.namelist()
-            if not any(name.endswith("/data.pkl") for name in names):
-                raise CheckpointError(f"{path}: an archive, but not a gsparc checkpoint")
-            if len(set(names)) < len(names):
-                raise CheckpointError(f"{path}: damaged (an entry is there twice)")
-            for name in names:
-                copy.writestr(name, archive.read(name))
-    except CheckpointError:
-        raise
-    except Exception as error:  # whatever a damaged archive raises
-        raise CheckpointError(f"{path}: damaged ({type(error).__name__}: {error})") from None
-    clean.seek(0)
-    return clean
 
 
 def restore(stored: Stored) -> Method:
@@ -290,6 +275,23 @@ def _as_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
         k: v.numpy() if isinstance(v, Tensor) else _as_numpy(v) if isinstance(v, Mapping) else v
         for k, v in facts.items()
     }
+
+
+def _overgrown(content: Any) -> bool:
+    """Whether a container is in it twice or too deep, or a tensor has more numbers than are stored."""
+    left, seen = [(content, 0)], set[int]()
+    while left:
+        value, depth = left.pop()
+        if isinstance(value, Tensor):
+            if value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
+                return True
+        elif isinstance(value, (Mapping, list, tuple)) and value:
+            if id(value) in seen or depth > DEEPEST:
+                return True
+            seen.add(id(value))
+            parts = value.values() if isinstance(value, Mapping) else value
+            left += [(part, depth + 1) for part in parts]
+    return False
 
 
 def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:

@@ -25,6 +25,7 @@ from gsparc.data.schema import Site
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Prediction
 from gsparc.methods.target_rows import entry_variance, to_real
+from gsparc.methods.worker import stop_when_late
 from gsparc.ops import Pose
 
 EXPONENTS = (0.0, 8.0)  # bounds of n: 2 in free space, 6 through many walls
@@ -211,7 +212,9 @@ def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
         place = place + 0.05 * size * (high - low <= 1e-3 * size)  # in the plane itself heights have no slope
         decades = 0.5 * np.log10(((place - rows.places) ** 2).sum(1) + tiny)
         start = np.concatenate([_start(decades, rows), place / size])
-        found.append(minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits))
+        found.append(
+            minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late)
+        )
     return min(found, key=lambda one: float(one.fun)).x[3:] * size
 
 

@@ -42,6 +42,7 @@ from gsparc.methods.power_process import (
 )
 from gsparc.methods.reduced import View
 from gsparc.methods.target_rows import entry_variance, from_real, to_real, training_targets
+from gsparc.methods.worker import stop_when_late
 from gsparc.ops import Pose
 
 
@@ -157,7 +158,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     starts = [np.log([spread * share, 0.01]) for share in (0.01, 0.05, 0.25)]
     pace = {"ftol": 1e-5, "maxfun": 60}  # seconds a look for thousands of rows; the figures move by 1e-4
     start = min(starts, key=objective)
-    best = minimize(objective, start, method="L-BFGS-B", bounds=bounds, options=pace)
+    best = minimize(objective, start, method="L-BFGS-B", bounds=bounds, options=pace, callback=stop_when_late)
     length, noise = (float(value) for value in np.exp(best.x))
     return Kernel(length, noise, leave_one_out(Kernel(length, noise).gram(positions), scores, entries)[1])
 

@@ -15,6 +15,8 @@ import numpy as np
 from scipy.linalg import LinAlgError, blas, cholesky, lapack
 from scipy.optimize import minimize
 
+from gsparc.methods.worker import stop_when_late
+
 LENGTH_SPAN = (1e-3, 3.0)  # bounds of a length, of the median distance between rows
 NOISE_SPAN = (1e-6, 1e2)  # bounds of the noise's variance, of the amplitude
 SHARES = 6.0  # bound of the logit of a share
@@ -178,6 +180,8 @@ def choose(
     points = [np.clip(one.parameters(), low, high) for one in starts]
     start = min(points, key=lambda point: objective(point)[0]) if len(points) > 1 else points[0]
     pace = {"ftol": 5e-6, "maxfun": MOST_LOOKS}
-    best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=pace).x
+    best = minimize(
+        objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=pace, callback=stop_when_late
+    ).x
     value, amplitude, _ = left_out(kernel_of(best), distance, terms, values, bounded=True)
     return value, kernel_of(best, amplitude)

@@ -23,6 +23,7 @@ from gsparc.methods.nearest_process import NearestProcess, Values, given, settin
 from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, choose, kernel_of, slopes
 from gsparc.methods.trend import REACH, Trend, trend_of
+from gsparc.methods.worker import late, stop_when_late
 
 log = logging.getLogger(__name__)
 
@@ -198,12 +199,12 @@ def _settings(
     weighed = rows.at(draw(rows.silent, WEIGHED_ON, seed))
     both = weighed.silent.any() and not weighed.silent.all()
     found = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
-    if both:
+    if both and not late():
         found = [_weighed(weighed, one) for one in found]
     best = max(found, key=lambda one: one.score)
-    if len(loud.places) > len(few.places) and not both:
+    if len(loud.places) > len(few.places) and not both and not late():
         best = _refined(loud, best)
-    if len(loud.places) >= TWO_LENGTHS_NEED:
+    if len(loud.places) >= TWO_LENGTHS_NEED and not late():
         two = _two_lengths(loud, best)
         best = max((best, _weighed(weighed, two) if both else two), key=lambda one: one.score)
     count = len((weighed if both else loud).places)
@@ -280,7 +281,9 @@ def _weighed(rows: Rows, one: _Candidate) -> _Candidate:
     start = np.clip([*one.kernel.parameters(), math.log(one.kernel.amplitude)], low, high)
     pace = {"ftol": 1e-5, "maxfun": EVIDENCE_LOOKS}
     limits = list(zip(low, high, strict=True))
-    best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits, options=pace)
+    best = minimize(
+        objective, start, jac=True, method="L-BFGS-B", bounds=limits, options=pace, callback=stop_when_late
+    )
     kernel = kernel_of(best.x[:-1], math.exp(best.x[-1]))
     return replace(one, score=-float(best.fun) * len(values) - one.cost, kernel=kernel)
 

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, kernel_of
+from gsparc.methods.worker import stop_when_late
 
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
 MOST_LOOKS = 40
@@ -100,7 +101,9 @@ def most_likely(starts: list[PowerKernel], sample: Sample, apart: np.ndarray) ->
     start = min(points, key=lambda point: objective(point)[0])
     pace = {"ftol": 5e-6, "maxfun": MOST_LOOKS}
     bounds = list(zip(low, high, strict=True))
-    best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=pace).x
+    best = minimize(
+        objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=pace, callback=stop_when_late
+    ).x
     with torch.no_grad():
         amplitude = float(_density(torch.from_numpy(best), sample)[1])
     return kernel_of(best, amplitude)

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.methods.worker import ask
 from gsparc.multipath.gp_likelihood import Factor, steering
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.worker import ask
 from gsparc.physics.waves import LIGHT, NEAR_M
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache

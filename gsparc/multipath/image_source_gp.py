@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.assemble import identity
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import LeftOutRows
@@ -226,7 +227,7 @@ class ImageSourceGP(FramedMethod):
         """What a search depends on; neither the budget nor the number of searches."""
         settings = (self.search_rows, self.row_limit, self.offsets, self.clutter, self.settings)
         rows = sha256(b"".join(part.tobytes() for part in (known, *self._groups))).hexdigest()
-        return {"data": data.site.sha256, "rows": rows, "seed": str(self.seed), "settings": str(settings)}
+        return {"data": identity(data), "rows": rows, "seed": str(self.seed), "settings": str(settings)}
 
     def _budget(self, measurements: int, given_s: float | None) -> float:
         if given_s is not None:

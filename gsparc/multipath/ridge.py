@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.multipath.worker import ask
+from gsparc.methods.worker import ask
 
 # Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
 # covariance is at most its trace; entries that are sums are rounded several times.

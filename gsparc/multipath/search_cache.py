@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from gsparc.data.files import whole_file
+from gsparc.data.raw import stored_archive
 from gsparc.methods.checkpoint import SEARCHES
 from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget, less_repeatable
 from gsparc.multipath.phased_gp import PhasedScene
@@ -68,7 +69,7 @@ class SearchCache:
 
     def _open(self, file: Path) -> None:
         try:
-            stored = torch.load(file, weights_only=True)
+            stored = torch.load(stored_archive(file), weights_only=True)
             before, kept, wall = dict(stored["depends_on"]), dict(stored[SEARCHES]), float(stored["spent_s"])
             spent = Spent(wall, float(stored.get("processor_s", wall)))  # older files know one clock
         except Exception as error:  # any error of a damaged or foreign file

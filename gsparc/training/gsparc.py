@@ -29,7 +29,7 @@ from gsparc.methods.power_process import PowerProcess, approximated, exact
 from gsparc.methods.reduced import contributions, knobs, reduced
 from gsparc.methods.registry import field_initialiser, method_class
 from gsparc.methods.run_factors import RunFactors
-from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
+from gsparc.methods.time_budget import TimeBudget, less_repeatable
 from gsparc.ops import Pose
 from gsparc.training import process_average, solution_weights, solutions
 from gsparc.training.auto_settings import resolve
@@ -185,9 +185,7 @@ class Gsparc(LearnedField):
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
         _log_cost(stages, seconds)
         notes = [note for name in self.started.split("+") for note in reports[name].notes]
-        limited: Clock | None = None
-        for report in reports.values():
-            limited = less_repeatable(limited, report.limited_by)
+        limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
         return FitReport(seconds, tuple(notes), limited)
 
     def _aligned(self, data: Measurements, known: np.ndarray, context: FitContext) -> Measurements:

@@ -19,6 +19,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport
 from gsparc.methods.registry import field_initialiser
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.worker import late_when
 from gsparc.training import solution_weights
 from gsparc.training.solution_weights import LEAST_HELD, comparable
 from gsparc.training.terms import EffectSettings
@@ -71,7 +72,8 @@ def find(
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
             within = replace(within, leave_out=leave_out)
             clutter = effects.visibility is not False
-            field, report = field_initialiser(part)(data, rows, settings, clutter, within)
+            with late_when(budget.over):
+                field, report = field_initialiser(part)(data, rows, settings, clutter, within)
             if effects.residual is False and isinstance(field, CompletedField):
                 field = field.field
             found[name] = field

@@ -17,11 +17,12 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, channels, compose, powers, spectra
+from doors import knock
 from omegaconf import open_dict
 
 import gsparc
 from gsparc.commands import evaluate
-from gsparc.commands.train import Objects, train
+from gsparc.commands.train import Objects, main, train
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.methods import checkpoint
@@ -367,3 +368,27 @@ def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(tmp_pa
     assert list(media.glob("images/test rows*.png")) and list(media.glob("images/predictions*.png"))
     (table,) = (json.loads(file.read_text()) for file in media.glob("table/results*.json"))
     assert table["columns"][0] == "method" and "gsparc" in [row[0] for row in table["data"]]
+
+
+@pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
+def test_the_objective_is_for_searches_alone(tmp_path, way):
+    """One power heard of sixty: everything was written, then `error: objective=test/rmse_db`, exit 1."""
+    where = np.random.default_rng(0).uniform(0, 20, (60, 3))
+    heard = np.full(60, np.nan)
+    heard[7] = -60.0
+    np.savez(
+        tmp_path / "own.npz", rx_position=where, tx_position=np.zeros(3), rssi_db=heard, sensitivity_db=-90.0
+    )
+    folder = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'run'}"]
+    given = [
+        "dataset=own",
+        f"dataset.file={tmp_path / 'own.npz'}",
+        "model=mean",
+        "baselines=[]",
+        "logger=none",
+    ]
+    answer = knock(main, "train.py", [*way, *given, *folder, "threads=1", "split.seed=0"])
+    assert answer.status == 0 and not [line for line in answer.err if line.startswith("error")], answer
+    written = list((tmp_path / "run").rglob("summary.json"))
+    assert len(written) == (2 if way else 1)
+    assert all(json.loads(file.read_text())["test/rmse_db"] is None for file in written)

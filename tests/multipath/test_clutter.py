@@ -1,5 +1,7 @@
 """Paths, boxes and patches against the exact simulator and brute force; then learned in small rooms."""
 
+import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +10,7 @@ import torch
 from gains import gains
 from rooms import PILLAR, WAVELENGTH, shoebox
 
+from gsparc.methods.worker import Ended, ended_by
 from gsparc.multipath.clutter import finite_mirrors, search
 from gsparc.multipath.clutter.blocking import Clutter, Obstacles, tangents, visible_share
 from gsparc.multipath.clutter.boxes import find_box
@@ -233,6 +236,47 @@ def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
     with caplog.at_level("INFO"):
         assert find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 1e4 * _room(), 3) == []
     assert "no search for small mirrors" in caplog.text
+
+
+def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
+    """It looked at neither clock nor interrupt: `budget_s=60` was at 150 s and going."""
+    rows, scorer, _, numbers = _beside_a_table(60)
+    spent: list[float] = []
+
+    def unwanted() -> bool:
+        spent.append(time.thread_time())
+        return spent[-1] > spent[0] + 0.5
+
+    with ended_by(unwanted), pytest.raises(Ended):
+        find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 4 * _room(), 3)
+    assert max(np.diff([*spent, time.thread_time()])) < 0.5
+    room, cells = 20 * _room(), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            finite_mirrors, "_raster", lambda *a: cells.append((len(a[4]), a[7])) or _nothing(len(a[4]))
+        )
+        patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
+        find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers[:1], room, 3)
+    count = sum(planes for planes, _ in cells) * math.prod(
+        finite_mirrors._cells(room, finite_mirrors.tangents(WALLS[numbers[0]]), cells[0][1])
+    )
+    assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
+
+
+def _nothing(count: int) -> tuple:
+    return torch.zeros(count), torch.zeros(count, 4)
+
+
+def test_clutter_found_before_the_clock_is_kept_and_an_unwanted_search_ends():
+    """A round of everything went on after the clock; now each step is left in the middle."""
+    rows, *_ = _beside_a_table(60)
+    phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
+    looks: list[int] = []
+    late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
+    found = find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
+    assert isinstance(found, PhasedScene) and len(looks) < 60
+    with ended_by(lambda: True), pytest.raises(Ended):
+        find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
 
 
 def test_an_infinite_mirror_becomes_finite():

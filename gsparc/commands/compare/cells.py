@@ -178,15 +178,15 @@ def plan(
     ]
 
 
-def key(model: Mapping[str, Any], trainer: Mapping[str, Any], data_sha: str, split_sha: str) -> str:
+def key(model: Mapping[str, Any], trainer: Mapping[str, Any], *hashes: str) -> str:
     """Name of a result: what it was learned from, by what settings and by which program text.
 
     Args:
         model: its whole configuration.
         trainer: settings of the training around it, where it has any.
-        data_sha, split_sha: hashes of the measurements and of the folds.
+        hashes: see `Problem`.
     """
-    text = json.dumps([model, trainer, data_sha, split_sha, code_version(model)], sort_keys=True, default=str)
+    text = json.dumps([model, trainer, *hashes, code_version(model)], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 

@@ -31,7 +31,7 @@ from gsparc.commands.compare.problem import Problem, load_problems, split_choice
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.claims import each_once
-from gsparc.data.files import platform_cache
+from gsparc.data.files import no_room, platform_cache, whole_file
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
@@ -183,6 +183,8 @@ def fill_all(
             kept = "interrupted; finished cells are kept: the same command goes on with the others"
             raise KeyboardInterrupt(kept) from None
         except Exception as error:  # any error of a plugin: the other methods' table comes nevertheless
+            if no_room(error):  # the others would be trained in vain
+                raise
             unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
             log.warning("%s cannot be filled: %s", one.cell, one_line(error), exc_info=unforeseen)
             broken.add(str(one.cell))
@@ -222,9 +224,9 @@ def _timed(
         elif measure and present and problems[dataset, split].data is not None:
             log.info("%s: timing single queries of every method in turns", dataset)
             found[dataset] = latencies(present, problems[dataset, split])
-            file.parent.mkdir(parents=True, exist_ok=True)
             rows = {name: asdict(one) for name, one in found[dataset].items()}
-            file.write_text(json.dumps(rows, indent=2))
+            with whole_file(file) as partial:  # another comparison may read it
+                partial.write_text(json.dumps(rows, indent=2), encoding="utf-8")
             continue
         found[dataset] = {name: Latency(**values) for name, values in stored.items()}
     return found

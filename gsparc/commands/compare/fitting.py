@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import statistics
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.compare.cells import Cell, Contender, key
-from gsparc.commands.compare.problem import RESULT, Problem, compose
+from gsparc.commands.compare.problem import RESULT, Problem, compose, facts_of
 from gsparc.commands.context import context_of
 from gsparc.commands.settings import plain
 from gsparc.commands.study.run import fit_and_score, in_folders
@@ -90,11 +89,8 @@ class Prepared:
 
     def found(self) -> Filled | None:
         """The kept result, if there is a whole one."""
-        try:
-            facts = json.loads((self.folder / RESULT).read_text(encoding="utf-8"))
-        except (OSError, json.JSONDecodeError):
-            return None
-        return Filled(self.cell, self.folder, facts)
+        facts = facts_of(self.folder / RESULT)
+        return None if facts is None else Filled(self.cell, self.folder, facts)
 
     def found_earlier(self) -> Filled | None:
         """The latest result of other program text or settings for this cell, the same data and split.
@@ -103,10 +99,12 @@ class Prepared:
         """
         stem = self.folder.name.rpartition("-")[0]
         same: dict[str, Any] = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
-        same |= dict(zip(("dataset/sha256", "split/sha256"), self.problem.hashes, strict=True))
+        data, folds, whole = self.problem.hashes
+        same |= {"dataset/sha256": data, "split/sha256": folds}
         files = self.folder.parent.glob(f"{stem}-*/{RESULT}")
-        every = {file.parent: json.loads(file.read_text(encoding="utf-8")) for file in files}
+        every = {file.parent: facts_of(file) or {} for file in files}
         found = {path: f for path, f in every.items() if all(f.get(k) == v for k, v in same.items())}
+        found = {path: f for path, f in found.items() if f.get("dataset/identity", whole) == whole}
         if not found:
             return None
         folder, facts = max(found.items(), key=lambda item: item[1].get("made") or "")

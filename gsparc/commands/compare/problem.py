@@ -15,6 +15,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.settings import plain
+from gsparc.data.assemble import identity
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
@@ -58,7 +59,7 @@ class Problem:
     Attributes:
         dataset, split: names.
         kind: of the measurements.
-        hashes: of measurements and folds.
+        hashes: of the measurements alone, of the folds, and of the former with every fact of their site.
         draw: number of the split's draw; None where it is not drawn again.
         stations: whether there are several.
         scene: whether they name a scene that a ray tracer loads.
@@ -70,7 +71,7 @@ class Problem:
     dataset: str
     split: str
     kind: str
-    hashes: tuple[str, str]
+    hashes: tuple[str, str, str]
     draw: int | None = None
     stations: bool = False
     scene: bool = False
@@ -117,7 +118,7 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
             config = compose(settings, chosen, draw)
             data = load(plain(config.dataset)) if data is None else data
             folds = split_for(plain(config.split), data)
-            hashes = (data.site.sha256, folds.sha256)
+            hashes = (data.site.sha256, folds.sha256, identity(data))
             several = data.site.stations is not None and folds.name != "stations"
             known = names_scene(data.provenance)
             problems.append(
@@ -126,24 +127,34 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
     return problems
 
 
+def facts_of(result: Path) -> dict[str, Any] | None:
+    """What a kept result says; None where there is none, or no whole one."""
+    try:
+        found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found
+
+
 def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> list[Problem]:
     """The problems of a dataset that most kept results are of, one per draw of a split."""
     found = []
     for split in splits:
         files = sorted(kept.glob(f"{dataset}-{split.name}-*/{RESULT}"))
-        facts = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+        facts = [one for file in files if (one := facts_of(file)) is not None]
         for draw in split.numbers:
             known = Counter(
                 (
                     *(f[of] for of in ("dataset/kind", "dataset/sha256", "split/sha256")),
+                    f.get("dataset/identity", ""),  # earlier versions kept none
                     *(bool(f.get(f"problem/{of}")) for of in ("stations", "scene")),
                 )
                 for f in facts
                 if draw is None or f["seed"] == draw
             )
             if known:
-                kind, data, folds, several, scene = known.most_common(1)[0][0]
-                found.append(Problem(dataset, split.name, kind, (data, folds), draw, several, scene))
+                kind, data, folds, whole, several, scene = known.most_common(1)[0][0]
+                found.append(Problem(dataset, split.name, kind, (data, folds, whole), draw, several, scene))
     return found
 
 

@@ -32,7 +32,9 @@ def variants_of(config: DictConfig) -> list[Variant]:
     def maker(overrides: Any) -> Callable[[], Method]:
         return lambda: build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
 
-    found = [Variant(str(name), maker(overrides)) for name, overrides in config.variants.items()]
+    # Resolved first: an interpolation would take the place of the model's own settings, not join them.
+    given = plain(config.variants)
+    found = [Variant(str(name), maker(overrides)) for name, overrides in given.items()]
     return found + [Variant(name, method_class(name)) for name in config.baselines]
 
 

@@ -17,6 +17,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.position_encoder.autoencoder import Autoencoder, EncoderSettings, train
 from gsparc.data.position_encoder.features import features
+from gsparc.data.raw import stored_archive
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ def load(path: str | Path) -> Autoencoder:
     if not path.is_file():
         raise DataError(f"{path}: no such encoder")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(stored_archive(path), map_location="cpu", weights_only=True)
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
         model = Autoencoder(int(content["width"]), EncoderSettings(**content["settings"]))

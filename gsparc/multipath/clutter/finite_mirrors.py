@@ -14,12 +14,12 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from gsparc.methods.worker import ask
 from gsparc.multipath.clutter.blocking import tangents, within
 from gsparc.multipath.clutter.boxes import evolve
 from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.worker import ask
 from gsparc.physics.mirror_planes import Reflections, reflect
 from gsparc.physics.waves import LIGHT, NEAR_M, wave
 
@@ -28,12 +28,13 @@ log = logging.getLogger(__name__)
 SMALLEST, LARGEST = 0.2, 3.0  # [m] sides of random patches
 MIN_SIDE = 0.05  # [m]
 PARALLEL = 0.999  # cosine of normals that are taken as equal
-CELL = 0.35  # [m], of the raster that small mirrors are searched on
+CELL = 0.35  # [m], of the raster that small mirrors are searched on; larger where it has more than MOST_CELLS
 STEP = 0.08  # of a wavelength, between candidate planes
 BEHIND = 0.4  # [m], how far behind the receivers' box planes are tried
 MAX_SPAN = 6  # cells along each side of a rectangle
 MAX_CELLS = 2e8  # of all rasters along one wall's normal; larger sites are not searched
-BLOCK_CELLS = 2e7  # of the rasters held at a time, four numbers each
+MOST_CELLS = 1e7  # of them that are looked at, a microsecond each
+BLOCK_CELLS = 1e6  # of the rasters held at a time, four numbers each
 MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 
 
@@ -116,7 +117,8 @@ def find_mirrors(
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
     and before each wall) are collected in a raster of where it is met; integral images give every rectangle.
-    Sites whose rasters have more than `MAX_CELLS` are not searched.
+    Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
+    `MOST_CELLS` are larger. Whether to go on is asked (`ask`) after each size of rectangle.
 
     Args:
         rows: n.
@@ -141,13 +143,15 @@ def find_mirrors(
             float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
         )
         candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
-        each = math.prod(_cells(room, tangents(candidates[0]))) * (1 + 2 * len(known))
-        if each * len(candidates) > MAX_CELLS:
-            count = each * len(candidates)
+        many = 1 + 2 * len(known)
+        count = math.prod(_cells(room, tangents(candidates[0]), CELL)) * many * len(candidates)
+        if count > MAX_CELLS:
             log.info("no search for small mirrors: %.0e raster cells at this site and wavelength", count)
             continue
+        cell = CELL * math.sqrt(max(count / MOST_CELLS, 1.0))
+        each = max(math.prod(_cells(room, tangents(candidates[0]), cell)), len(rows)) * many
         parts = [
-            _raster(rows, alpha, scale, transmitter, block, known, room)
+            _raster(rows, alpha, scale, transmitter, block, known, room, cell)
             for block in candidates.split(max(1, int(BLOCK_CELLS / each)))
         ]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -180,16 +184,17 @@ def _raster(
     candidates: Tensor,
     known: Tensor,
     room: Tensor,
+    cell: float,
 ) -> tuple[Tensor, Tensor]:
     """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
     along = tangents(candidates[0])
-    low, cells = (room @ along.T).amin(0), _cells(room, along)
+    low, cells = (room @ along.T).amin(0), _cells(room, along, cell)
     tables = []
     for arriving, met in _sources(rows, transmitter, candidates, known):
         ask()
-        cell = ((met @ along.T - low) / CELL).floor().long()
-        inside = (cell >= 0).all(-1) & (cell < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
-        index = (cell[..., 0] * cells[1] + cell[..., 1]).clamp(0, cells[0] * cells[1] - 1)
+        at = ((met @ along.T - low) / cell).floor().long()
+        inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
+        index = (at[..., 0] * cells[1] + at[..., 1]).clamp(0, cells[0] * cells[1] - 1)
         own, blank = arriving.conj() * alpha, torch.zeros(len(candidates), cells[0] * cells[1])
         values = (own.real, own.imag, arriving.abs().square() * scale, torch.ones(()))
         binned = [blank.scatter_add(1, index, (value * inside).float()).view(-1, *cells) for value in values]
@@ -200,27 +205,26 @@ def _raster(
     # a few cells, or all there are: a wall that was missed
     sizes = [sorted({*range(1, min(MAX_SPAN, count) + 1), count}) for count in cells]
     for wide, high_by in product(*sizes):
-        real, imag, energy, count = (
-            s[..., wide:, high_by:] - s[..., :-wide, high_by:] - s[..., wide:, :-high_by]
-            + s[..., :-wide, :-high_by]
-            for s in sums
-        )  # fmt: skip
+        ask()
+        if high_by == sizes[1][0]:
+            strips = [s[..., wide:, :] - s[..., :-wide, :] for s in sums]
+        real, imag, energy, count = (s[..., high_by:] - s[..., :-high_by] for s in strips)
         score = (real.square() + imag.square()) / energy.clamp_min(1e-3) / 2
         summed = ((score - 1).clamp_min(0) * (count >= MIN_SERVED)).sum(0)  # sequences add up: (C, u, v)
         value, at = summed.flatten(1).max(1)
         first = torch.stack([at // summed.shape[2], at % summed.shape[2]], 1)
         span = torch.tensor([wide, high_by])
-        corners = torch.cat([low + CELL * first, low + CELL * (first + span)], 1)
+        corners = torch.cat([low + cell * first, low + cell * (first + span)], 1)
         better = value > total
         total = torch.where(better, value, total)
         best = torch.where(better[:, None], corners, best)
     return total, best
 
 
-def _cells(room: Tensor, along: Tensor) -> list[int]:
-    """Cells of a raster along each of two tangents (2, 3)."""
+def _cells(room: Tensor, along: Tensor, cell: float) -> list[int]:
+    """Cells of that side [m] in a raster along each of two tangents (2, 3)."""
     ends = room @ along.T
-    return ((ends.amax(0) - ends.amin(0)) / CELL).ceil().long().clamp_min(1).tolist()
+    return ((ends.amax(0) - ends.amin(0)) / cell).ceil().long().clamp_min(1).tolist()
 
 
 def _sources(

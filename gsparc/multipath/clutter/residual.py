@@ -14,11 +14,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gsparc.methods.worker import ask
 from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.worker import ask
 
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search

@@ -11,6 +11,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from gsparc.methods.worker import Ended, ask, ended_by
 from gsparc.multipath import refine_phase
 from gsparc.multipath.backprojection import pick_apart
 from gsparc.multipath.clutter.blocking import SOFT, Clutter, tangents, visible_share, within
@@ -58,7 +59,7 @@ def find_clutter(
         rows: of one output, as many as in a search.
         phased: from the final refinement of a search.
         generator: of the candidates.
-        late: asked again and again; nothing new is tried when it says so.
+        late: asked again and again; what was found so far is the result when it says so.
         noise_floor: known variance of the noise, in units of the rows' power.
     """
     # The kernel learned without clutter explains it: reset
@@ -134,41 +135,49 @@ class _ClutterSearcher:
     # ---- the loop ----
     def run(self, late: Callable[[], bool]) -> PhasedScene:
         start = self.nll
-        best = start, self.phased
-        for epoch in range(EPOCHS):
-            before = self.nll
-            for move in (self._mirrors, self._patches, self._boxes, self._sequences):
-                if not late():
-                    move()
-            if not late():
-                self._descend_soft(SOFT_EDGES[min(epoch, len(SOFT_EDGES) - 1)])
-                self._drop()
-                self._refactor(self.phased)
-            if not late():
-                self._relocate_boxes()
-                self._descend(10)
-                self._drop()
-                self._refactor(self.phased)
-                self._drop_sequences()
-                sequences, prior = self.scene.sequences, self.phase_prior
-                found = refine_phase.refine(
-                    self.rows,
-                    self.phased,
-                    STEPS,
-                    self.noise_floor,
-                    partial(prior.cost, sequences=sequences),
-                )
-                self._refactor(found)
-            best = min(best, (self.nll, self.phased), key=lambda b: b[0])
-            log.debug(
-                "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
-                epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches),
-                len(self.scene.sequences), self.nll, start, math.exp(self.scene.log_noise),
-                self.scene.visibility,
-            )  # fmt: skip
-            if late() or self.nll > before - PROGRESS:
-                break
+        best = self.whole = start, self.phased
+        try:
+            with ended_by(late):  # within a step, too
+                for epoch in range(EPOCHS):
+                    before = self.nll
+                    self._improve(SOFT_EDGES[min(epoch, len(SOFT_EDGES) - 1)])
+                    best = min(best, self.whole, key=lambda b: b[0])
+                    log.debug(
+                        "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
+                        epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches),
+                        len(self.scene.sequences), self.nll, start, math.exp(self.scene.log_noise),
+                        self.scene.visibility,
+                    )  # fmt: skip
+                    if self.nll > before - PROGRESS:
+                        break
+        except Ended:
+            ask()  # by the clock alone: what was found so far is the result
+            best = min(best, self.whole, key=lambda b: b[0])
         return best[1]
+
+    def _improve(self, soft: float) -> None:
+        """One round of everything; what each step leaves is `whole`."""
+        steps = (
+            self._mirrors, self._patches, self._boxes, self._sequences, partial(self._settle, soft),
+            self._settle_boxes,
+        )  # fmt: skip
+        for step in steps:
+            step()
+            self.whole = self.nll, self.phased
+
+    def _settle(self, soft: float) -> None:
+        self._descend_soft(soft)
+        self._drop()
+        self._refactor(self.phased)
+
+    def _settle_boxes(self) -> None:
+        self._relocate_boxes()
+        self._descend(10)
+        self._drop()
+        self._refactor(self.phased)
+        self._drop_sequences()
+        cost = partial(self.phase_prior.cost, sequences=self.scene.sequences)
+        self._refactor(refine_phase.refine(self.rows, self.phased, STEPS, self.noise_floor, cost))
 
     def _descend_soft(self, soft: float) -> None:
         """Descend with softer edges, whose gradients reach farther, then with sharp ones."""

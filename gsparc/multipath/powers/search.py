@@ -22,6 +22,7 @@ from gsparc.methods.distance_law import Rows
 from gsparc.methods.power_kernel import PowerKernel, choose, inverse_of
 from gsparc.methods.time_budget import TimeBudget
 from gsparc.methods.trend import Trend
+from gsparc.methods.worker import stop_when_late
 from gsparc.multipath.powers.blockers import Blockers, Place
 
 CANDIDATES = 3_000  # drawn for each Gaussian
@@ -158,6 +159,12 @@ def _polished(one: Blockers, seen: Seen, inverse: Tensor) -> tuple[float, Blocke
 
     bounds = [(None, None)] * 3 + [(-REACH, REACH)] * 4
     best = minimize(
-        objective, np.zeros(7), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": LOOKS}
+        objective,
+        np.zeros(7),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxfun": LOOKS},
+        callback=stop_when_late,
     )
     return -float(best.fun), moved(torch.from_numpy(best.x))

@@ -14,6 +14,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from gsparc.methods.worker import stop_when_late
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, specular, temporal
@@ -64,7 +65,15 @@ def with_drift(
 
     start = np.log(noise * np.array(SHARES))
     bounds = [(math.log(noise * LOWEST), math.log(noise) + 5)] * 3
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
+    found = minimize(
+        objective,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": STEPS},
+        callback=stop_when_late,
+    )
     fresh = replace(shape, correlated=True)
     power = torch.cat([values.power.clone(), torch.zeros(2, dtype=torch.float64)])
     for name, level in zip(("noise", "fast", "drift"), np.exp(found.x), strict=True):

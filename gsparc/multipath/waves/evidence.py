@@ -19,6 +19,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from gsparc.methods.worker import stop_when_late
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import (
@@ -324,6 +325,7 @@ def fit_all(
         method="L-BFGS-B",
         bounds=bounds,
         options={"maxiter": steps, "ftol": SETTLED},
+        callback=stop_when_late,
     )
     power, towards = torch.from_numpy(found.x[:count]).exp(), torch.from_numpy(found.x[count:])
     return power, towards, evidence(parts, power, towards)

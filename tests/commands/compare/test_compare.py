@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from campaigns import spectra
 from hydra import initialize_config_module
 
+from gsparc.commands.compare import command
 from gsparc.commands.compare.cells import Cell, Contender
-from gsparc.commands.compare.command import _may_match, _timed
+from gsparc.commands.compare.command import _may_match, _timed, fill_all
 from gsparc.commands.compare.fitting import Filled, Prepared, prepare
 from gsparc.commands.compare.problem import Problem, SplitChoice, split_choices, stored_problems
+from gsparc.methods.checkpoint import CheckpointError
 
 ROOT = Path(__file__).parents[3]
 
 
 def compare(tmp_path, *more: str) -> subprocess.CompletedProcess:
-    command = [
+    words = [
         sys.executable, "-m", "gsparc", "compare", f"+datasets.own.file={tmp_path / 'own.npz'}",
         "splits.random.datasets=[own]", "budgets=[{seconds: 0.3, seeds: [0]}]", f"cells={tmp_path / 'cells'}",
         f"hydra.run.dir={tmp_path / 'run'}", *more,
     ]  # fmt: skip
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
 
 
 def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
@@ -41,7 +45,7 @@ def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
 def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path):
     """Published cells would vanish from the table with every edit of a method."""
     cell = Cell("toy", "random", "gp", None, None)
-    problem = Problem("toy", "random", "spectrum", ("d", "s"))
+    problem = Problem("toy", "random", "spectrum", ("d", "s", "i"))
     prepared = Prepared(cell, problem, None, tmp_path / "toy-random-gp-today")
     facts = {
         "seed": None, "budget_s": None, "git": "0123456789",
@@ -53,6 +57,9 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
         (tmp_path / name / "cell.json").write_text(json.dumps({**facts, **changes}))
 
     write("toy-random-gp-other", **{"dataset/sha256": "e"})
+    write("toy-random-gp-grid", **{"dataset/identity": "of another grid"})
+    write("toy-random-gp-cut")
+    (tmp_path / "toy-random-gp-cut" / "cell.json").write_text("{")
     assert prepared.found() is None and prepared.found_earlier() is None
     write("toy-random-gp-old", made="2026-01-01")
     write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
@@ -61,6 +68,9 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     write("toy-random-gp-today")
     assert prepared.found().earlier is None
     random, sparse = SplitChoice("random"), SplitChoice("sparse")
+    for name in ("old", "newer", "today"):
+        kept = {**facts, "dataset/identity": "i"}
+        (tmp_path / f"toy-random-gp-{name}" / "cell.json").write_text(json.dumps(kept))
     assert stored_problems(tmp_path, "toy", [random, sparse]) == [problem]
     assert not stored_problems(tmp_path, "t", [random])
 
@@ -82,7 +92,7 @@ def test_an_unknown_setting_of_a_split_is_named():
 @pytest.mark.parametrize("model", ["gsparc", "moving_array"])
 def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_path):
     """A model was trained as if there were no budget: one of 5 s was found again as one of 60 s."""
-    problem = Problem("own", "random", "spectrum", ("d", "s"))
+    problem = Problem("own", "random", "spectrum", ("d", "s", "i"))
     contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         short, long = (
@@ -95,7 +105,7 @@ def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_
 @pytest.mark.parametrize("model", ["gsparc", "auto", "moving_array"])
 def test_every_seed_is_a_cell_of_its_own(model, tmp_path):
     """The first seed of gsparc stood for all three: a spread of 0.00."""
-    problem = Problem("own", "random", "spectrum", ("d", "s"))
+    problem = Problem("own", "random", "spectrum", ("d", "s", "i"))
     contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         folders = [
@@ -105,6 +115,23 @@ def test_every_seed_is_a_cell_of_its_own(model, tmp_path):
             for seed in range(3)
         ]
     assert len(folders) == 3
+
+
+def test_a_full_disk_ends_a_comparison(campaign, folds, tmp_path, monkeypatch):
+    """Every further cell was trained in vain; then `no cell is filled (train=true fills them)`."""
+    tried = []
+
+    def full(prepared):
+        tried.append(prepared)
+        raise CheckpointError("m.ckpt: cannot be written") from OSError(errno.ENOSPC, "No space left")
+
+    monkeypatch.setattr(command, "fill", full)
+    data = campaign("spectrum", 20)
+    problem = Problem("toy", "random", "spectrum", ("d", "s", "i"), data=data, folds=folds(20))
+    cells = [Cell("toy", "random", method, None, None) for method in ("mean", "gp")]
+    with pytest.raises(CheckpointError, match="cannot be written"):
+        fill_all([Prepared(one, problem, None, tmp_path / one.method) for one in cells])
+    assert len(tried) == 1
 
 
 @pytest.mark.slow
@@ -157,3 +184,23 @@ def test_mistakes_are_one_line(tmp_path):
 def test_a_star_may_stand_for_several_parts_of_a_cell(pattern, rfid, newrf):
     assert _may_match(pattern, "rfid", "random") == rfid
     assert _may_match(pattern, "newrf", "random") == newrf
+
+
+@pytest.mark.slow
+def test_two_comparisons_at_once_share_their_cells(tmp_path):
+    """In one folder of cells each is filled once and both report; in one folder of a run one is told."""
+    spectra(tmp_path / "own.npz")
+    only = "only=[own/random/mean/*,own/random/nearest/*,own/random/gp/*]"
+    with ThreadPoolExecutor(3) as pool:
+        runs = [tmp_path / name for name in ("run", "other", "run")]
+        done = list(pool.map(lambda run: compare(tmp_path, only, f"hydra.run.dir={run}"), runs))
+    assert sorted(one.returncode for one in done) == [0, 0, 1], [one.stderr[-300:] for one in done]
+    (told,) = (one.stderr for one in done if one.returncode)
+    assert "another run writes here" in told and "Traceback" not in told
+    filled = [
+        line for one in done for line in one.stdout.splitlines() if line[0:1] == "[" and " dB after " in line
+    ]
+    assert len(filled) == 3, "each by one of them"
+    tables = [(run / "compare.csv").read_text().splitlines() for run in runs[:2]]
+    assert [line.split(",")[:5] for line in tables[0]] == [line.split(",")[:5] for line in tables[1]]
+    assert not list(tmp_path.rglob("*.partial"))

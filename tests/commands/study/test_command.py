@@ -11,6 +11,7 @@ from campaigns import compose, spectra
 from hydra.core.hydra_config import HydraConfig
 
 from gsparc.commands.study.command import study_of, task
+from gsparc.training.terms import EffectSettings
 
 PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
 LINES = {
@@ -48,3 +49,12 @@ def test_each_kind_has_its_variants_and_baselines():
     assert names[0] == effects.base == "plain" and {"array", "phase", "power", "gp"} <= set(names)
     assert [v.name for v in positions.variants] == [v.name for v in measured.variants]
     assert len(positions.conditions) == 13 and len(measured.conditions) == 4 and measured.rounds == 3
+
+
+def test_variants_join_the_models_settings_where_they_are_interpolations():
+    """Both studies of the pages ended after 8 s: `error: visibility: Missing key visibility`."""
+    variants = {v.name: v.make() for v in study_of(compose("kind=effects", config="study")).variants}
+    switches = {name: method.switches for name, method in variants.items() if name != "gp"}
+    assert len(switches) == 9 and all(isinstance(one, EffectSettings) for one in switches.values())
+    assert (switches["plain"].image, switches["plain"].phase) == (True, False)
+    assert (switches["all"].image, switches["plain"].visibility) == ("auto", "auto")

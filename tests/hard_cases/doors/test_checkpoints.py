@@ -27,11 +27,14 @@ from ledger import LEDGER
 import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main as train
+from gsparc.data.errors import DataError
 from gsparc.data.load import load, split_for
+from gsparc.data.position_encoder.store import load as load_encoder
 from gsparc.methods import checkpoint
 from gsparc.methods.checkpoint import CheckpointError
 from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
+from gsparc.multipath.search_cache import SearchCache
 
 evaluate = COMMANDS["evaluate"].run
 
@@ -221,3 +224,38 @@ def test_an_ordinary_unpickler_would_run_them(tmp_path):
         mark = [path for path in tmp_path.iterdir() if path.name.startswith(MARK)]
         assert mark, name
         mark[0].unlink()
+
+
+def test_a_deflated_entry_is_not_inflated(sound, tmp_path):
+    """3 MB held one entry of 3 GB: 65 s and 6.4 GB, and it loaded; of searches and encoders alike."""
+    bomb = tmp_path / "bomb.ckpt"
+    with zipfile.ZipFile(sound[0]) as archive, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as copy:
+        for name in archive.namelist():
+            copy.writestr(name, archive.read(name))
+        copy.writestr("archive/more", bytes(1 << 24))
+    assert bomb.stat().st_size < 1 << 20
+    assert_refused_everywhere(bomb, sound[1], tmp_path / "run", "compressed, or larger than the file")
+    with pytest.raises(ValueError, match="holds no finished searches"):
+        SearchCache(resume=bomb)
+    with pytest.raises(DataError, match="not a gsparc encoder"):
+        load_encoder(bomb)
+
+
+def test_aliases_in_a_stored_configuration_are_refused(sound, tmp_path):
+    """Nine levels of nine aliases, 300 bytes, had no end in 200 s."""
+    levels = [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}' if i else 'x'] * 9)}]\n" for i in range(9)]
+    config = "".join(levels) + "model: {_target_: gsparc.methods.idw.InverseDistance}\n"
+    path = altered(sound[0], tmp_path / "aliases.ckpt", config=config)
+    assert_refused_everywhere(path, sound[1], tmp_path / "run", "aliases")
+
+
+def test_one_part_many_times_is_refused(sound, tmp_path):
+    """The same with pickled lists, with lists in lists, and with a tensor of one number a billion times."""
+    wide, deep = ["x"], ["x"]
+    for _ in range(9):
+        wide = [wide] * 9
+    for _ in range(100):
+        deep = [deep]
+    for name, part in {"wide": wide, "deep": deep, "thin": torch.zeros(1).expand(1 << 40)}.items():
+        path = altered(sound[0], tmp_path / f"{name}.ckpt", state={"x": part})
+        assert_refused_everywhere(path, sound[1], tmp_path / "run", "many times")

@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.worker import stop_when_late
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.together.law import SiteLaw
 from gsparc.multipath.powers.together.posterior import End, Factored, left_out_of, weights_of
@@ -134,6 +135,7 @@ def _walk(
         return float(value.detach()), slope.numpy()
 
     def stop(_: np.ndarray) -> None:
+        stop_when_late()
         if budget is not None and budget.over():
             raise StopIteration
 

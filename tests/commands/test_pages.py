@@ -1,0 +1,57 @@
+"""Every command that a page or a configuration shows ends well on small data of its kind."""
+
+from __future__ import annotations
+
+import pytest
+from doors import knock
+from pages import Tiny, commands
+
+from gsparc.__main__ import main
+
+COMPOSED = {  # by `tests/test_docs.py` alone, for another reason each
+    "simulate": "needs the ray tracer (tests/simulate)",
+    "bench": "measures the machine (tests/commands/test_bench.py)",
+    "link": "needs Sionna (tests/commands/test_link.py)",
+    "report": "needs folders of runs (tests/evaluation/report)",
+    "trainer=ddp": "processes of their own (tests/training/test_processes.py)",
+    "trainer.devices=2": "processes of their own (tests/training/test_processes.py)",
+    "trainer.strategy=ddp": "processes of their own (tests/training/test_processes.py)",
+    "logger=tensorboard": "tests/training/test_tracking.py",
+    "logger=wandb": "tests/commands/test_train.py",
+    "model=calibrated_raytracer": "needs the ray tracer (tests/peers)",
+    "search=optuna": "a search of many trainings",
+}
+
+
+def _composed(line: tuple[str, ...]) -> bool:
+    text = " ".join(line)
+    served = line[0] == "view" and "save=" not in text  # a server that Ctrl-C ends (tests/view)
+    unfinished = any(word.startswith("ckpt_path") for word in line)  # tests/hard_cases/test_resume.py
+    sweep = "experiment=ablation_" in text  # of many trainings
+    return (
+        served or sweep or unfinished or line[0] in COMPOSED or bool(COMPOSED.keys() & set(line))
+        or "map=" in text or "walls=" in text
+    )  # fmt: skip
+
+
+RUN = [line for line in commands() if not _composed(line)]
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return Tiny(tmp_path_factory.mktemp("pages"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", RUN, ids=" ".join)
+def test_a_command_of_a_page_ends_well(line, tiny, tmp_path, monkeypatch):
+    """`gsparc study kind=effects` stood on two pages and ended after 8 s."""
+    monkeypatch.chdir(tiny.folder)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    name, *overrides = line
+    answer = knock(main, "gsparc", [name, *tiny.line(name, tuple(overrides), tmp_path / "run")])
+    assert answer.status == 0, [text[:300] for text in answer.err[-3:]]
+
+
+def test_most_commands_of_the_pages_are_run():
+    assert len(RUN) > 50

@@ -1,0 +1,188 @@
+"""The commands that pages and configurations show, and small data of every kind to run them on."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+from campaigns import brief, channels, compose, powers, spectra
+from crashes import small_campaign
+from measured import write_npz, write_release, write_walk
+from PIL import Image
+from towns import town_file
+
+from gsparc.commands.listing import COMMANDS
+from gsparc.commands.train import train
+from gsparc.simulate.argos_sim import Offsets, write_argos_sim
+from gsparc.simulate.campaign import simulate
+from gsparc.simulate.rfid_sim import write_rfid_sim
+
+ROOT = Path(__file__).parents[2]
+TOP = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG")]
+FOLDERS = ("docs", "docs/tutorials", "docs/reference")
+PAGES = [*TOP, *(page for folder in FOLDERS for page in sorted((ROOT / folder).glob("*.md")))]
+PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]  # which also speaks of names that are gone
+COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
+
+
+def said(page: Path) -> list[str]:
+    """Lines of code blocks without a language, and inline code; of a configuration its first comments."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".yaml":
+        return [line.lstrip("# ").partition(" : ")[0].partition("   (")[0] for line in text.splitlines()[:5]]
+    blocks = re.findall(r"^ *```\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
+    inline = re.findall(r"`([^`]+)`", re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE))
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return lines + [code.replace("\n", " ") for code in inline]
+
+
+def commands() -> dict[tuple[str, ...], str]:
+    """Configuration and overrides of every command that is shown, and the line it stands in."""
+    found = {}
+    shown = [*PRESENT, *sorted((ROOT / "conf").rglob("*.yaml"))]
+    for line in dict.fromkeys(line.strip() for page in shown for line in said(page)):
+        match = COMMAND.match(line)
+        if match is None:
+            continue
+        name = match["name"] or "train"
+        assert name in COMMANDS, line
+        words = shlex.split(re.sub(r" [:(] .*| \(.*", "", match["rest"]), comments=True)
+        given = [word for word in words if "=" in word or word.startswith("~")]
+        given = [word for word in given if not word.endswith(("=NAME", "=...", "=DIR..."))]
+        # Of the values of a sweep the first.
+        found[name, *(word if "[" in word else word.partition(",")[0] for word in given)] = line
+    return {key: line for key, line in found.items() if (ROOT / "conf" / f"{key[0]}.yaml").exists()}
+
+
+class Tiny:
+    """Small data and models of every kind, made in a folder; `line` puts them into a command."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.made = folder, dict[str, str]()
+        square = [[[2, 2], [30, 2], [30, 20], [2, 20], [2, 2]]]
+        area = {"type": "Polygon", "coordinates": square}
+        for name in ("campus", "corridors", "roofs"):
+            (folder / f"{name}.geojson").write_text(json.dumps(area))
+        Image.new("L", (1600, 900), 255).save(folder / "floor.png")
+        heads = "x,y,z,rssi_dbm,station\n"
+        rng = np.random.default_rng(0)
+        rows = [f"{x},{y},1.5,{-60 - x},{s}\n" for x, y in rng.uniform(0, 20, (40, 2)) for s in ("a", "b")]
+        (folder / "drive.csv").write_text(heads + "".join(rows))
+        (folder / "sites.csv").write_text("name,x,y,z\na,0,0,8\nb,20,20,8\n")
+        (folder / "places.csv").write_text("x,y,z\n10,10,1.5\n20,20,1.5\n")
+
+    def data(self, name: str) -> str:
+        """File or folder of a dataset by its choice."""
+        if name not in self.made:
+            path = self.folder / name
+            make = {
+                "rfid": lambda: (write_rfid_sim(path, 40, 0), path)[1],
+                "argos": lambda: (write_argos_sim(path, 60, 0, Offsets(), 20), path)[1],
+                "newrf": lambda: self._room(path.with_suffix(".npz")),
+                "own": lambda: powers(path.with_suffix(".npz"), 60),
+                "city": lambda: town_file(path.with_suffix(".npz"), 80),
+                "sionna": lambda: (
+                    simulate(small_campaign(40), path.with_suffix(".h5")),
+                    path.with_suffix(".h5"),
+                )[1],
+                "techtile": lambda: write_release(path),
+                "powder": lambda: write_walk(path),
+                "ble": lambda: write_npz(path, "ble"),
+            }[name]
+            path.mkdir(exist_ok=True) if name in ("techtile", "powder", "ble") else None
+            self.made[name] = str(make())
+        return self.made[name]
+
+    def _room(self, path: Path) -> Path:
+        with np.load(channels(path, 60, shape="S")) as own:
+            tx, rx = own["tx_position"], own["rx_position"]
+            walls = [tx, (0.0, 1.5, 1.0), (4.0, 1.5, 1.0)]  # where the last leg of each path begins
+            np.savez(
+                path, tx_pos=tx, rx_pos=rx, csi=own["csi"].astype("c8"), frequency_hz=own["frequency_hz"],
+                path_offsets=3 * np.arange(len(rx) + 1), path_last_point=np.tile(walls, (len(rx), 1)),
+                path_gain=np.ones(3 * len(rx), np.complex64), split_train=np.arange(48),
+                split_test=np.arange(48, 60),
+            )  # fmt: skip
+        return path
+
+    def model(self, command: str) -> str:
+        """A checkpoint that a command can use."""
+        kind = command if command in ("link", "place", "calibrate", "tradeoff") else "map"
+        if f"{kind} model" not in self.made:
+            folder, more = self.folder / f"{kind} model", ("baselines=[]", "logger=none", "threads=1")
+            if kind == "link":
+                file = channels(self.folder / "link.npz", 60)
+                config = compose("dataset=own", f"dataset.file={file}", "model=complex_gp", *more)
+            elif kind in ("calibrate", "tradeoff"):
+                file = spectra(self.folder / f"{kind}.npz", 400 if kind == "calibrate" else 40)
+                config = compose(*brief(file, *more))
+            else:
+                stations = ["stations=together"] if kind == "place" else []
+                given = ["dataset=own", f"dataset.file={self.data('city')}", "model=gp", *stations, *more]
+                config = compose(*given)
+            train(config, folder)
+            self.made[f"{kind} model"] = str(folder / "model.ckpt")
+        return self.made[f"{kind} model"]
+
+    def line(self, name: str, overrides: tuple[str, ...], run: Path) -> list[str]:
+        """The words of a command that ends within seconds, on data of its kind, into a folder `run`."""
+        given = dict(word.partition("=")[::2] for word in overrides)
+        dropped = [word for word in given if word.startswith("~")]
+        words = {key: value for key, value in given.items() if key not in dropped}
+        if "dataset" in words or name in ("train", "study"):
+            chosen = words.get("dataset") or ("sionna" if words.get("experiment") == "sionna" else "rfid")
+            kind = chosen.removesuffix("_sim")
+            if chosen in ("rfid", "argos"):
+                words["dataset.root"] = self.data(kind)
+            elif chosen == "rfid_sim":
+                words |= {"dataset.count": "40", "dataset.root": str(self.folder)}
+            elif chosen == "argos_sim":
+                words |= {"dataset.stand_in.count": "60", "dataset.stand_in.root": str(self.folder)}
+            elif words.get("dataset.file") != "drive.csv":
+                words["dataset.file"] = self.data(kind)
+            if kind == "argos":
+                words |= {"dataset.positions": "true"} if chosen == "argos_sim" else {}
+        if name in ASKING or "ckpt" in words or (name == "plan" and not {"area", "plan"} & set(words)):
+            splats = words.get("save", "").endswith(".ply")  # of a field
+            words["ckpt"] = self.model("tradeoff" if splats else name)
+        if "init_from" in words:  # weights of the same data and settings
+            run = self.folder / "before"
+            if not run.exists():
+                train(compose(*self.line("train", ("dataset=rfid",), run)), run)
+            words["init_from"] = str(run / "model.ckpt")
+        if name == "predict":
+            words |= {"places": "places.csv", "out": f"{run}.csv"}
+        if name == "evaluate":
+            words.pop("dataset.root", None)
+        if name == "compare":
+            for key in [key for key in words if key.startswith("datasets.")] or ["datasets.rfid.root"]:
+                words[key] = self.data(ALIKE.get(key.split(".")[1], key.split(".")[1]))
+            only = [f"{key.split('.')[1]}/*/{method}/*" for key in words if key.startswith("datasets.")
+                    for method in ("mean", "nearest")]  # fmt: skip
+            words |= {"only": f"[{','.join(only)}]", "cells": str(run.parent / "cells"), "latency": "false"}
+        words |= TINY.get(name, {})
+        gsparc = words.get("model", "gsparc") == "gsparc" and words.get("experiment") != "sionna"
+        if name in ("train", "study") and gsparc:
+            words |= FIELD
+        words["hydra.run.dir"] = str(run)
+        return [*dropped, *(f"{key}={value}" for key, value in words.items())]
+
+
+ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link")  # commands about a model
+ALIKE = {"exp005": "techtile", "exp006": "techtile", "plane": "own", "hall_1": "ble", "hall_2": "ble"}
+SHORT = {"threads": "1"}
+FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
+TINY = {  # what makes each command short
+    "train": {**SHORT, "budget_s": "1", "baselines": "[mean]", "logger": "none"},
+    "study": {
+        **SHORT, "budget_s": "1", "baselines": "[]", "query_s": "0.1", "queries": "5", "rounds": "1",
+    },
+    "tradeoff": {"threads": "[1]", "rounds": "2", "baselines": "[]"},
+    "evaluate": {**SHORT, "baselines": "[mean]"},
+    "link": {"pusch.coarse": "8", "pusch.fine": "16"},
+    "map": {**SHORT, "step_m": "4"},
+    "plan": {**SHORT, "count": "2"},
+}  # fmt: skip

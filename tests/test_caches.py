@@ -1,0 +1,87 @@
+"""What was kept is found again for the same data only: every fact of a site changes every key."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gsparc.array import vector_cache
+from gsparc.commands.compare import problem
+from gsparc.commands.compare.cells import key
+from gsparc.commands.compare.problem import SplitChoice, load_problems
+from gsparc.data.assemble import identity
+from gsparc.data.links.georeference import Georeference
+from gsparc.data.schema import Site, Stations
+from gsparc.evaluation import baseline_cache
+from gsparc.methods.checkpoint import _as_numpy, _plain, _site_from
+from gsparc.multipath.image_source_gp import ImageSourceGP
+from gsparc.ops import SphereGrid
+
+ONE = np.ones(3)
+FACTS = {
+    "name": "other", "kind": "rssi", "static_end": "tx", "grid": SphereGrid.hemisphere(4, 8),
+    "array": np.eye(3), "carrier_hz": 2.4e9, "subcarriers_hz": ONE, "origin": 7 * ONE,
+    "box": np.array([-ONE, 3 * ONE]), "sha256": "0" * 64, "normalisation": "minmax", "target_scale": 3.0,
+    "stand_in": "another", "convergence_error": 0.5, "static_position": 9 * ONE,
+    "rx_rotation": -np.eye(3), "uplink_array": np.eye(3), "uplink_hz": ONE, "antennas": np.arange(2),
+    "stations": Stations(np.zeros((2, 3)), ("one", "two")), "georeference": Georeference(52.0, 13.0),
+    "moving_box": np.array([-ONE, 2 * ONE]), "level_unit": "dBm",
+}  # fmt: skip
+
+
+class Asked(Exception):
+    """Carries the path that a cache looked for."""
+
+
+def _keys(data, split, monkeypatch, folder) -> dict[str, str]:
+    """The name under which each cache keeps what it finds of these data."""
+
+    def asked(path, *unused):
+        raise Asked(str(path))
+
+    monkeypatch.setattr(vector_cache, "_read", asked)
+    monkeypatch.setattr(baseline_cache, "_stored_fit", asked)
+    monkeypatch.setattr(problem, "compose", lambda *unused: SimpleNamespace(dataset={}, split={}))
+    monkeypatch.setattr(problem, "plain", lambda node: node)
+    monkeypatch.setattr(problem, "load", lambda unused: data)
+    monkeypatch.setattr(problem, "split_for", lambda *unused: split)
+    found = {}
+    rows = np.arange(len(data))
+    for name, look in {
+        "vectors": lambda: vector_cache.recovered(data, rows, folder),
+        "baselines": lambda: baseline_cache.baseline("mean", data, split, cache=folder),
+    }.items():
+        with pytest.raises(Asked) as path:
+            look()
+        found[name] = str(path.value)
+    found["searches"] = str(ImageSourceGP()._depends_on(data, rows))
+    (one,) = load_problems("toy", {}, [SplitChoice("random")])
+    found["cells"] = key({}, {}, *one.hashes)
+    return found
+
+
+def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, folds, monkeypatch, tmp_path):
+    """Of another `grid_deg` or `normalisation` a comparison showed the kept 32.4169 dB for 32.3799."""
+    assert set(FACTS) == {one.name for one in fields(Site)}, "a new fact of a site is to be named here"
+    data, split = campaign("spectrum", 20), folds(20)
+    before = _keys(data, split, monkeypatch, tmp_path)
+    assert before == _keys(replace(data), split, monkeypatch, tmp_path)
+    for name, value in FACTS.items():
+        other = replace(data, site=replace(data.site, **{name: value}))
+        after = _keys(other, split, monkeypatch, tmp_path)
+        same = [cache for cache in before if before[cache] == after[cache]]
+        assert not same, f"{name}: {same}"
+    for renamed in (("one", "three"), ("two", "one")):
+        stations = [replace(FACTS["stations"], name=names) for names in (renamed, ("one", "two"))]
+        found = [replace(data, site=replace(data.site, stations=one)) for one in stations]
+        assert identity(found[0]) != identity(found[1])
+
+
+def test_facts_are_the_same_after_a_checkpoint(campaign):
+    data = campaign("spectrum", 20)
+    whole = replace(data.site, **{**FACTS, "target_scale": np.float64(3.0)})
+    again = _site_from(_as_numpy(_plain(asdict(whole), "site")))
+    assert identity(replace(data, site=again)) == identity(replace(data, site=whole))
