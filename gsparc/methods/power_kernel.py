@@ -7,7 +7,7 @@ those of largest leave-one-out likelihood (Rasmussen and Williams 2006, section 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -162,9 +162,21 @@ def left_out(
 
 
 def choose(
-    starts: list[PowerKernel], distance: np.ndarray, terms: np.ndarray, values: np.ndarray
+    starts: list[PowerKernel],
+    distance: np.ndarray,
+    terms: np.ndarray,
+    values: np.ndarray,
+    late: Callable[[], bool] = lambda: False,
 ) -> tuple[float, PowerKernel]:
-    """Least negative leave-one-out log density, and its kernel, walked to from the best of `starts`."""
+    """Least negative leave-one-out log density, and its kernel, walked to from the best of `starts`.
+
+    The walk ends where it is when `late` says so.
+    """
+
+    def stop(_: np.ndarray) -> None:
+        if late():
+            raise StopIteration
+
     bounds = bounds_of(len(starts[0].lengths), distance)
     low, high = np.array(bounds).T
 
@@ -178,6 +190,8 @@ def choose(
     points = [np.clip(one.parameters(), low, high) for one in starts]
     start = min(points, key=lambda point: objective(point)[0]) if len(points) > 1 else points[0]
     pace = {"ftol": 5e-6, "maxfun": MOST_LOOKS}
-    best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=pace).x
+    best = minimize(
+        objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=pace, callback=stop
+    ).x
     value, amplitude, _ = left_out(kernel_of(best), distance, terms, values, bounded=True)
     return value, kernel_of(best, amplitude)

@@ -19,6 +19,7 @@ from gsparc.data.schema import Site
 from gsparc.methods.censored_ep import condition, log_evidence, propagate
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows, law_of
+from gsparc.methods.haste import UNHURRIED, Haste
 from gsparc.methods.nearest_process import NearestProcess, Values, given, settings_of
 from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, choose, kernel_of, slopes
@@ -29,8 +30,7 @@ log = logging.getLogger(__name__)
 MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
-CHOSEN_ON = 1_000  # rows that settings are chosen on: each look at them factors a matrix
-COMPARED_ON = 500  # of them, constant and distance law
+COMPARED_ON, LEAST_COMPARED_ON = 500, 150  # of them, constant and distance law; in haste
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
 MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
 MOST_SILENT = 3_000  # of them, where nothing was heard
@@ -128,7 +128,7 @@ def restored(state: dict[str, Any]) -> Process:
 
 
 def fit_powers(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int | None = None
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
 ) -> tuple[Process, tuple[str, ...]]:
     """A process of largest leave-one-out likelihood, and what must be said of it.
 
@@ -139,29 +139,37 @@ def fit_powers(
         site: where the still end is.
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
-        chosen_on: rows that settings are chosen on, of more; None: CHOSEN_ON.
+        haste: see there.
     """
-    process, notes = _fitted(rows, _trends(rows, site, mean), seed, chosen_on)
-    return process, (_description(process.trend, process.kernel), *notes)
+    trend, kernel, notes = choose_prior(rows, site, mean, seed, haste)
+    process, more = conditioned(rows, trend, kernel, seed)
+    return process, (*notes, *more)
 
 
-def fit_about(
-    rows: Rows, trend: Trend, seed: int = 0, chosen_on: int | None = None
-) -> tuple[Process, tuple[str, ...]]:
-    """The same about a mean law that is given."""
-    return _fitted(rows, [(trend, 0, ())], seed, chosen_on)
+def choose_prior(
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
+) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
+    """The settings of `fit_powers` alone, and what must be said of them."""
+    trend, kernel, notes = _chosen(rows, _trends(rows, site, mean), seed, haste)
+    return trend, kernel, (_description(trend, kernel), *notes)
 
 
-def _fitted(
-    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, chosen_on: int | None
-) -> tuple[Process, tuple[str, ...]]:
-    """The process about the best of `trends`, and what must be said of it."""
-    trend, kernel, said = _settings(rows, trends, seed, chosen_on)
+def choose_about(
+    rows: Rows, trend: Trend, seed: int = 0, haste: Haste = UNHURRIED
+) -> tuple[PowerKernel, tuple[str, ...]]:
+    """The kernel about a mean law that is given, and what must be said of it."""
+    return _chosen(rows, [(trend, 0, ())], seed, haste)[1:]
+
+
+def _chosen(
+    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, haste: Haste
+) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
+    """The best of `trends` with its kernel, and what must be said of the choice."""
+    trend, kernel, said = _settings(rows, trends, seed, haste)
     if len(rows.places) > MOST_ROWS and not rows.silent.any():  # these tell of settings too
         kernel, how = settings_of(Values.of(rows.places, rows.decibels), trend, kernel, seed)
         said = (*said, f"then {how}")
-    process, more = conditioned(rows, trend, kernel, seed)
-    return process, (*said, *more)
+    return trend, kernel, said
 
 
 def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
@@ -187,22 +195,23 @@ class _Candidate:
 
 
 def _settings(
-    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, chosen_on: int | None
+    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, haste: Haste
 ) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
     """Mean, lengths and noise, chosen on a part of many rows, and what must be said of the choice."""
     loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
-    loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on or CHOSEN_ON, seed))
-    few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
-    weighed = rows.at(draw(rows.silent, WEIGHED_ON, seed))
+    loud = loud.at(draw(np.zeros(len(loud.places), bool), haste.rows, seed))
+    compared_on = min(COMPARED_ON, max(haste.rows // 2, LEAST_COMPARED_ON))
+    few = loud.at(draw(np.zeros(len(loud.places), bool), compared_on, seed))
+    weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, haste.rows), seed))
     both = weighed.silent.any() and not weighed.silent.all()
-    found = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
+    found = [_one_length(few, trend, cost, notes, haste) for trend, cost, notes in trends]
     if both:
         found = [_weighed(weighed, one) for one in found]
     best = max(found, key=lambda one: one.score)
-    if len(loud.places) > len(few.places) and not both:
-        best = _refined(loud, best)
-    if len(loud.places) >= TWO_LENGTHS_NEED:
-        two = _two_lengths(loud, best)
+    if len(loud.places) > len(few.places) and not both and not haste.late():
+        best = _refined(loud, best, haste)
+    if len(loud.places) >= TWO_LENGTHS_NEED and not haste.late():
+        two = _two_lengths(loud, best, haste)
         best = max((best, _weighed(weighed, two) if both else two), key=lambda one: one.score)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):
@@ -229,28 +238,28 @@ def _views(rows: Rows, trend: Trend) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return distance, trend.terms(places).numpy(), rows.decibels - trend.mean(places).numpy()
 
 
-def _one_length(rows: Rows, trend: Trend, cost: int, notes: tuple[str, ...]) -> _Candidate:
+def _one_length(rows: Rows, trend: Trend, cost: int, notes: tuple[str, ...], haste: Haste) -> _Candidate:
     distance, terms, values = _views(rows, trend)
     scale = float(np.median(distance)) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float((values**2).mean()), 1e-12)
         return _Candidate(0.0, trend, PowerKernel((scale,), (1.0,), 1e-2, amplitude), cost, notes)
     starts = [PowerKernel((scale * share,), (1.0,), 0.1, 1.0) for share in SHARES]
-    value, kernel = choose(starts, distance, terms, values)
+    value, kernel = choose(starts, distance, terms, values, haste.late)
     return _Candidate(-value - cost, trend, kernel, cost, notes)
 
 
-def _refined(rows: Rows, one: _Candidate) -> _Candidate:
+def _refined(rows: Rows, one: _Candidate, haste: Haste) -> _Candidate:
     """The same with settings of more rows."""
-    value, kernel = choose([one.kernel], *_views(rows, one.trend))
+    value, kernel = choose([one.kernel], *_views(rows, one.trend), haste.late)
     return replace(one, score=-value - one.cost, kernel=kernel)
 
 
-def _two_lengths(rows: Rows, one: _Candidate) -> _Candidate:
+def _two_lengths(rows: Rows, one: _Candidate, haste: Haste) -> _Candidate:
     """The same mean with two lengths, for two more parameters."""
     length, noise = one.kernel.lengths[0], one.kernel.noise
     starts = [PowerKernel((length * a, length * b), (0.5, 0.5), noise, 1.0) for a, b in SPLITS]
-    value, kernel = choose(starts, *_views(rows, one.trend))
+    value, kernel = choose(starts, *_views(rows, one.trend), haste.late)
     return replace(one, score=-value - one.cost - 2, kernel=kernel, cost=one.cost + 2)
 
 

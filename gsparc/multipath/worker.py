@@ -15,12 +15,13 @@ class Ended(BaseException):
 
 @contextmanager
 def ended_by(unwanted: Callable[[], bool]) -> Iterator[None]:
-    """Within, `ask` raises `Ended` in this thread as soon as `unwanted` says so."""
-    _asked.unwanted = unwanted
+    """Within, `ask` raises `Ended` in this thread as soon as `unwanted`, or who surrounds it, says so."""
+    before = getattr(_asked, "unwanted", None)
+    _asked.unwanted = unwanted if before is None else lambda: before() or unwanted()
     try:
         yield
     finally:
-        _asked.unwanted = None
+        _asked.unwanted = before
 
 
 def ask() -> None:
