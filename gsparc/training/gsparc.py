@@ -50,7 +50,7 @@ DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 BEFORE, AFTER = 3.0, 3.0  # validations that steps take at least, and that may follow when seconds end them
 LEAST_STEPS_S = 0.5  # less is not worth to set up
-LEAST_FACTORS, MOST_FACTORED = 8.0, 3_000  # covariances of all rows that any fit makes, and rows of one
+LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fit makes, and rows of one
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
 
 
@@ -152,7 +152,8 @@ class Gsparc(LearnedField):
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
         count = 1 if data.site.stations is None else len(data.site.stations)
-        least = LEAST_FACTORS * count * factor_s(min(len(known) // count, MOST_FACTORED))
+        alone = LEAST_FACTORS * count * factor_s(min(len(known) // count, MOST_FACTORED))
+        least = alone if len(chosen.parts) == 1 else alone * (1 + solutions.GROUPS)
         if least > budget.seconds:
             log.warning(
                 "%g s are too few: the least fit of these rows takes about %.0f s", budget.seconds, least
@@ -213,6 +214,10 @@ class Gsparc(LearnedField):
             return 0, field.count > 0
         if not learns(field):
             log.info("gradient steps: none, nothing to move")
+            return 0, field.count > 0
+        each = factor_s(min(len(fold.train), MOST_FACTORED))  # about what a validation takes
+        if (BEFORE + AFTER) * each + LEAST_STEPS_S > budget.seconds - budget.spent:
+            log.info("gradient steps: none, no seconds are left")
             return 0, field.count > 0
         if not field.count:
             field.condition(data, fold.train)  # as a validation does

@@ -32,9 +32,9 @@ def heard(alike: bool, count: int = 60):
 
 
 def test_powers_are_learned_as_rows_left_out_want_it():
-    alike, why = stations.best(*heard(True), FitContext(budget_s=60))
+    alike, why = stations.best(*heard(True), FitContext(budget_s=6))
     assert alike == "together" and "dB together" in why and "folds)" in why
-    assert stations.best(*heard(False), FitContext(budget_s=60))[0] == "each"
+    assert stations.best(*heard(False), FitContext(budget_s=6))[0] == "each"
 
 
 def test_rows_beyond_one_factor_are_learned_by_station(monkeypatch):
@@ -51,7 +51,7 @@ def test_stations_that_nobody_heard_are_answered_by_what_all_share():
 
 
 def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkeypatch, caplog):
-    """Over 30 minutes where one model of all took 29 s and had half the error; plain methods stay as they were."""
+    """Over 30 minutes, where one of all took 29 s and had half the error; plain methods stay as they were."""
     caplog.set_level("INFO", "gsparc")
     walk = np.random.default_rng(0).uniform(0, 3, (30, 3))
     far = np.linalg.norm(walk[:, None] - POSTS, axis=-1)
