@@ -147,7 +147,7 @@ class Gsparc(LearnedField):
         budget = context.time_budget()
         log.info(
             "training a Gaussian field with closed-form weights: init=%s, then at most %d gradient steps, "
-            "within %g s; callbacks: %s", " and ".join(chosen.parts), self._most_steps(context),
+            "within %.3g s; callbacks: %s", " and ".join(chosen.parts), self._most_steps(context),
             context.budget_s, KeepBest.__name__,
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))

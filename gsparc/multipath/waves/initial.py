@@ -58,7 +58,7 @@ ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all 
 DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 GRID_SHARE = 0.2  # of the seconds, for the grid of envelopes and noises, which has fewer rows if need be
-FEWEST = 100  # of them
+FEWEST = 150  # of them, that a look is timed with, too
 LENGTHS_SHARE = 0.5  # of the seconds, after which no further length is tried
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
@@ -120,13 +120,17 @@ def _isotropic(
     """Envelope and noise on the grid of `complex_gp`, and the factors of runs, as measured."""
     groups = gather(data, rows, False)
     looked = thinned(groups, 8, CHOSEN_ON)
-    expected = len(LENGTHS) * len(NOISES) * sum(factor_s(len(group)) for group in looked)
-    affordable = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / expected
-    if affordable < 1:
-        budget.limited = True
-        looked = thinned(groups, 8, max(int(CHOSEN_ON * affordable ** (1 / 3)), FEWEST))
     runs = 1 if data.run is None else len(np.unique(data.run[rows]))
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
+    few, began = thinned(looked, 8, FEWEST), budget.spent
+    _grid_point(few, [_plain_kernel(group, wavelength) for group in few], 1.0, runs)
+    given = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
+    most = (
+        int(FEWEST * (given / max(budget.spent - began, 1e-6)) ** (1 / 3)) if given < math.inf else CHOSEN_ON
+    )
+    if most < max(len(group) for group in looked):
+        budget.limited = True
+        looked = thinned(groups, 8, max(most, FEWEST))
     tried = []
     for length in LENGTHS:
         bounded = [_plain_kernel(group, length * wavelength) for group in looked]
