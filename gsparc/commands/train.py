@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,9 +45,12 @@ from gsparc.evaluation.summary import (
 from gsparc.methods import checkpoint, parts
 from gsparc.methods.method import FitContext, FitReport, Method, TrainsByGradient
 from gsparc.methods.registry import build
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
+
+LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
 def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     RunSettings.of(config)
+    watch = TimeBudget(clock=config.budget_clock)
     module = _data(config)
     data = module.measurements
     objective_of(config, data.site.kind)  # refused now, not after the training
@@ -112,8 +116,13 @@ def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     with tracking.opened(config.logger) as loggers:
         given = {"trainer": trainer, "callbacks": callbacks, "loggers": loggers, "datamodule": module}
 
+        read_s = watch.spent  # counts: the seconds that are given begin with the first read
+
         def context(number: int) -> FitContext:
-            return context_of(config, run_dir=folders[number], resume=resumes[number], **given)
+            found = context_of(config, run_dir=folders[number], resume=resumes[number], **given)
+            if number or found.budget_s is None:
+                return found
+            return replace(found, budget_s=max(found.budget_s - read_s, LEAST_SHARE * found.budget_s))
 
         try:
             fitted = fit_and_score(model, data, split, context, eval_on=None, keep=keep)

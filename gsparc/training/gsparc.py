@@ -173,7 +173,7 @@ class Gsparc(LearnedField):
             "%s of %d Gaussians from init=%s, terms %s", type(self.field).__name__, self.field.count,
             self.started, ", ".join(self.field.terms) or "none",
         )  # fmt: skip
-        self.steps, moved = self._take_steps(data, fold, context, budget)
+        self.steps, moved = self._take_steps(data, fold, context, budget, several)
         stepped = budget.counted.wall
         if moved or several:  # else it is of these rows already
             self.field.condition(data, known)
@@ -189,9 +189,12 @@ class Gsparc(LearnedField):
         return FitReport(seconds, tuple(notes), limited)
 
     def _take_steps(
-        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
+        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, apart: bool
     ) -> tuple[int, bool]:
         """Gradient steps under Lightning, as many as validation gains by.
+
+        Args:
+            apart: whether the field was conditioned on training rows alone.
 
         Returns:
             Their number, and whether the field is conditioned on other rows than before, or has moved.
@@ -203,7 +206,8 @@ class Gsparc(LearnedField):
             return 0, False
         began = budget.spent
         if field.count:
-            field.condition(data, fold.train)
+            if not apart:
+                field.condition(data, fold.train)
             batch = data.batch(fold.val)
             target, found = comparable(batch.target, data.site), field(batch.tx, batch.rx)
             assert found.explained is not None

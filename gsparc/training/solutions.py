@@ -86,7 +86,7 @@ def find(
                 field = field.field
             found[name] = field
             if part not in OPEN_ENDED:
-                field.held = _held(field, data, rows, groups, until_s, budget)
+                field.held = _held(field, data, rows, groups, until_s, budget, report.seconds)
         except KeyboardInterrupt:
             if not name.startswith("few "):
                 raise
@@ -155,17 +155,23 @@ def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def _held(
     field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...],
-    until_s: float, budget: TimeBudget,
+    until_s: float, budget: TimeBudget, fitted_s: float,
 ) -> LeftOutRows | None:  # fmt: skip
-    """Rows of every group, predicted from the others with the parameters of all; None where time is short."""
+    """Rows of every group, predicted from the others with the parameters of all; None where time is short.
+
+    Args:
+        until_s: second of the budget by which that must be done.
+        fitted_s: seconds of the fit, about what the weights may take at most.
+    """
     if not groups:
         return None
     found, began = [], budget.spent
     for number, group in enumerate(groups):
-        each = (budget.spent - began) / max(number, 1)
+        each = (budget.spent - began) / number if number else fitted_s
         if budget.spent + each > until_s:
             budget.limited = True
-            field.condition(data, rows)
+            if number:
+                field.condition(data, rows)
             return None
         field.condition(data, np.setdiff1d(rows, group))
         batch = data.batch(group)
