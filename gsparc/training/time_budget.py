@@ -13,7 +13,7 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
-from gsparc.methods.time_budget import Spent, TimeBudget
+from gsparc.methods.time_budget import NOTHING, Spent, TimeBudget
 from gsparc.training.processes import agreed
 from gsparc.training.schedule import in_steps
 
@@ -60,7 +60,7 @@ class Budget(L.Callback):
     def __init__(self, pace: Pace | None, budget: TimeBudget) -> None:
         self.pace, self.budget, self._begin, self._process = pace, budget, budget.counted, os.getpid()
         self._validating = 0.0  # seconds of the longest validation: one more follows the last step
-        self._since = 0.0
+        self._since, self._resumed = 0.0, NOTHING
 
     @property
     def _learned(self) -> Spent:
@@ -77,7 +77,11 @@ class Budget(L.Callback):
             self.budget.moved()
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Say how far it is."""
+        """The schedule begins now; what making the Trainer took is no part of it, and shortens it."""
+        setup = self._learned - self._resumed
+        self._begin = self._begin + setup
+        if self.pace is not None:
+            self.pace.budget_s -= agreed(setup.by(self.budget.clock), trainer)
         self._look(trainer)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
@@ -103,7 +107,8 @@ class Budget(L.Callback):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there; older files know one clock."""
         wall = float(state["seconds"])
-        self.budget.charge(Spent(wall, float(state.get("processor_s", wall))))
+        self._resumed = Spent(wall, float(state.get("processor_s", wall)))
+        self.budget.charge(self._resumed)
 
 
 class Stretched(L.Callback):
