@@ -65,11 +65,11 @@ def of_station(site: Site, number: int) -> Site:
 
     Its hash is its own, so that nothing kept of one station is taken for another's.
     """
-    assert site.stations is not None
     site = replace(site, sha256=sha256(f"{site.sha256} {number}".encode()).hexdigest())
     if number == UNHEARD:
         return replace(site, stations=None, static_end=None, static_position=None)
     stations = site.stations
+    assert stations is not None
     carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
     rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
     return replace(

@@ -313,7 +313,7 @@ class _Search:
         powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
         start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
         values = replace(values, power=torch.tensor(start, dtype=torch.float64))
-        tried = []
+        tried: list[tuple[float, Values]] = []
         for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if gains else GAINS[:1]:
                 if tried and budget.over(LENGTHS_SHARE):
