@@ -35,7 +35,7 @@ def context_of(
         seed=int(config.seed),
         budget_s=config.budget_s,
         budget_clock=config.get("budget_clock", "wall"),
-        stations=config.get("stations", "each"),
+        stations=config.get("stations", "auto"),
         split=None if split is None else split_settings(plain(split)),
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),

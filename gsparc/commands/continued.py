@@ -1,4 +1,4 @@
-"""Jobs of a multirun, each done once: the same command in the same `hydra.sweep.dir` does what is left."""
+"""What was interrupted goes on: runs, and jobs of a multirun, each done once in its `hydra.sweep.dir`."""
 
 from __future__ import annotations
 
@@ -11,24 +11,31 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from gsparc.commands.run_lock import in_use
 from gsparc.commands.settings import plain
 from gsparc.data.claims import claimed
 from gsparc.data.files import whole_file
 from gsparc.evaluation.report.sweep import FAILURE
+from gsparc.evaluation.summary import provenance
+from gsparc.methods.parts import LAST
 
 log = logging.getLogger(__name__)
 
 RECORD = "job.json"  # of a job's folder: its settings, when it began, and what it returned
-LAST = ("refit/last.ckpt", "last.ckpt")  # the later stage first
+PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 
 
-def once(run_dir: Path, config: DictConfig, work: Callable[[DictConfig], float]) -> float:
+def once(
+    run_dir: Path, config: DictConfig, work: Callable[[DictConfig], float], again: bool = False
+) -> float:
     """What a job returns: as recorded where it has ended in this folder, else from its last checkpoint on.
 
     Args:
         run_dir: the job's own.
         config: of the job; `ckpt_path` is filled in where there is a checkpoint to go on from.
         work: does the job.
+        again: it is a run by itself: done anew where it has ended, and gone on with where the same settings
+            and program were interrupted in a folder beside this one.
 
     Raises:
         ValueError: another process is doing it.
@@ -37,27 +44,44 @@ def once(run_dir: Path, config: DictConfig, work: Callable[[DictConfig], float])
         if not mine:
             raise ValueError(f"{run_dir}: another process does this job; wait for its end")
         settings = json.loads(json.dumps(plain(config), default=str))
-        record = _read(run_dir / RECORD)
-        if record is None or record["settings"] != settings:
-            record = {"settings": settings, "began": time.time(), "returned": None}
+        record, other = _read(run_dir / RECORD), None
+        if record is None or record["settings"] != settings or (again and record["returned"] is not None):
+            record = {"settings": settings, "program": provenance(), "began": time.time(), "returned": None}
             _write(run_dir / RECORD, record)
+            other = _beside(run_dir, record) if again and config.ckpt_path is None else None
         elif record["returned"] is not None:
             log.info("%s: was done before", run_dir)
             return float(record["returned"])
         elif config.ckpt_path is None:
             config.ckpt_path = _left(run_dir, record["began"])
+        if other is not None:
+            config.ckpt_path, text = _left(other.parent, 0.0), "to begin anew, delete it"
+            log.info("going on from %s, where the same run was interrupted; %s", config.ckpt_path, text)
         (run_dir / FAILURE).unlink(missing_ok=True)  # of an earlier try
         value = work(config)
-        _write(run_dir / RECORD, {**record, "returned": value})
+        for path in (run_dir / RECORD, *([] if other is None else [other])):
+            _write(path, {**(_read(path) or record), "returned": value})
         return value
 
 
+def _beside(run_dir: Path, record: dict[str, Any]) -> Path | None:
+    """The record of the newest run beside this one that was interrupted, of the same settings and program."""
+    for path in sorted(run_dir.parent.glob(f"*/{RECORD}"), reverse=True):
+        one = None if path.parent == run_dir else _read(path)
+        if one is None or any(one.get(key) != record[key] for key in ("settings", "program", "returned")):
+            continue
+        if _left(path.parent, one["began"]) is not None and not in_use(path.parent):
+            return path
+    return None
+
+
 def _left(run_dir: Path, began: float) -> str | None:
-    """The last checkpoint of this job, or the folder of several folds; None: it begins anew."""
+    """The last checkpoint of this job, or the folder of one of many parts; None: it begins anew."""
     for name in LAST:
         if _is_of(run_dir / name, began):
             return str(run_dir / name)
-    return str(run_dir) if any(_is_of(path, began) for path in run_dir.glob("fold*/last.ckpt")) else None
+    parts = (path for pattern in PARTS for path in run_dir.glob(pattern))
+    return str(run_dir) if any(_is_of(path, began) for path in parts) else None
 
 
 def _is_of(path: Path, began: float) -> bool:

@@ -89,6 +89,15 @@ def held(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def in_use(folder: Path) -> bool:
+    """Whether another run writes there."""
+    try:
+        _locked(folder).release()
+    except InUse:
+        return True
+    return False
+
+
 def _locked(folder: Path) -> FileLock:
     """Its lock, held."""
     lock = FileLock(folder.resolve() / LOCK)

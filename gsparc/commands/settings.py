@@ -28,7 +28,7 @@ class RunSettings(Checked):
         baselines: names of methods; None: all plain ones that serve the data.
         budget_s: seconds of training, or of timing; None: as the rest is configured.
         budget_clock: `wall` or `processor`.
-        stations: `each` or `together`.
+        stations: `auto`, `each` or `together`.
     """
 
     seed: int = setting(0, whole(0, 2**32 - 1))
@@ -37,7 +37,7 @@ class RunSettings(Checked):
     baselines: tuple[str, ...] | None = ()
     budget_s: float | None = setting(None, or_null(POSITIVE))
     budget_clock: str = setting("wall", choice("wall", "processor"))
-    stations: str = setting("each", choice("each", "together"))
+    stations: str = setting("auto", choice("auto", "each", "together"))
 
     @classmethod
     def of(cls, config: DictConfig) -> RunSettings:

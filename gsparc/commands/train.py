@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,12 +43,15 @@ from gsparc.evaluation.summary import (
     write_samples,
     write_summary,
 )
-from gsparc.methods import checkpoint
+from gsparc.methods import checkpoint, parts
 from gsparc.methods.method import FitContext, FitReport, Method, TrainsByGradient
 from gsparc.methods.registry import build
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
+
+LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
 def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     RunSettings.of(config)
+    watch = TimeBudget(clock=config.budget_clock)
     module = _data(config)
     data = module.measurements
     objective_of(config, data.site.kind)  # refused now, not after the training
@@ -103,7 +107,8 @@ def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
     def keep(number: int, method: Method, report: FitReport) -> None:
         _log_fit(method, report, config.budget_s)
-        extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
+        marks = parts.marks(report, data, split.folds[number], context(number))
+        extra = {**marks, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(files[number], method, yaml, extra)
 
     model = partial(build, config.model)
@@ -112,10 +117,21 @@ def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     with tracking.opened(config.logger) as loggers:
         given = {"trainer": trainer, "callbacks": callbacks, "loggers": loggers, "datamodule": module}
 
-        def context(number: int) -> FitContext:
-            return context_of(config, run_dir=folders[number], resume=resumes[number], **given)
+        read_s = watch.spent  # counts: the seconds that are given begin with the first read
 
-        fitted = fit_and_score(model, data, split, context, eval_on=None, keep=keep)
+        def context(number: int) -> FitContext:
+            found = context_of(config, run_dir=folders[number], resume=resumes[number], **given)
+            if number or found.budget_s is None:
+                return found
+            return replace(found, budget_s=max(found.budget_s - read_s, LEAST_SHARE * found.budget_s))
+
+        try:
+            fitted = fit_and_score(model, data, split, context, eval_on=None, keep=keep)
+        except KeyboardInterrupt as stopped:
+            if count == 1:
+                raise
+            said = str(stopped).partition("; ")[0] or "interrupted"
+            raise KeyboardInterrupt(f"{said}; go on with ckpt_path={run_dir}") from None
         methods = fitted.methods
         found = evaluate(
             methods, fitted.train_s, data, split,
@@ -173,25 +189,25 @@ def _check_model(config: DictConfig, resumed: bool) -> None:
     method = build(config.model)
     if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
         raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
-    if resumed and not method.resumable:
+    if resumed and not method.resumable and not Path(config.ckpt_path).is_dir():  # with parts that finished
         raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
     for guess in method.guesses:
         log.info("guess: %s", guess)
 
 
 def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
-    """The checkpoint to go on from; a run with several folds resumes each from its own folder."""
+    """What to go on from, a file or a folder; each of several folds has its own in the run's."""
     if config.ckpt_path is None:
         return None
     path = Path(config.ckpt_path)
     if folds == 1:
         return path
-    own = path / f"fold{number}" / "last.ckpt"
-    if path.is_file():
+    own = parts.folder_of(path, parts.FOLDS) / f"fold{number}"
+    if path.is_file() and own not in path.parents and not own.parent.glob("fold*"):
         raise ValueError(
             f"ckpt_path={path}: split={config.split.name} has {folds} folds, give the run's folder"
         )
-    return own if own.exists() else None
+    return own if own.is_dir() else None
 
 
 def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
@@ -224,15 +240,14 @@ def objective_of(config: DictConfig, kind: Kind) -> str:
 
 
 def task(config: DictConfig) -> float:
-    """Train as configured and show the table; a job of a multirun that has ended here is not done again.
+    """Train as configured and show the table; what was interrupted goes on, see `once`.
 
     Returns:
         The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned; NaN
             where the data do not tell it and no search asks.
     """
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
-        return once(run_directory(), config, _train_and_show)
-    return _train_and_show(config)
+    job = HydraConfig.get().mode == RunMode.MULTIRUN
+    return once(run_directory(), config, _train_and_show, again=not job)
 
 
 def _train_and_show(config: DictConfig) -> float:

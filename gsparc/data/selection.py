@@ -127,6 +127,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
         name: array[chosen] if per_station(name, array, count) else array
         for name, array in raw.arrays.items()
     }
+    arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
     if "station" in arrays:
         rows = np.flatnonzero(np.isin(raw.arrays["station"], chosen))
         _left(rows, "dataset.stations", source)

@@ -20,6 +20,7 @@ from gsparc.methods.censored import silent
 from gsparc.methods.coarse_grid import Filled
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows
+from gsparc.methods.haste import CHOSEN_ON
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.nearest_targets import NearestTargets, learned, projected
@@ -27,7 +28,6 @@ from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.pareto import Settings
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.power_process import (
-    CHOSEN_ON,
     MEANS,
     MOST_ROWS,
     MeanName,

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
     from gsparc.methods.power_process import PowerProcess
 
-StationModels = Literal["each", "together"]
+StationModels = Literal["auto", "each", "together"]
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class FitReport:
     """What fitting cost.
 
     Attributes:
-        seconds: training time without validation, testing or pictures [s].
+        seconds: that it took, validations too [s].
         notes: what a reader must know (early stop, dropped components), one line each.
         limited_by: the clock whose seconds decided something, so that another machine's result may differ.
     """
@@ -79,10 +79,11 @@ class FitContext:
         seed: of whatever is random and has no seed of its own.
         budget_s: seconds of training; None: as the method is configured.
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
-        stations: of several, whether `each` has a model or all are one's `together`.
+        stations: of several, whether `each` has a model or all are one's `together`; `auto` as the method's
+            `best_stations` says.
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
         leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
-        resume: what an interrupted run left, to go on from.
+        resume: what an interrupted run left, to go on from: a file, or the folder of a run of parts.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
         datamodule: the run's `DataModule`, whose loaders gradient training on its measurements goes through.
@@ -99,7 +100,7 @@ class FitContext:
     seed: int = 0
     budget_s: float | None = None
     budget_clock: Clock = "wall"
-    stations: StationModels = "each"
+    stations: StationModels = "auto"
     split: SplitSettings | FileSettings | None = None
     leave_out: tuple[np.ndarray, ...] = ()
     resume: Path | None = None
@@ -117,7 +118,7 @@ class FitContext:
         if self.budget_clock not in get_args(Clock):
             raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
         if self.stations not in get_args(StationModels):
-            raise ValueError(f"stations={self.stations!r}: one of each, together is needed")
+            raise ValueError(f"stations={self.stations!r}: one of auto, each, together is needed")
         if type(self.batch_size) is not int or self.batch_size < 1:
             raise ValueError(
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
@@ -183,6 +184,16 @@ class Method(ABC):
     def shares(self, site: Site) -> bool:
         """Whether it learns several stations of this site at once, told which by `Batch.station`."""
         return False
+
+    def best_stations(
+        self, data: Measurements, fold: Fold, context: FitContext
+    ) -> tuple[Literal["each", "together"], str]:
+        """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
+        return "each", ""
+
+    def usual_s(self, site: Site) -> float | None:
+        """Seconds of all stations together where `FitContext.budget_s` says nothing; None: no end [s]."""
+        return self.own_budget_s
 
     def problem(self, data: Measurements) -> str | None:
         """Why it cannot serve these measurements, as far as that is known before a fit; None where it may."""

@@ -7,9 +7,13 @@ moving, so that its query is (tx, rx), where the method can do that.
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import reduce
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,10 +27,13 @@ from gsparc.methods.censored import heard
 from gsparc.methods.label import common_label
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction, Reconditions
 from gsparc.methods.reduced import View
-from gsparc.methods.time_budget import Clock, less_repeatable
+from gsparc.methods.time_budget import Clock, Spent, less_repeatable
 from gsparc.ops import Pose
 
+log = logging.getLogger(__name__)
+
 SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
+LEAST_SHARE = 0.5  # of an even part of the seconds, which every station has though earlier ones took more
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
@@ -54,11 +61,15 @@ def trained_stations(method: Method, data: Measurements, fold: Fold) -> tuple[np
 
 
 def of_station(site: Site, number: int) -> Site:
-    """The site as one station sees it; of `UNHEARD`, with both ends moving."""
-    assert site.stations is not None
+    """The site as one station sees it; of `UNHEARD`, with both ends moving.
+
+    Its hash is its own, so that nothing kept of one station is taken for another's.
+    """
+    site = replace(site, sha256=sha256(f"{site.sha256} {number}".encode()).hexdigest())
     if number == UNHEARD:
         return replace(site, stations=None, static_end=None, static_position=None)
     stations = site.stations
+    assert stations is not None
     carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
     rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
     place = stations.position[number]
@@ -98,14 +109,22 @@ class PerStation(Method):
         """Fit every station that is asked for, or all together; seconds are shared.
 
         Together, a method that shares stations learns them as they are, any other as if both ends moved.
+        What an interrupted run finished is taken from its folder (`FitContext.resume`).
 
         Raises:
             ValueError: a station of the test rows has too few training rows, or all are learned together, and
                 the method cannot take both ends for moving.
         """
+        from gsparc.methods import checkpoint, parts  # checkpoints hold this class
+
         assert data.station is not None and data.site.stations is not None
-        together = context.stations == "together"
-        joint = self.wrapped.shares(data.site)
+        whole = self.wrapped.usual_s(data.site) if context.budget_s is None else context.budget_s
+        budget = context.time_budget(math.inf if whole is None else whole)
+        how = context.stations
+        if how == "auto":
+            how, why = self.wrapped.best_stations(data, fold, replace(context, budget_s=whole))
+            log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
+        together, joint = how == "together", self.wrapped.shares(data.site)
         self._shared = together and joint
         if together and not (joint or self.wrapped.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
@@ -121,24 +140,53 @@ class PerStation(Method):
             numbers.append(UNHEARD)
         if UNHEARD in numbers and not joint and np.isnan(data.site.stations.position).any():
             raise ValueError(f"{self.name}: places of stations are unknown, it needs them; say stations=each")
-        whole = self.wrapped.own_budget_s if context.budget_s is None else context.budget_s
-        share = None if whole is None else whole / len(numbers)
-        seconds, notes = 0.0, []
+        notes: list[str] = []
+        left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
+        kept = self.wrapped.resumable and context.run_dir != Path()
         limited: Clock | None = None
-        for number in numbers:
+        if kept and left is None:  # of an earlier run in this folder
+            for file in context.run_dir.glob("station*/**/*.ckpt"):
+                file.unlink()
+        for turn, number in enumerate(numbers):
             rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
             copy, part = self._make(), data.subset(rows, self._site_of(data.site, number))
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
+            name = "all stations" if together else "stations never heard"
+            name = name if number == UNHEARD else data.site.stations.name[number]
+            folder = "unheard" if number == UNHEARD else f"station{number}"
+            share = None
+            if whole is not None:
+                share = max(
+                    (whole - budget.spent) / (len(numbers) - turn), LEAST_SHARE * whole / len(numbers)
+                )
             own = context.within(
-                f"station{number}" if number != UNHEARD else "unheard", budget_s=share, datamodule=None
+                folder, budget_s=share, datamodule=None, resume=None if left is None else left / folder
             )
-            report = copy.fit(part, inner, own)
+            if self.wrapped.takes_budget and len(numbers) > 1:
+                spent = budget.spent
+                rest = spent / turn * (len(numbers) - turn) if whole is None and turn else None
+                rest = rest if whole is None else max(whole - spent, 0.0)
+                said = "" if rest is None else f", about {rest:.0f} s left for all"
+                log.info("station %d of %d: %s%s", turn + 1, len(numbers), name, said)
+            before = budget.counted.wall
+            try:
+                report = parts.fit(copy, part, inner, own)
+            except KeyboardInterrupt:
+                if not kept or len(numbers) == 1:
+                    raise
+                said = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
+                raise KeyboardInterrupt(f"{said}; go on with ckpt_path={context.run_dir}") from None
+            if kept and len(numbers) > 1:
+                extra = parts.marks(report, part, inner, own)
+                checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
+            earlier = max(
+                report.seconds - (budget.counted.wall - before), 0.0
+            )  # spent by the interrupted run
+            budget.charge(Spent(earlier, earlier))
             self._copies[number] = copy
-            seconds, limited = seconds + report.seconds, less_repeatable(limited, report.limited_by)
-            all_or_new = "all stations" if together else "stations never heard"
-            name = all_or_new if number == UNHEARD else data.site.stations.name[number]
+            limited = less_repeatable(limited, report.limited_by)
             notes += [f"{name}: {note}" for note in report.notes]
-        return FitReport(seconds, tuple(notes), limited)
+        return FitReport(budget.counted.wall, tuple(notes), limited)
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; stations without rows among these are then as if never heard."""

@@ -19,19 +19,19 @@ from gsparc.data.schema import Site
 from gsparc.methods.censored_ep import condition, log_evidence, propagate
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows, law_of
+from gsparc.methods.haste import UNHURRIED, Haste
 from gsparc.methods.nearest_process import NearestProcess, Values, given, settings_of
 from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, choose, kernel_of, slopes
 from gsparc.methods.trend import REACH, Trend, trend_of
-from gsparc.methods.worker import late, stop_when_late
+from gsparc.methods.worker import late, late_when, stop_when_late
 
 log = logging.getLogger(__name__)
 
 MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
-CHOSEN_ON = 1_000  # rows that settings are chosen on: each look at them factors a matrix
-COMPARED_ON = 500  # of them, constant and distance law
+COMPARED_ON, LEAST_COMPARED_ON = 500, 150  # of them, constant and distance law; in haste
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
 MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
 MOST_SILENT = 3_000  # of them, where nothing was heard
@@ -131,7 +131,7 @@ def restored(state: dict[str, Any]) -> Process:
 
 
 def fit_powers(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int | None = None
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
 ) -> tuple[Process, tuple[str, ...]]:
     """A process of largest leave-one-out likelihood, and what must be said of it.
 
@@ -142,29 +142,38 @@ def fit_powers(
         site: where the still end is.
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
-        chosen_on: rows that settings are chosen on, of more; None: CHOSEN_ON.
+        haste: see there.
     """
-    process, notes = _fitted(rows, _trends(rows, site, mean), seed, chosen_on)
-    return process, (_description(process.trend, process.kernel), *notes)
+    trend, kernel, notes = choose_prior(rows, site, mean, seed, haste)
+    process, more = conditioned(rows, trend, kernel, seed)
+    return process, (*notes, *more)
 
 
-def fit_about(
-    rows: Rows, trend: Trend, seed: int = 0, chosen_on: int | None = None
-) -> tuple[Process, tuple[str, ...]]:
-    """The same about a mean law that is given."""
-    return _fitted(rows, [(trend, 0, ())], seed, chosen_on)
+def choose_prior(
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
+) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
+    """The settings of `fit_powers` alone, and what must be said of them."""
+    trend, kernel, notes = _chosen(rows, _trends(rows, site, mean), seed, haste)
+    return trend, kernel, (_description(trend, kernel), *notes)
 
 
-def _fitted(
-    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int | None
-) -> tuple[Process, tuple[str, ...]]:
-    """The process about the best of `trends`, and what must be said of it."""
-    trend, kernel, said = _settings(rows, trends, seed, chosen_on)
+def choose_about(
+    rows: Rows, trend: Trend, seed: int = 0, haste: Haste = UNHURRIED
+) -> tuple[PowerKernel, tuple[str, ...]]:
+    """The kernel about a mean law that is given, and what must be said of it."""
+    return _chosen(rows, [(trend, 0.0, ())], seed, haste)[1:]
+
+
+def _chosen(
+    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
+) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
+    """The best of `trends` with its kernel, and what must be said of the choice."""
+    with late_when(haste.late):
+        trend, kernel, said = _settings(rows, trends, seed, haste)
     if len(rows.places) > MOST_ROWS and not rows.silent.any():  # these tell of settings too
         kernel, how = settings_of(Values.of(rows.places, rows.decibels), trend, kernel, seed)
         said = (*said, f"then {how}")
-    process, more = conditioned(rows, trend, kernel, seed)
-    return process, (*said, *more)
+    return trend, kernel, said
 
 
 def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
@@ -190,13 +199,14 @@ class _Candidate:
 
 
 def _settings(
-    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int | None
+    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
 ) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
     """Mean, lengths and noise, chosen on a part of many rows, and what must be said of the choice."""
     loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
-    loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on or CHOSEN_ON, seed))
-    few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
-    weighed = rows.at(draw(rows.silent, WEIGHED_ON, seed))
+    loud = loud.at(draw(np.zeros(len(loud.places), bool), haste.rows, seed))
+    compared_on = min(COMPARED_ON, max(haste.rows // 2, LEAST_COMPARED_ON))
+    few = loud.at(draw(np.zeros(len(loud.places), bool), compared_on, seed))
+    weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, haste.rows), seed))
     both = weighed.silent.any() and not weighed.silent.all()
     found = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     if both and not late():

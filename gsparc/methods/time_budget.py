@@ -95,6 +95,11 @@ class TimeBudget:
         if self._since is None:
             self._since = self._now()
 
+    def moved(self) -> None:
+        """Count on in another process, whose processor time began with it."""
+        if self._since is not None:
+            self._since = Spent(self._since.wall, 0.0)
+
     def over(self, share: float = 1.0) -> bool:
         """Whether that share of it is spent; whoever asks then ends what it does."""
         found = self.spent > share * self.seconds

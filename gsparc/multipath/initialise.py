@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,9 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, residuals
 from gsparc.field.initial import InitSettings
+from gsparc.methods.haste import factor_s
 from gsparc.methods.method import FitContext, FitReport
+from gsparc.methods.time_budget import TimeBudget, less_repeatable
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.known.method import KnownWallsGP
@@ -29,20 +30,23 @@ from gsparc.multipath.waves.settings import ChannelSettings
 log = logging.getLogger(__name__)
 
 NO_BLOCKERS = PowerSettings(most=0)
+COMPLETION_SHARE = 0.15  # of the seconds of sources, for that process
+FACTORS = 4.0  # covariances of all rows that it needs at least
 LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
 
 
 def sources(
     data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
-    """Image sources of several searches."""
+    """Image sources of several searches, and a process on what they leave within the same seconds."""
+    budget = context.time_budget()
     method = ImageSourceGP(
         searches=init.searches, search_rows=init.search_rows, rows=init.rows, margin=init.margin,
         max_sources=init.max_sources, order=init.order, clutter=clutter, edges=init.edges,
         offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
-    return _completed(SourceField(method), data, report)
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
+    return _completed(SourceField(method), data, report, budget)
 
 
 def scene(
@@ -55,12 +59,13 @@ def scene(
     """
     if data.site.kind == "rssi":
         return powers(data, rows, init, clutter, context)
+    budget = context.time_budget()
     method = KnownWallsGP(
         read_walls(init.file), search_rows=init.search_rows, rows=init.rows, max_sources=init.max_sources,
         order=init.order, clutter=clutter, offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
-    return _completed(SourceField(method), data, report)
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
+    return _completed(SourceField(method), data, report, budget)
 
 
 def rays(
@@ -115,21 +120,34 @@ def joint_powers(
     return field, FitReport(budget.counted.wall, notes, budget.limited_by)
 
 
+def _searching(data: Measurements, context: FitContext) -> FitContext:
+    """The seconds of a search: without those for `_completed`."""
+    share = 1.0 if context.budget_s is None or data.target[0].size > 1 else 1 - COMPLETION_SHARE
+    return replace(context, budget_s=None if context.budget_s is None else share * context.budget_s)
+
+
 def _completed(
-    field: ConditionalField, data: Measurements, report: FitReport
+    field: ConditionalField, data: Measurements, report: FitReport, budget: TimeBudget
 ) -> tuple[ConditionalField, FitReport]:
     """With a process on what the sources leave, where leaving rows out says that it pays."""
     if data.target[0].size > 1:
         return field, report
-    began = time.monotonic()
+    began = budget.counted.wall
     left = field.left_out()
+    if budget.seconds - budget.spent < FACTORS * factor_s(len(left.rows)):
+        budget.limited = True
+        note = "no time for a process on what the sources leave"
+        return field, replace(report, notes=(*report.notes, note), limited_by=budget.clock)
     remainder = residuals(field, data)
-    residual, _ = waves.initialise(remainder, left.rows, ChannelSettings(direct=False, constant=False))
+    settings = ChannelSettings(direct=False, constant=False)
+    residual, _ = waves.initialise(remainder, left.rows, settings, budget)
     missed = torch.from_numpy(data.target[left.rows]).flatten() - left.mean.flatten()
     predicted = residual.left_out().mean.flatten()
     overlap = float((predicted.conj() * missed).real.sum())
     weight = min(max(overlap / max(float(predicted.abs().square().sum()), 1e-30), 0.0), 1.0)
     gain = 1 - float((missed - weight * predicted).abs().square().sum() / missed.abs().square().sum())
     note = f"a process explains {max(gain, 0):.0%} of what the sources leave, left out one by one"
-    report = replace(report, seconds=report.seconds + time.monotonic() - began, notes=(*report.notes, note))
+    limited = less_repeatable(report.limited_by, budget.limited_by)
+    seconds = report.seconds + budget.counted.wall - began
+    report = FitReport(seconds, (*report.notes, note), limited)
     return (CompletedField(field, residual, weight) if gain >= LEAST_GAIN else field), report

@@ -30,7 +30,7 @@ from gsparc.training.time_budget import SPENT, Budget, Stretched
 
 log = logging.getLogger(__name__)
 
-SECONDS, TAKEN = "time/learning_s", "steps/taken"
+TAKEN = "steps/taken"
 KEPT = ("steps/kept", "steps/kept_position")
 CONDITIONAL_ROWS = 256  # of a step of a conditional field: it factors a matrix of this size
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
@@ -55,7 +55,7 @@ class Ran:
     """What a stage took.
 
     Attributes:
-        seconds: spent learning [s].
+        seconds: that it took, validations too [s].
         steps: whose result is kept.
         position: of that in the schedule [steps]; None where nothing was kept back.
     """
@@ -78,12 +78,11 @@ def total_steps(context: FitContext) -> int:
 
 
 class BringHome(L.Callback):
-    """Time and steps of training as metrics: of all attributes, only these leave a process."""
+    """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Also after a checkpoint with every step done."""
-        for name, value in ((SECONDS, module.train_seconds), (TAKEN, trainer.global_step)):
-            trainer.callback_metrics[name] = torch.tensor(value, dtype=torch.float64)
+        trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
 
 
 class _Stopped(BaseException):
@@ -137,13 +136,11 @@ def run_stage(
 ) -> Ran:  # fmt: skip
     """Train `module` on `fold.train`, watching `fold.val`.
 
-    The budget is paused before and after, and counts them too.
-
     Args:
         module: what is trained.
         data, fold, context: of the fit.
         checkpoints: how `last.ckpt` is written.
-        budget: of the fit.
+        budget: of the fit, running.
         watch: callbacks that say which steps are kept.
         validate_every: steps between validations; None: as the Trainer is configured.
 
@@ -152,6 +149,8 @@ def run_stage(
     """
     folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
     before = budget.counted
+    budget.pause()
+    budget.go()  # what other processes go on from
     if module.conditional:  # a row is predicted from the others of its batch
         batches = Loaded(data, min(len(fold.train), CONDITIONAL_ROWS))
     elif batches is None or batches.measurements is not data:
@@ -208,10 +207,10 @@ def run_stage(
     finally:
         batches.trainer = None  # which holds the optimizer's state
     metrics = trainer.callback_metrics
-    learned = float(metrics[SECONDS]) or float(metrics[SPENT][0]) - before.wall  # where no ledger counts
-    budget.charge(Spent(*metrics[SPENT].tolist()) - budget.counted)
+    more = Spent(*metrics[SPENT].tolist()) - budget.counted  # of other processes, and of an earlier run
+    budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
     steps, position = (int(metrics[name]) if name in metrics else None for name in KEPT)
-    return Ran(learned, int(metrics[TAKEN]) if steps is None else steps, position)
+    return Ran((budget.counted - before).wall, int(metrics[TAKEN]) if steps is None else steps, position)
 
 
 def _lost(error: ProcessException, advice: str) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import logging
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, StackedField, learns
+from gsparc.methods.haste import factor_s
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.pareto import Settings
@@ -31,7 +32,7 @@ from gsparc.methods.registry import field_initialiser, method_class
 from gsparc.methods.run_factors import RunFactors
 from gsparc.methods.time_budget import TimeBudget, less_repeatable
 from gsparc.ops import Pose
-from gsparc.training import process_average, solution_weights, solutions
+from gsparc.training import process_average, solution_weights, solutions, stations
 from gsparc.training.auto_settings import resolve
 from gsparc.training.checkpoint_io import GsparcCheckpointIO
 from gsparc.training.fit import run_stage, total_steps
@@ -48,6 +49,9 @@ log = logging.getLogger(__name__)
 
 DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
+BEFORE, AFTER = 3.0, 3.0  # validations that steps take at least, and that may follow when seconds end them
+LEAST_STEPS_S = 0.5  # less is not worth to set up
+LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fit makes, and rows of one
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
 
 
@@ -144,9 +148,12 @@ class Gsparc(LearnedField):
         return not self._alone
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
+        self._reserve_s = 0.0
         if self.plan is not None and self.plan.plain:
+            watch = TimeBudget()
             self._average, explained = process_average.weigh(self, data, fold, self._left_out, self._apart)
             self.explained = self.explained if explained is None else explained
+            self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
 
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
@@ -156,10 +163,17 @@ class Gsparc(LearnedField):
         budget = context.time_budget()
         log.info(
             "training a Gaussian field with closed-form weights: init=%s, then at most %d gradient steps, "
-            "within %g s; callbacks: %s", " and ".join(chosen.parts), self._most_steps(context),
+            "within %.3g s; callbacks: %s", " and ".join(chosen.parts), self._most_steps(context),
             context.budget_s, KeepBest.__name__,
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
+        count = 1 if data.site.stations is None else len(data.site.stations)
+        alone = LEAST_FACTORS * count * factor_s(min(len(known) // count, MOST_FACTORED))
+        least = alone if len(chosen.parts) == 1 else alone * (1 + solutions.GROUPS)
+        if least > budget.seconds:
+            log.warning(
+                "%g s are too few: the least fit of these rows takes about %.0f s", budget.seconds, least
+            )
         several = len(chosen.parts) > 1
         held = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
         init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
@@ -176,12 +190,13 @@ class Gsparc(LearnedField):
             "%s of %d Gaussians from init=%s, terms %s", type(self.field).__name__, self.field.count,
             self.started, ", ".join(self.field.terms) or "none",
         )  # fmt: skip
-        self.steps, moved = self._take_steps(data, fold, context, budget)
+        self.steps, moved = self._take_steps(data, fold, context, budget, several)
         stepped = budget.counted.wall
         if moved or several:  # else it is of these rows already
             self.field.condition(data, known)
         seconds = budget.counted.wall
         stages = {name: report.seconds for name, report in reports.items()}
+        stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
         _log_cost(stages, seconds)
         notes = [note for name in self.started.split("+") for note in reports[name].notes]
@@ -201,9 +216,12 @@ class Gsparc(LearnedField):
         return self.runs.aligned(data)
 
     def _take_steps(
-        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
+        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, apart: bool
     ) -> tuple[int, bool]:
         """Gradient steps under Lightning, as many as validation gains by.
+
+        Args:
+            apart: whether the field was conditioned on training rows alone.
 
         Returns:
             Their number, and whether the field is conditioned on other rows than before, or has moved.
@@ -213,8 +231,10 @@ class Gsparc(LearnedField):
         if not len(fold.val):
             log.info("gradient steps: none, there are no validation rows to say whether they pay")
             return 0, False
+        began = budget.spent
         if field.count:
-            field.condition(data, fold.train)
+            if not apart:
+                field.condition(data, fold.train)
             batch = data.batch(fold.val)
             target, found = comparable(batch.target, data.site), field(batch.tx, batch.rx)
             assert found.explained is not None
@@ -223,23 +243,45 @@ class Gsparc(LearnedField):
         if isinstance(getattr(field, "process", None), NearestProcess):
             log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
             return 0, field.count > 0
-        if not learns(field) or budget.over(1 - STEPS_SHARE / 2):
-            log.info(
-                "gradient steps: none, %s", "no seconds are left" if learns(field) else "nothing to move"
-            )
+        if not learns(field):
+            log.info("gradient steps: none, nothing to move")
             return 0, field.count > 0
+        each = factor_s(min(len(fold.train), MOST_FACTORED))  # about what a validation takes
+        if (BEFORE + AFTER) * each + LEAST_STEPS_S > budget.seconds - budget.spent:
+            log.info("gradient steps: none, no seconds are left")
+            return 0, field.count > 0
+        if not field.count:
+            field.condition(data, fold.train)  # as a validation does
+        left = budget.seconds - budget.spent - AFTER * (budget.spent - began)
+        if left < BEFORE * (budget.spent - began) or left < LEAST_STEPS_S:
+            log.info("gradient steps: none, no seconds are left")
+            return 0, True
         inner = context.within("steps", resume=None)
         steps = self._most_steps(context)
-        pace = Pace(steps, budget.seconds - budget.spent)
-        module = GaussianModule(field, self.loss, self.rates, steps, inner.run_dir, pace)
+        module = GaussianModule(field, self.loss, self.rates, steps, inner.run_dir, Pace(steps, left))
         files = GsparcCheckpointIO(self, context.config_yaml, {"stage": "steps"})
-        budget.pause()
-        ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
-        budget.go()
+        try:
+            ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
+        except KeyboardInterrupt:  # these steps are taken anew; what searches found is kept
+            searched = context.run_dir / "last.ckpt"
+            said = f"go on with ckpt_path={searched}" if searched.exists() else "there is no checkpoint yet"
+            raise KeyboardInterrupt(f"training was interrupted; {said}") from None
         return ran.steps, True
 
     def _most_steps(self, context: FitContext) -> int:
         return total_steps(context) if self.most_steps is None else self.most_steps
+
+    def best_stations(
+        self, data: Measurements, fold: Fold, context: FitContext
+    ) -> tuple[Literal["each", "together"], str]:
+        """See `Method.best_stations`."""
+        if not self.shares(data.site) or self.init.name == "scene":
+            return "each", ""
+        return stations.best(data, fold, context)
+
+    def usual_s(self, site: Site) -> float | None:
+        """See `Method.usual_s`; steps, not seconds, are counted where Gaussians are rendered."""
+        return None if site.kind == "spectrum" else DEFAULT_BUDGET_S
 
     # -- answering ---------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField
 from gsparc.field.initial import InitSettings
+from gsparc.methods.haste import factor_s
 from gsparc.methods.method import FitContext, FitReport
 from gsparc.methods.registry import field_initialiser
 from gsparc.methods.time_budget import TimeBudget
@@ -28,7 +29,10 @@ log = logging.getLogger(__name__)
 
 GROUPS = 3  # of training rows, that solutions are weighed by
 FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8, "edges": False}
+CLOSED_SHARE = 0.3  # of the seconds, for what takes no more than it needs beside what does
 FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
+SEARCH_LOOKS = 60  # at a search's rows, that the shortest takes
+LEAST_S = 0.2  # of a part, though others left none
 OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
 SEARCHES = ("sources", "bearings")  # of them, those that also give an answer of few sources
 
@@ -56,7 +60,8 @@ def find(
     several = held is not None
     rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
     groups = () if held is None else _groups(held, fold.train)
-    plans = [(part, init, 1.0) for part in parts if part not in OPEN_ENDED]
+    first = CLOSED_SHARE if any(part in OPEN_ENDED for part in parts) else 1.0
+    plans = [(part, init, first) for part in parts if part not in OPEN_ENDED]
     for part in (part for part in parts if part in OPEN_ENDED):
         if several and part in SEARCHES:
             plans.append((f"few {part}", replace(init, **FEW), FEW_SHARE))
@@ -64,10 +69,15 @@ def find(
     found: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
     for name, settings, share in plans:
-        within = replace(context, budget_s=share * max(until_s - budget.spent, 1.0))
+        part = name.split()[-1]
+        least = SEARCH_LOOKS * factor_s(settings.search_rows) if part in SEARCHES else 0.0
+        if found and context.resume is None and least > until_s - budget.spent:
+            log.info("init=%s is left out: the seconds are too few for a search", name)
+            budget.limited = True
+            continue
+        within = replace(context, budget_s=share * max(until_s - budget.spent, LEAST_S))
         if name.startswith("few "):
             within = replace(within, run_dir=Path(), resume=None)
-        part = name.split()[-1]
         try:
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
             within = replace(within, leave_out=leave_out)
@@ -78,7 +88,7 @@ def find(
                 field = field.field
             found[name] = field
             if part not in OPEN_ENDED:
-                field.held = _held(field, data, rows, groups)
+                field.held = _held(field, data, rows, groups, until_s, budget, report.seconds)
         except KeyboardInterrupt:
             if not name.startswith("few "):
                 raise
@@ -146,13 +156,25 @@ def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _held(
-    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
-) -> LeftOutRows | None:
-    """Rows of every group, predicted from the others with the parameters of all."""
+    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...],
+    until_s: float, budget: TimeBudget, fitted_s: float,
+) -> LeftOutRows | None:  # fmt: skip
+    """Rows of every group, predicted from the others with the parameters of all; None where time is short.
+
+    Args:
+        until_s: second of the budget by which that must be done.
+        fitted_s: seconds of the fit, about what the weights may take at most.
+    """
     if not groups:
         return None
-    found = []
-    for group in groups:
+    found, began = [], budget.spent
+    for number, group in enumerate(groups):
+        each = (budget.spent - began) / number if number else fitted_s
+        if budget.spent + each > until_s:
+            budget.limited = True
+            if number:
+                field.condition(data, rows)
+            return None
         field.condition(data, np.setdiff1d(rows, group))
         batch = data.batch(group)
         found.append(field(batch.tx, batch.rx))

@@ -107,6 +107,7 @@ class LearnedField(Method):
         self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._billed = Spent()  # for reusable work, by the stages so far
         self.frozen: FrozenView | FrozenArray | None = None
+        self._reserve_s = 0.0  # of the budget, for what follows the last stage [s]
         self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
         self._left_out: LeftOut | None = None  # of the initialiser; not stored
         self._apart: float | None = None  # validation rows from the nearest training row, median [m]
@@ -132,7 +133,6 @@ class LearnedField(Method):
         marks = {} if resumed is None else resumed.extra
         stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
         budget = context.time_budget(before=Spent(*marks.get("spent", (seconds, seconds))))
-        budget.pause()
         now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self.spent, self._apart = {}, _apart(data, fold)
@@ -145,10 +145,10 @@ class LearnedField(Method):
         if self._solved(fold):
             if self.refit:
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
-            seconds = self._stage("train", origin, data, fold, context, budget, seconds)
+            self._stage("train", origin, data, fold, context, budget, seconds)
             self._weigh_process(data, fold)
             self.frozen = None
-            return FitReport(seconds, limited_by=self._limited_by)
+            return FitReport(budget.counted.wall, limited_by=self._limited_by)
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
@@ -160,9 +160,9 @@ class LearnedField(Method):
             resume = context.resume if stage == "refit" else None
             again = context.within("refit", resume=resume)
             confidence = self.fitted().confidence
-            seconds += self._stage("refit", origin, data, every, again, budget, seconds, confidence)
+            self._stage("refit", origin, data, every, again, budget, seconds, confidence)
         self.frozen = None
-        return FitReport(seconds, limited_by=self._limited_by)
+        return FitReport(budget.counted.wall, limited_by=self._limited_by)
 
     def _pays(self) -> bool:
         """Whether another stage is worth its seconds."""
@@ -180,14 +180,10 @@ class LearnedField(Method):
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
         budget: TimeBudget, earlier_s: float, confidence: Confidence | None = None,
     ) -> float:  # fmt: skip
-        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s].
-
-        The budget is paused before and after.
-        """
+        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
         folder, resume = context.run_dir, context.resume
         L.seed_everything(context.seed, verbose=False)
         started = budget.counted
-        budget.go()
         assert self.choices is not None
         if context.init_from is not None and resume is None and stage == "train":
             self._start_from(data.site, context.init_from)
@@ -211,7 +207,6 @@ class LearnedField(Method):
             self.restore(data.site, checkpoint.read(resume).state)
         if confidence is not None:
             self.fitted().confidence = confidence.requires_grad_(False)
-        budget.pause()
         prepared = (budget.counted - started).wall
         self.init_s = (self.init_s or 0.0) + prepared
         again = "" if stage == "train" else " again, on all rows"
@@ -221,7 +216,7 @@ class LearnedField(Method):
         steps, pace = total_steps(context) if self.most_steps is None else self.most_steps, None
         if context.budget_s is not None:
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
-            end = context.budget_s * (0.5 if first else 1.0)
+            end = context.budget_s * 0.5 if first else context.budget_s - self._reserve_s
             pace = Pace(steps, end - budget.spent)
             if pace.budget_s <= 0:
                 log.warning(

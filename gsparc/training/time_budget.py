@@ -6,13 +6,14 @@ its schedule the training is.
 
 from __future__ import annotations
 
+import os
 from dataclasses import astuple
 from typing import Any
 
 import lightning.pytorch as L
 import torch
 
-from gsparc.methods.time_budget import Spent, TimeBudget
+from gsparc.methods.time_budget import NOTHING, Spent, TimeBudget
 from gsparc.training.processes import agreed
 from gsparc.training.schedule import in_steps
 
@@ -49,15 +50,17 @@ class Pace:
 
 
 class Budget(L.Callback):
-    """Counts the seconds of training, and ends it with its pace; validation is not billed.
+    """Counts the seconds of a stage, validations too, and ends it with its pace.
 
     Args:
         pace: told after every step; None where steps decide.
-        budget: paused, with all that was spent before the first step.
+        budget: running, with all that was spent before.
     """
 
     def __init__(self, pace: Pace | None, budget: TimeBudget) -> None:
-        self.pace, self.budget, self._begin = pace, budget, budget.counted
+        self.pace, self.budget, self._begin, self._process = pace, budget, budget.counted, os.getpid()
+        self._validating = 0.0  # seconds of the longest validation: one more follows the last step
+        self._since, self._resumed = 0.0, NOTHING
 
     @property
     def _learned(self) -> Spent:
@@ -65,30 +68,33 @@ class Budget(L.Callback):
 
     def _look(self, trainer: L.Trainer) -> None:
         if self.pace is not None:
-            self.pace.spend(agreed(self._learned.by(self.budget.clock), trainer))
+            self.pace.spend(agreed(self._learned.by(self.budget.clock) + self._validating, trainer))
             trainer.should_stop = trainer.should_stop or self.pace.over
 
+    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
+        """Of several processes each has a processor time of its own."""
+        if os.getpid() != self._process:
+            self.budget.moved()
+
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Start the watch."""
+        """The schedule begins now; what making the Trainer took is no part of it, and shortens it."""
+        setup = self._learned - self._resumed
+        self._begin = self._begin + setup
+        if self.pace is not None:
+            self.pace.budget_s -= agreed(setup.by(self.budget.clock), trainer)
         self._look(trainer)
-        self.budget.go()
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Say how far it is; end when it is over."""
         self._look(trainer)
 
     def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Stop the watch."""
-        self.budget.pause()
+        """Look at the clock."""
+        self._since = self.budget.spent
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Go on."""
-        if trainer.state.fn == "fit":
-            self.budget.go()
-
-    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Stop the watch."""
-        self.budget.pause()
+        """How long it took."""
+        self._validating = max(self._validating, self.budget.spent - self._since)
 
     def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
         """Bring home what was spent; only metrics leave the process where there are several devices."""
@@ -101,7 +107,8 @@ class Budget(L.Callback):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there; older files know one clock."""
         wall = float(state["seconds"])
-        self.budget.charge(Spent(wall, float(state.get("processor_s", wall))))
+        self._resumed = Spent(wall, float(state.get("processor_s", wall)))
+        self.budget.charge(self._resumed)
 
 
 class Stretched(L.Callback):

@@ -56,6 +56,21 @@ def test_a_checkpoint_of_other_settings_is_not_gone_on_from(tmp_path):
     assert seen == [None]
 
 
+def test_the_same_run_said_again_began_anew_without_a_word(tmp_path, caplog):
+    """It goes on from the folder beside it where it was interrupted; one that has ended is done again."""
+    caplog.set_level("INFO", "gsparc")
+    for name in ("1", "2", "3", "4"):
+        (tmp_path / name).mkdir()
+    seen = []
+    with pytest.raises(KeyboardInterrupt):
+        once(tmp_path / "1", job(), cut_short(tmp_path / "1", "station0/model.ckpt"), again=True)
+    for name, settings in (("2", {"seed": 1}), ("3", {}), ("4", {}), ("4", {})):
+        ended = lambda config: seen.append(config.ckpt_path) or 1.0  # noqa: E731
+        assert once(tmp_path / name, job(**settings), ended, again=True) == 1.0
+    assert seen == [None, str(tmp_path / "1"), None, None]
+    assert f"going on from {tmp_path / '1'}" in caplog.text
+
+
 def test_a_job_that_another_process_does_is_refused(tmp_path):
     with claimed(tmp_path / ".job.lock"), pytest.raises(ValueError, match="another process does this job"):
         once(tmp_path, job(), lambda config: 1.0)

@@ -75,6 +75,16 @@ def test_stations_of_a_long_file_are_rows_and_numbered_anew():
     assert "with them 30 of 60 rows" in kept.notes[0]
 
 
+@pytest.mark.parametrize("make", [channels, long])
+def test_antenna_5_of_a_part_of_them_answered_as_1(make):
+    """`dataset.stations=[0,5]` made stations "0" and "1" of a file without names."""
+    raw = make()
+    raw.arrays.pop("station_name", None)
+    last = len(raw.arrays["station_position"]) - 1
+    data = from_arrays(select(raw, Selection(stations=[0, last]), "file").raw.arrays)
+    assert data.site.stations.name == ("0", str(last))
+
+
 def test_what_belongs_to_a_station_goes_with_it():
     more = {
         "sensitivity_db": np.arange(4.0),

@@ -97,7 +97,7 @@ def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
     method = for_links(method_class("mean"), town)
     method.fit(town, fold, FitContext(tmp_path, stations="together"))
     assert len(dict(method)) == 1 and len(torch.unique(method.answer(town.batch(fold.test)).mean)) == 1
-    with pytest.raises(ValueError, match="stations='togehter': one of each, together is needed"):
+    with pytest.raises(ValueError, match="stations='togehter': one of auto, each, together is needed"):
         FitContext(tmp_path, stations="togehter")
 
 

@@ -69,32 +69,45 @@ def test_callbacks_see_the_step_of_the_schedule():
     assert seen == [(100, "kept"), (200, "kept")] and stretched.state_key == "inner"
 
 
-def test_validation_is_not_billed_and_a_resumed_run_has_the_rest(monkeypatch):
+def test_validations_were_not_counted_and_a_resumed_run_has_the_rest(monkeypatch):
+    """Of 3,900 powers "within 60 s" took 156 s on the clock."""
     clocks = wound(monkeypatch)
     trainer = SimpleNamespace(should_stop=False, state=SimpleNamespace(fn="fit"))
 
     def watching() -> Budget:
-        budget = TimeBudget(before=Spent(wall=30.0))  # preparation, which the pace does not see
-        budget.pause()
-        return Budget(Pace(100, 10.0), budget)
+        return Budget(Pace(100, 10.0), TimeBudget(before=Spent(wall=30.0)))  # preparation: not the pace's
 
     watch = watching()
     watch.on_train_start(trainer, None)
-    clocks.monotonic.wind(4)
+    clocks.monotonic.wind(2)
     watch.on_train_batch_end(trainer, None)
     watch.on_validation_start(trainer, None)
-    clocks.monotonic.wind(1000)
-    watch.on_validation_end(trainer, None)
     clocks.monotonic.wind(2)
+    watch.on_validation_end(trainer, None)
+    watch.on_train_batch_end(trainer, None)
+    assert watch.pace.step == 60 and not trainer.should_stop  # one more validation follows the last step
     state = watch.state_dict()
-    assert state["seconds"] == pytest.approx(6.0, abs=0.01) and not trainer.should_stop
+    assert state["seconds"] == pytest.approx(4.0, abs=0.01)
     again = watching()
     again.load_state_dict(state)
     again.on_train_start(trainer, None)
-    assert again.pace.step == 60
-    clocks.monotonic.wind(4)
+    assert again.pace.step == 40
+    clocks.monotonic.wind(6)
     again.on_train_batch_end(trainer, None)
     assert trainer.should_stop
+
+
+def test_making_the_trainer_shortens_the_schedule_and_is_no_part_of_it(monkeypatch):
+    """Steps of which none was kept were one of the second stage: it had 9 dB less."""
+    clocks = wound(monkeypatch)
+    trainer = SimpleNamespace(should_stop=False)
+    watch = Budget(Pace(100, 10.0), TimeBudget())
+    clocks.monotonic.wind(2)
+    watch.on_train_start(trainer, None)
+    assert watch.pace.step == 0
+    clocks.monotonic.wind(4)
+    watch.on_train_batch_end(trainer, None)
+    assert watch.pace.step == pytest.approx(50, abs=1)
 
 
 @pytest.fixture()
@@ -158,7 +171,7 @@ def test_a_run_ends_with_its_budget_in_both_stages(tmp_path):
     file = spectra(tmp_path / "own.npz")
     config = compose(*brief(file, "budget_s=2.0", "trainer.max_steps=100000"))
     facts, objects = train(config, tmp_path / "run")
-    assert 1.9 < facts["time/train_s"] < 3.5  # the step in progress is finished
+    assert 1.0 < facts["time/train_s"] < 3.5  # less the reading; the step in progress is finished
     last = (tmp_path / "run" / "learning_curve.csv").read_text().splitlines()[-1].split(",")
-    assert 0.5 < float(last[1]) < 1.6  # half of it; the rest is the second stage
+    assert 0.2 < float(last[1]) < 1.6  # half of it; the rest is the second stage
     assert objects.checkpoints[0].exists()

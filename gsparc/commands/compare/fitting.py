@@ -123,7 +123,7 @@ def prepare(
     # cells from before there was a choice keep their names
     if whole["trainer"].get("strategy") == "auto":
         trainer["trainer"] = {name: v for name, v in whole["trainer"].items() if name != "strategy"}
-    if whole["stations"] != "each":
+    if whole["stations"] == "together" or (whole["stations"] == "auto" and problem.stations):
         trainer["stations"] = whole["stations"]
     if problem.draw is None and cell.seed and "seed" not in whole["model"]:
         trainer["seed"] = cell.seed  # of a draw, the split's own hash tells

@@ -12,6 +12,7 @@ from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import score
+from gsparc.methods import parts
 from gsparc.methods.method import FitContext, FitReport, Method
 from gsparc.methods.per_station import for_links
 from gsparc.methods.time_budget import Clock, less_repeatable
@@ -84,7 +85,7 @@ def fit_and_score(
         there, rows = (data, fold) if learned is None else learned(data, fold)
         method, settings = for_links(make, there), context(number)
         before = time.process_time()
-        report = method.fit(there, rows, settings)
+        report = parts.fit(method, there, rows, settings)
         processor.append(time.process_time() - before)
         seconds.append(report.seconds)
         limited = less_repeatable(limited, report.limited_by)

@@ -25,15 +25,16 @@ from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.censored import silent
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows
+from gsparc.methods.haste import haste
 from gsparc.methods.nearest_process import COVER, NearestProcess
 from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
 from gsparc.methods.power_process import (
-    CHOSEN_ON,
     LAW_NEEDS,
     Process,
+    choose_about,
+    choose_prior,
     conditioned,
     draw,
-    fit_about,
     fit_powers,
 )
 from gsparc.methods.power_process import restored as restored_process
@@ -49,8 +50,8 @@ from gsparc.ops import Pose
 
 QUERIES = 512  # at a time: memory
 SOUGHT_ON = 600  # rows: each look factors a matrix
-UNHURRIED_S = 8.0  # of a budget, from which settings are chosen on as many rows as ever
-LEAST_CHOSEN_ON = 300
+HASTY = 0.3  # of what is left, for each of the later ones
+CHOOSING = 0.3  # of the seconds, for the settings of the plain process
 SEEK_WITHIN = 0.35  # of a budget: seeking, and trying on groups, takes several times what the process took
 FOLDS = 5
 MOST_ASKED = 4_000  # rows of a fold that are predicted
@@ -304,13 +305,6 @@ class PowerField(ConditionalField):
         return from_real(decibels[:, None].float(), "rssi", (1,))
 
 
-def rows_within(budget: TimeBudget | None) -> int | None:
-    """Rows that settings are chosen on, None for as many as ever: a look at n of them takes n^3."""
-    if budget is None or budget.seconds >= UNHURRIED_S:
-        return None
-    return max(int(CHOSEN_ON * (budget.seconds / UNHURRIED_S) ** (1 / 3)), LEAST_CHOSEN_ON)
-
-
 def ridge(columns: np.ndarray, values: np.ndarray, prior: float) -> np.ndarray:
     """Weights (P,) of columns (n, P) with a prior variance, when what is left of values (n,) is white."""
     weights, left = np.zeros(columns.shape[1]), float((values**2).mean())
@@ -358,8 +352,8 @@ def initialise(
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
-    plain, notes = fit_powers(seen, data.site, "auto", seed, rows_within(budget))
-    bare = PowerField(data.site, plain.trend, plain.kernel, Blockers.none(), None, seed)
+    trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, haste(budget, CHOOSING, len(rows)))
+    bare = PowerField(data.site, trend, kernel, Blockers.none(), None, seed)
     if (
         settings.fringes
         and known is None
@@ -369,7 +363,7 @@ def initialise(
         order = np.argsort(rows)
         assert data.site.wavelength is not None
         bare.fringes, said = find_fringes(
-            seen.at(order), rows[order], plain, data.site.wavelength, seed, budget
+            seen.at(order), rows[order], bare.prior(), data.site.wavelength, seed, budget
         )
         return bare, (*notes, said)
     if not settings.most:
@@ -414,18 +408,17 @@ def shadowed(
     few = loud.at(draw(loud.silent, SOUGHT_ON, seed))
     if len(few.places) < max(LAW_NEEDS, 2) or len(np.unique(few.places[:, :3], axis=0)) < 2:
         return None
-    plain, _ = fit_powers(few, site, "distance", seed, rows_within(budget))
-    assert plain.trend.law is not None
-    still = plain.trend.law.place
+    plain, kernel, _ = choose_prior(few, site, "distance", seed, haste(budget, HASTY, len(few.places)))
+    assert plain.law is not None
+    still = plain.law.place
     if known is None:
-        blockers, _, _ = search(Seen.of(few, plain.trend, still), plain.kernel, settings.most, seed, budget)
+        blockers, _, _ = search(Seen.of(few, plain, still), kernel, settings.most, seed, budget)
     else:
-        blockers = known.relative_to(plain.kernel.amplitude)
+        blockers = known.relative_to(kernel.amplitude)
     if not len(blockers):
         return None
-    trend = ShadowedTrend.over(plain.trend, blockers, still)
-    process, notes = fit_about(rows, trend, seed, rows_within(budget))
-    return trend, process.kernel, notes
+    trend = ShadowedTrend.over(plain, blockers, still)
+    return trend, *choose_about(rows, trend, seed, haste(budget, HASTY, len(rows.places)))
 
 
 def gain_of_groups(
@@ -452,7 +445,7 @@ def gain_of_groups(
         if len(asked) == 0 or int((~learned.silent).sum()) < least:
             continue
         queries, measured = rows.places[asked], rows.decibels[asked]
-        process, _ = fit_powers(learned, site, "auto", seed, rows_within(budget))
+        process, _ = fit_powers(learned, site, "auto", seed, haste(budget, HASTY, len(learned.places)))
         without = process.mean_and_variance(queries)[0] - measured
         found = shadowed(learned, site, settings, seed, budget, known)
         if found is not None:

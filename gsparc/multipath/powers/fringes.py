@@ -19,9 +19,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.methods.distance_law import Rows
-from gsparc.methods.power_kernel import inverse_of
-from gsparc.methods.power_process import PowerProcess, Process, conditioned, draw, exact
+from gsparc.methods.power_kernel import PowerKernel, inverse_of
+from gsparc.methods.power_process import PowerProcess, conditioned, draw, exact
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.trend import Trend
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
 
@@ -161,7 +162,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 def find_fringes(
     rows: Rows,
     numbers: np.ndarray,
-    plain: Process,
+    plain: tuple[Trend, PowerKernel],
     wavelength: float,
     seed: int,
     budget: TimeBudget | None,
@@ -171,7 +172,7 @@ def find_fringes(
     Args:
         rows: all heard.
         numbers: (n,) of the rows, sorted.
-        plain: the process.
+        plain: the process's mean law and kernel.
         wavelength: [m].
         seed: of starts, folds and rows that are drawn.
         budget: none is sought beyond it, nor beyond `SECONDS`.
@@ -190,7 +191,7 @@ def find_fringes(
     for k, part in enumerate(folds(group, FOLDS, seed)):
         fold[part] = k
     fold[rng.permutation(count)[: count // PROBES]] = -1
-    process = exact(conditioned(rows, plain.trend, plain.kernel, seed)[0])
+    process = exact(conditioned(rows, *plain, seed)[0])
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None

@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
+from gsparc.methods.haste import factor_s
 from gsparc.methods.run_factors import aligning, run_quadratic
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.worker import Ended, ended_by
 from gsparc.multipath.complex_gp import CHOSEN_ON, LENGTHS, NOISES
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves import drift
@@ -54,6 +57,9 @@ SHORT = 8  # steps of a fit that compares lengths, or that is followed by anothe
 ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
 DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
+GRID_SHARE = 0.2  # of the seconds, for the grid of envelopes and noises, which has fewer rows if need be
+FEWEST = 150  # of them, that a look is timed with, too
+LENGTHS_SHARE = 0.5  # of the seconds, after which no further length is tried
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
 
@@ -91,13 +97,13 @@ def initialise(
         data: kind csi.
         rows: (n,) measurements to learn from.
         settings: terms.
-        budget: when it is over, no further term is tried.
+        budget: before it is over no further term is tried, so that there is time for the weights.
 
     Raises:
         ValueError: the data are no channels of a known carrier with one static end.
     """
     rows, budget = np.asarray(rows), budget or TimeBudget()
-    start, factors, notes = _isotropic(data, rows)
+    start, factors, notes = _isotropic(data, rows, budget)
     search = _Search.of(data, rows, settings, start, factors)
     best, more = search.run(budget)
     channel = (int(data.target.shape[1]), int(data.target.shape[2]))
@@ -108,12 +114,23 @@ def initialise(
     return field, (*notes, *more)
 
 
-def _isotropic(data: Measurements, rows: np.ndarray) -> tuple[tuple[Shape, Values], Tensor, list[str]]:
+def _isotropic(
+    data: Measurements, rows: np.ndarray, budget: TimeBudget
+) -> tuple[tuple[Shape, Values], Tensor, list[str]]:
     """Envelope and noise on the grid of `complex_gp`, and the factors of runs, as measured."""
     groups = gather(data, rows, False)
     looked = thinned(groups, 8, CHOSEN_ON)
     runs = 1 if data.run is None else len(np.unique(data.run[rows]))
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
+    few, began = thinned(looked, 8, FEWEST), budget.spent
+    _grid_point(few, [plain(g.places, g.places, g.slot.wavenumber, wavelength) for g in few], 1.0, runs)
+    given = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
+    most = (
+        int(FEWEST * (given / max(budget.spent - began, 1e-6)) ** (1 / 3)) if given < math.inf else CHOSEN_ON
+    )
+    if most < max(len(group) for group in looked):
+        budget.limited = True
+        looked = thinned(groups, 8, max(most, FEWEST))
     tried = []
     for length in LENGTHS:
         bounded = [plain(g.places, g.places, g.slot.wavenumber, length * wavelength) for g in looked]
@@ -208,28 +225,44 @@ class _Search:
         return _Search(settings, groups, every, start, wavelength, Kept())
 
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
-        """The terms that are kept, and notes."""
-        wanted = self.settings
+        """The terms that are kept, and notes; what the seconds end is as if it had not been tried."""
         notes: list[str] = []
-        best = self._measured(*self.start, self._compressed(*self.start))
-        best = self._step(best, self._fitted(*self.start), "powers by likelihood", notes)
-        one_end = self.every[0].places.shape[1] == 3
+        kept = [self._measured(*self.start, self._compressed(*self.start))]
+        longest = max(len(group) for group in self.every)
+        reserve = len(self.every) * factor_s(longest)  # for the weights in the end
+        end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
+        try:
+            with ended_by(partial(budget.over, end)):
+                self._grow(kept, notes, budget)
+        except Ended:
+            notes.append("waves: the seconds ended the search for terms")
+        return kept[-1], notes
+
+    def _grow(self, kept: list[Candidate], notes: list[str], budget: TimeBudget) -> None:
+        """Append what each further term makes of the last of `kept`."""
+        wanted = self.settings
+
+        def step(after: Candidate, name: str) -> None:
+            kept.append(self._step(kept[-1], after, name, notes))
+
+        step(self._fitted(*self.start), "powers by likelihood")
+        one_end = (
+            self.every[0].places.shape[1] == 3
+        )  # where both move, what waves have in common is not known
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = known and wanted.direct
-        if (direct or wanted.constant) and one_end and not budget.over():
-            best = self._step(best, self._with_fixed(best, direct), "leakage and direct wave", notes)
-        if wanted.mirrors and best.shape.direct and ends_of(self.every) > 1 and not budget.over():
-            mirrored = self._with_mirrors(best, budget)
+        if (direct or wanted.constant) and one_end:
+            step(self._with_fixed(kept[-1], direct, budget), "leakage and direct wave")
+        if wanted.mirrors and kept[-1].shape.direct and ends_of(self.every) > 1:
+            mirrored = self._with_mirrors(kept[-1], budget)
             if mirrored is not None:
-                count = len(mirrored.values.planes)
-                best = self._step(best, mirrored, f"mirror planes of all ends ({count})", notes)
-        if wanted.directions and one_end and not budget.over():
-            best = self._step(best, self._with_directions(best), "directions", notes)
-        if ends_of(self.every) > 1 and not budget.over():
-            best = self._of_all_ends(best, known, notes)
-        if wanted.correlated and not budget.over():
-            best = self._with_drift(best, notes)
-        return best, notes
+                step(mirrored, f"mirror planes of all ends ({len(mirrored.values.planes)})")
+        if wanted.directions and one_end:
+            step(self._with_directions(kept[-1]), "directions")
+        if ends_of(self.every) > 1:
+            self._of_all_ends(kept, known, notes)
+        if wanted.correlated:
+            kept.append(self._with_drift(kept[-1], notes))
 
     def _step(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
         keep = after.beats(before)
@@ -266,19 +299,23 @@ class _Search:
         numbers = sum(2 * group.target.numel() for group in self.groups)
         return 0.5 * parameters * math.log(numbers)
 
-    def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
+    def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
         """With leakage and the direct wave; the best of a few lengths."""
         shape = replace(before.shape, constant=self.settings.constant, direct=direct)
-        return self._moved(self._of_lengths(shape, before.values, before.shape, direct))
+        return self._moved(self._of_lengths(shape, before.values, before.shape, direct, budget))
 
-    def _of_lengths(self, shape: Shape, values: Values, old: Shape, gains: bool) -> Candidate:
+    def _of_lengths(
+        self, shape: Shape, values: Values, old: Shape, gains: bool, budget: TimeBudget
+    ) -> Candidate:
         """Lengths of the envelope and of gains from a short fit each, then powers."""
         powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
         start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
         values = replace(values, power=torch.tensor(start, dtype=torch.float64))
-        tried = []
+        tried: list[tuple[float, Values]] = []
         for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if gains else GAINS[:1]:
+                if tried and budget.over(LENGTHS_SHARE):
+                    break
                 lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
                 trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
                 power, nll = fit_powers(self._compressed(shape, trial), shape, trial.power, 0.0, SHORT)
@@ -341,13 +378,15 @@ class _Search:
         found = self._fitted(*_strongest(shape, replace(values, power=power)))
         return replace(found, errors=np.maximum(found.errors, errors))
 
-    def _of_all_ends(self, before: Candidate, known: bool, notes: list[str]) -> Candidate:
+    def _of_all_ends(self, kept: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
-        wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
-        best = wide._moved(wide._fitted(before.shape, before.values))
+        wide, before = replace(self, groups=thinned(self.every, ENDS, self.settings.rows)), kept[-1]
+        kept.append(wide._fitted(before.shape, before.values))
+        kept.append(wide._moved(kept[-1]))
         if known and self.settings.directions:
-            best = wide._step(best, wide._with_tied(best), "directions by angles to ends", notes)
-        return best
+            kept.append(
+                wide._step(kept[-1], wide._with_tied(kept[-1]), "directions by angles to ends", notes)
+            )
 
     def _with_tied(self, before: Candidate) -> Candidate:
         """With powers of directions that depend on room and angle to the end, all equal at first."""

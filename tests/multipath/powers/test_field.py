@@ -16,6 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.haste import haste
 from gsparc.methods.method import FitContext
 from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.power_kernel import PowerKernel
@@ -30,7 +31,6 @@ from gsparc.multipath.powers.field import (
     initialise,
     restored,
     rows_of,
-    rows_within,
 )
 from gsparc.multipath.powers.search import Seen, drawn, gains, search
 from gsparc.ops import Pose
@@ -315,9 +315,10 @@ def powers_of(
 
 
 def test_settings_of_little_time_are_chosen_on_fewer_rows():
-    budgets = (FitContext(budget_s=seconds).time_budget() for seconds in (0.1, 4.0, 60.0))
-    few, some, all_of_them = (rows_within(budget) for budget in budgets)
-    assert 300 == few < some < 1000 and all_of_them is None and rows_within(None) is None
+    budgets = [FitContext(budget_s=seconds).time_budget() for seconds in (1e-3, 1e6)]
+    few, every = (haste(budget, 0.5, 9999) for budget in budgets)
+    assert few.rows == 150 and few.late() and every.rows == 1000 and not every.late()
+    assert [budget.limited for budget in budgets] == [True, False] and haste(None, 0.5, 9).rows == 1000
 
 
 def test_without_visibility_nothing_stands_in_the_way(blocked):

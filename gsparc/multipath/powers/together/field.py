@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
@@ -20,6 +21,7 @@ from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.per_station import SAME_PLACE_M
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.trend import REACH
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.together import posterior as joint
 from gsparc.multipath.powers.together.law import fit_site_law
@@ -73,6 +75,7 @@ class JointPowerField(ConditionalField):
         self.heard, self.unheard, self.inflation = heard, unheard, inflation
         self.posterior: joint.Posterior | None = None
         self.elsewhere: joint.Posterior | None = None
+        self._reach: tuple[cKDTree, float] | None = None  # of what is known, made when it is asked
         self.rows: dict[int, np.ndarray] = {}
         self.decibels: dict[int, np.ndarray] = {}
 
@@ -107,7 +110,7 @@ class JointPowerField(ConditionalField):
             raise ValueError("a field of powers needs at least one row")
         every = heard_rows(data, rows, self.places)
         used = thinned(every, most_each(len(every.stations)), self.seed)
-        self.posterior, _, kept = given(used, self.heard)
+        (self.posterior, _, kept), self._reach = given(used, self.heard), None
         loud = [used.at(own[~used.silent[own]]) for own in kept]
         self.rows = {int(used.station[own[0]]): part.rows for own, part in zip(kept, loud, strict=True)}
         self.decibels = {
@@ -139,6 +142,7 @@ class JointPowerField(ConditionalField):
                 said[1] *= 1.0 if known else self.inflation
                 parts[:, chosen] = said
         mean, spread, share, explained = parts
+        share = (share + self._by_law(moving)).clamp_max(1.0)
         power = self._power(mean)
         variance = entry_variance(spread.float(), power, "rssi")
         return Posterior(power, variance, self._power(explained) if self.count else None, share.float())
@@ -215,6 +219,20 @@ class JointPowerField(ConditionalField):
             torch.where(turned[:, None], one, other) for one, other in ((still, moving), (moving, still))
         )
         return moving, still, self._standing(still)
+
+    def _by_law(self, moving: Tensor) -> Tensor:
+        """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.
+
+        Its slope says nothing of places far from all data.
+        """
+        posterior, _ = self._conditioned()
+        if self._reach is None:
+            known = torch.cat([end.moving for end in posterior.ends.values()]).numpy()
+            self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), 1e-9)
+        tree, reach = self._reach
+        far = torch.from_numpy(tree.query(moving.numpy())[0])
+        law = max(1 - float(posterior.prior.variance(NEVER)) / posterior.whole, 0.0)
+        return law * (1 - (-(far / reach).square()).exp())
 
     def _standing(self, places: Tensor) -> Tensor:
         """Numbers (B,) of the stations at places (B, 3), negative where none stands."""
