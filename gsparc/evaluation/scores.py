@@ -123,7 +123,7 @@ def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.n
             product = (method.answer(batch).mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
         if overlap:
-            turn[torch.from_numpy(mine)] = overlap / abs(overlap)
+            turn[torch.from_numpy(mine)] = torch.tensor(overlap / abs(overlap), dtype=torch.complex64)
     return turn
 
 
