@@ -6,6 +6,7 @@ import pytest
 
 from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.errors import DataError
+from gsparc.data.inner_folds import inner_folds
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split, path_order, read_split, write_split
@@ -261,6 +262,20 @@ def test_stations_are_held_out_one_by_one_or_together():
         make_split(positions, SplitSettings("stations"))
     with pytest.raises(DataError, match="two at least must remain"):
         make_split(positions, SplitSettings("stations", leave_out=4), station=station)
+
+
+def test_whole_runs_are_held_out():
+    run = np.repeat([3, 4, 7, 8, 9], 20)
+    positions = np.random.default_rng(0).uniform(0, 3, (100, 3))
+    (fold,) = make_split(positions, SplitSettings("runs"), station=run).folds
+    assert [len(set(run[part])) for part in (fold.train, fold.val, fold.test)] == [3, 1, 1]
+    assert _disjoint(fold, 100)
+    (fold,) = make_split(positions, SplitSettings("runs", test_fraction=0.4), station=run).folds
+    assert len(set(run[fold.test])) == 2
+    inner = inner_folds(positions, fold, SplitSettings("runs", test_fraction=0.4), 3, 0, None, run)
+    assert inner.name == "runs" and all(len(set(run[one.test])) == 1 for one in inner.folds)
+    with pytest.raises(DataError, match="have one run; take split=random"):
+        make_split(positions, SplitSettings("runs"))
 
 
 def test_block_is_called_corner_now():

@@ -15,7 +15,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
-from outcome import Outcome, repeated, run
+from judging import Outcome, repeated, run
 from product import PARTS
 from rich.console import Console
 from rich.table import Table

@@ -7,7 +7,7 @@ counts when it is a gross one, after five fresh seeds.
 from __future__ import annotations
 
 import pytest
-from outcome import repeated, run
+from judging import repeated, run
 from product import PARTS
 from worlds import CHOICES, World, covering, every, possible_pairs
 

@@ -57,6 +57,8 @@ def test_the_second_has_the_weight_of_largest_psnr():
     assert share_of_second([rows(0.1, 0.1, 200)]) == pytest.approx(0.5, abs=0.05)
     assert share_of_second([rows(0.01, 0.3, 200)]) == 0.0
     assert share_of_second([rows(0.3, 0.01, 200)]) == 1.0
+    # A query that takes longer is worth little, a loss to the process beside it is not.
+    assert share_of_second([rows(0.102, 0.1, 20_000)]) > 0
 
 
 def test_every_row_counts_once_whichever_part_it_is_of():

@@ -117,7 +117,11 @@ class Values:
 
 
 def direct_wave(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
-    """(n,) complex128, of size 1 in the middle."""
+    """(n,) complex128, of size 1 in the middle; of places (n, 6), from one moving end to the other."""
+    if places.shape[1] > 3:
+        between, middle = places[:, :3] - places[:, 3:], shape.middle[:3] - shape.middle[3:]
+        away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / slot.wavenumber)
+        return steering(between, torch.zeros_like(middle), slot.wavenumber, away)
     end = slot.end + values.offset
     return steering(places, end, slot.wavenumber, torch.linalg.vector_norm(end - shape.middle))
 

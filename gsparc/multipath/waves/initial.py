@@ -250,8 +250,8 @@ class _Search:
             self.every[0].places.shape[1] == 3
         )  # where both move, what waves have in common is not known
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
-        direct = known and wanted.direct
-        if (direct or wanted.constant) and one_end:
+        direct = (known or not one_end) and wanted.direct
+        if direct or (wanted.constant and one_end):
             step(self._with_fixed(kept[-1], direct, budget), "leakage and direct wave")
         if wanted.mirrors and kept[-1].shape.direct and ends_of(self.every) > 1:
             mirrored = self._with_mirrors(kept[-1], budget)
@@ -301,7 +301,8 @@ class _Search:
 
     def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
         """With leakage and the direct wave; the best of a few lengths."""
-        shape = replace(before.shape, constant=self.settings.constant, direct=direct)
+        one_end = self.every[0].places.shape[1] == 3
+        shape = replace(before.shape, constant=self.settings.constant and one_end, direct=direct)
         return self._moved(self._of_lengths(shape, before.values, before.shape, direct, budget))
 
     def _of_lengths(
@@ -325,7 +326,7 @@ class _Search:
     def _moved(self, found: Candidate) -> Candidate:
         """With static ends where they really are."""
         shape, values = found.shape, found.values
-        if not shape.direct:
+        if not shape.direct or self.every[0].places.shape[1] > 3:
             return found
         offset = best_offset(self._compressed(shape, values), shape, values, self.wavelength)
         if offset is None:

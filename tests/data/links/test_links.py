@@ -275,3 +275,29 @@ def test_nothing_heard_in_any_row_was_zero_everywhere():
     arrays = {"rx_position": np.eye(3) * 4, "rssi_db": np.full(3, np.nan), "sensitivity_db": np.array(-100.0)}
     with pytest.raises(DataError, match="rssi_db: nothing was heard in any row"):
         interpret(Raw(arrays), "drive")
+
+
+@pytest.mark.parametrize("what", ["masked", "dark"])
+def test_rows_that_tell_nothing_were_refused(what):
+    """A mask without an entry, or a spectrum without any power, is no row."""
+    spectra = RNG.uniform(0.1, 1, (PLACES, 12, 24))
+    arrays = {"tx_position": WALK, "rx_position": POSTS[0], "spectrum": spectra}
+    if what == "masked":
+        arrays["mask"] = np.ones(spectra.shape, bool)
+        arrays["mask"][3] = False
+    else:
+        spectra[3] = 0
+    found = interpret(Raw(arrays, {}), "own")
+    assert len(found.data) == PLACES - 1 and any("1 of 10 values are missing" in note for note in found.notes)
+    assert np.allclose(found.data.tx + found.data.site.origin, np.delete(WALK, 3, 0))
+
+
+def test_one_station_in_degrees_needed_a_column():
+    degrees = {"latitude": 48 + WALK[:, 1] / 1e5, "longitude": 9 + WALK[:, 0] / 1e5, "tx_height": WALK[:, 2]}
+    mast = {
+        "station_latitude": np.array([48.0]),
+        "station_longitude": np.array([9.0]),
+        "station_height": np.array(5.0),
+    }
+    found = interpret(Raw({**degrees, **mast, "rssi_db": LEVELS[:, 0]}, {}), "own")
+    assert len(found.data) == PLACES and len(found.data.site.stations) == 1
