@@ -257,7 +257,9 @@ def test_stations_have_fields_of_their_own_and_share_the_seconds():
     assert all(isinstance(copy, Gsparc) for _, copy in fitted.method)
     begun = [line for line in fitted.lines if line.startswith("training ")]
     given = [float(line.partition("within ")[2].split()[0]) for line in begun if "init=powers" in line]
-    assert len(given) == 2 and all(0.2 < seconds < 1.0 for seconds in given)  # what one leaves is the next one's
+    assert len(given) == 2 and all(
+        0.2 < seconds < 1.0 for seconds in given
+    )  # one leaves what it does not need
 
 
 def test_a_search_that_ends_early_says_so():
