@@ -182,7 +182,7 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(initialise, "LEAST_GAIN", -math.inf)
-    fitted = fit("channels")
+    fitted = fit("channels", budget_s=4.0)  # less leaves no time to complete them
     field = fitted.method.field
     assert isinstance(field, StackedField) and sum(field.weights) == pytest.approx(1)
     assert [type(member) is CompletedField for member in field.members] == [False, True, True]
@@ -257,7 +257,9 @@ def test_stations_have_fields_of_their_own_and_share_the_seconds():
     assert all(isinstance(copy, Gsparc) for _, copy in fitted.method)
     begun = [line for line in fitted.lines if line.startswith("training ")]
     given = [float(line.partition("within ")[2].split()[0]) for line in begun if "init=powers" in line]
-    assert len(given) == 2 and all(0.2 < seconds <= 0.5 for seconds in given)
+    assert len(given) == 2 and all(
+        0.2 < seconds < 1.0 for seconds in given
+    )  # one leaves what it does not need
 
 
 def test_a_search_that_ends_early_says_so():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,33 +19,42 @@ from gsparc.training.gsparc import Gsparc
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5], [20, 20, 5]])
 
 
-def heard(alike: bool, count: int = 60):
-    """Powers at four stations: of one law, or each of a pattern and a law of its own."""
+def heard(count: int = 40):
+    """Powers at four stations of one law, with noise."""
     rng = np.random.default_rng(0)
     walk = rng.uniform([0, 0, 1], [20, 20, 2], (count, 3))
     far = np.linalg.norm(walk[:, None] - POSTS, axis=-1)
     powers = -30 * np.log10(far) + rng.normal(size=far.shape)
-    if not alike:
-        slopes = np.array([[0.0, 3], [3, 0], [-3, 0], [0, -3]])
-        powers = walk[:, :2] @ slopes.T + np.array([0.0, 40, -40, 10])
     data = from_arrays({"tx_position": walk, "station_position": POSTS, "rssi_db": powers})
     return data, make_split(data.moving, SplitSettings(), place=data.place, station=data.station).folds[0]
 
 
-def test_powers_are_learned_as_rows_left_out_want_it():
-    alike, why = stations.best(*heard(True), FitContext(budget_s=6))
-    assert alike == "together" and "dB together" in why and "folds)" in why
-    assert stations.best(*heard(False), FitContext(budget_s=6))[0] == "each"
+def test_powers_of_one_law_are_learned_together():
+    how, why = stations.best(*heard(), FitContext(budget_s=6))
+    assert how == "together" and "dB together" in why and "folds)" in why
+
+
+@pytest.mark.parametrize(("wrong_db", "best"), [({"joint_powers": 2, "powers": 1}, "each"),
+                                                ({"joint_powers": 1, "powers": 2}, "together")])  # fmt: skip
+def test_powers_are_learned_as_rows_left_out_want_it(monkeypatch, wrong_db, best):
+    def initialiser(name):
+        answer = lambda batch: SimpleNamespace(mean=batch.target * 10 ** (wrong_db[name] / 10))  # noqa: E731
+        return lambda *given: (SimpleNamespace(answer=answer), None)
+
+    monkeypatch.setattr(stations, "field_initialiser", initialiser)
+    how, why = stations.best(*heard(), FitContext(budget_s=60))
+    said = f"{wrong_db['joint_powers']}.00 dB together, {wrong_db['powers']}.00 dB each"
+    assert how == best and said in why and "3 folds" in why
 
 
 def test_rows_beyond_one_factor_are_learned_by_station(monkeypatch):
     monkeypatch.setattr(stations, "ONE_FACTOR", 50)
-    how, why = stations.best(*heard(True), FitContext())
+    how, why = stations.best(*heard(), FitContext())
     assert how == "each" and why.endswith("rows are more than one factor holds (50)")
 
 
 def test_stations_that_nobody_heard_are_answered_by_what_all_share():
-    data, _ = heard(True)
+    data, _ = heard()
     split = SplitSettings("stations", leave_out=1)
     fold = make_split(data.moving, split, place=data.place, station=data.station).folds[0]
     assert stations.best(data, fold, FitContext(split=split))[0] == "together"

@@ -25,7 +25,7 @@ from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.censored import silent
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows
-from gsparc.methods.haste import haste
+from gsparc.methods.haste import UNHURRIED, haste
 from gsparc.methods.nearest_process import COVER, NearestProcess
 from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
 from gsparc.methods.power_process import (
@@ -352,7 +352,8 @@ def initialise(
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
-    trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, haste(budget, CHOOSING, len(rows)))
+    pace = haste(budget, CHOOSING, len(rows))
+    trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, pace)
     bare = PowerField(data.site, trend, kernel, Blockers.none(), None, seed)
     if (
         settings.fringes
@@ -370,7 +371,8 @@ def initialise(
         return bare, notes
     if known is None and int((~seen.silent).sum()) < LEAST:
         return bare, (*notes, f"no Gaussians: fewer than {LEAST} rows were heard")
-    if known is None and budget and budget.over(SEEK_WITHIN):
+    hurried = pace.rows < min(UNHURRIED.rows, len(rows))
+    if known is None and budget and (hurried or budget.over(SEEK_WITHIN)):
         return bare, (*notes, "no Gaussians: no time to seek them and to try them on groups of places")
     found = shadowed(seen, data.site, settings, seed, budget, known)
     if found is None:

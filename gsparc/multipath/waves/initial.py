@@ -59,6 +59,8 @@ DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart t
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 GRID_SHARE = 0.2  # of the seconds, for the grid of envelopes and noises, which has fewer rows if need be
 FEWEST = 150  # of them, that a look is timed with, too
+MIRRORS_SHARE = 0.25  # of the seconds that are left, for mirror planes: directions come after them
+WEIGHTS = 2.0  # factors of all rows that the weights in the end take
 LENGTHS_SHARE = 0.5  # of the seconds, after which no further length is tried
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
@@ -229,7 +231,7 @@ class _Search:
         notes: list[str] = []
         kept = [self._measured(*self.start, self._compressed(*self.start))]
         longest = max(len(group) for group in self.every)
-        reserve = len(self.every) * factor_s(longest)  # for the weights in the end
+        reserve = WEIGHTS * len(self.every) * factor_s(longest)  # for the weights in the end
         end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
         try:
             with ended_by(partial(budget.over, end)):
@@ -337,11 +339,15 @@ class _Search:
     def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
         shape, values = before.shape, before.values
+        late = budget.over
+        if math.isfinite(budget.seconds):
+            until = budget.spent + MIRRORS_SHARE * max(budget.seconds - budget.spent, 0.0)
+            late = partial(budget.over, until / max(budget.seconds, 1e-9))
         rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(shape, values)
         wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
         parts = wide._compressed(shape, values)
         planes, sequences = find_mirrors(
-            rough, parts, shape, values, self.wavelength, self.settings.mirrors, budget.over
+            rough, parts, shape, values, self.wavelength, self.settings.mirrors, late
         )
         if not sequences:
             return None
