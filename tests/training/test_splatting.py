@@ -15,6 +15,7 @@ from gsparc.data.load import split_for
 from gsparc.methods import checkpoint
 from gsparc.methods.registry import build
 from gsparc.ops import Pose
+from gsparc.training import splatting
 from gsparc.training.splatting import QUERY_CHUNK, LearnedField
 
 
@@ -178,3 +179,16 @@ def test_untrained_says_so():
 def test_a_closed_form_start_that_cannot_be_says_what_it_needs(tmp_path):
     with pytest.raises(ValueError, match="needs spectra, a static receiver"):
         fitted(channels(tmp_path / "own.npz"), tmp_path, "init=images")
+
+
+def test_few_validation_rows_chose_steps(tmp_path):
+    """Two rows tell by chance: a closed-form start is the answer, a field of steps has a third held out."""
+    file = spectra(tmp_path / "own.npz", rows=30)
+    method, _, fold = fitted(file, tmp_path, "model.keep_best=true")
+    assert len(fold.val) < 8 and method.steps == 0
+    moving = spectra(tmp_path / "own.npz", rows=30, moving="rx")
+    data = load_data({"name": "own", "file": str(moving)})
+    few = split_for({"name": "random"}, data).folds[0]
+    told = splatting._more_told(data, few, short(tmp_path, 5))
+    assert len(few.val) < 4 <= len(told.val) and np.array_equal(told.test, few.test)
+    assert set(told.train) | set(told.val) == set(few.train) | set(few.val)
