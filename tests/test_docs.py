@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,8 @@ def test_commands_compose():
     offer_scenes()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         for (name, *overrides), line in given.items():
+            if "search=optuna" in overrides and find_spec("hydra_plugins.hydra_optuna_sweeper") is None:
+                continue  # an extra that is not installed here
             assert compose(name, overrides), line
 
 

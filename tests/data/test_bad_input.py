@@ -84,8 +84,6 @@ def _together(*spoils):
     return spoil
 
 
-half_masked = np.ones((12, 2, 3), dtype=bool)
-half_masked[7] = False
 CSI = {
     "no measurement": (_without("csi"), "expected exactly one of spectrum, csi, rssi, rssi_db; found none"),
     "two measurements": (_set("rssi", np.ones(12)), "found csi and rssi"),

@@ -15,6 +15,7 @@ from gsparc.methods.method import FitContext
 from gsparc.methods.per_station import for_links
 from gsparc.methods.predictor import Predictor
 from gsparc.multipath.complex_gp import ComplexGP
+from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.waves.covariance import Shape, Values, diffuse_of, directional, prior, ways
 from gsparc.multipath.waves.field import ChannelField, restored
 from gsparc.multipath.waves.initial import initialise
@@ -187,7 +188,9 @@ def test_methods_of_one_end_are_refused_as_before():
     data = _ceiling(ends=3, count=30)
     rows = np.arange(len(data))
     with pytest.raises(ValueError, match="stations=each"):
-        for_links(ComplexGP, data).fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
+        for_links(ImageSourceGP, data).fit(
+            data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together")
+        )
 
 
 CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"

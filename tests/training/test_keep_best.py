@@ -16,7 +16,7 @@ COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    file = spectra(tmp_path_factory.mktemp("own") / "own.npz")
+    file = spectra(tmp_path_factory.mktemp("own") / "own.npz", rows=120)  # 10 of them for validation
     data = load({"name": "own", "file": str(file)})
     return file, data, split_for({"name": "random"}, data).folds[0]
 

@@ -146,14 +146,16 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         return check.refuse("sensitivity_db", "expected dB between -400 and 400")
     arrays.pop("sensitivity_db", None)
     mask = arrays.get("mask")
-    if mask is not None and mask.shape != values.shape:
+    if mask is not None and (mask.shape != values.shape or mask.dtype.kind not in "biu"):
         return links  # said where the mask is read
-    silent = measured == "spectrum" and not is_big(values)  # a spectrum without power has no directions
+    # A spectrum without power has no directions; where rows have paths they are a simulation's.
+    silent = measured == "spectrum" and not is_big(values) and "path_offsets" not in arrays
     may_miss = measured in POWERS or links.stations is not None or mask is not None or silent
     if values.dtype.kind not in "iufc" or values.ndim == 0 or not may_miss:
         return links
     axes = tuple(range(1, values.ndim))
-    unknown = np.isnan(values)
+    gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
+    unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
     told = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
     censored = np.zeros(len(values), bool)
     if level is not None:
