@@ -17,7 +17,7 @@ DIST ?= dist
 # Its own objects, made anew: those of another compiler would be taken as they are.
 WHEEL ?= -Cbuild-dir=build/wheel/objects
 GRID ?=
-.PHONY: browser grid results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
+.PHONY: browser grid pages results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -75,7 +75,10 @@ results: setup ## README's results table, measured anew (RFID=folder of the rele
 	$(RUN) -m gsparc report outputs/results readme=README.md
 
 test-slow: setup sionna browser $(VENV)/.docs ## slow tests: whole training runs, kills, sanitizers, ray tracing
-	$(PYTEST) -m slow
+	$(PYTEST) -m "slow and not pages"
+
+pages: setup ## every command of every page on small data (a part of them is among the slow tests)
+	$(PYTEST) -m slow tests/commands/test_pages.py
 
 hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md
 	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md

@@ -35,6 +35,18 @@ def _composed(line: tuple[str, ...]) -> bool:
 
 
 RUN = [line for line in commands() if not _composed(line)]
+OFTEN = 3  # of a command's lines that the slow tests run; the others are like them
+
+
+def _parts() -> list:
+    """The lines, those beyond the first few of a command marked."""
+    seen: dict[str, int] = {}
+    found = []
+    for line in RUN:
+        seen[line[0]] = seen.get(line[0], 0) + 1
+        often = line[0] == "study" or seen[line[0]] <= OFTEN
+        found.append(pytest.param(line, id=" ".join(line), marks=() if often else pytest.mark.pages))
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +55,7 @@ def tiny(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("line", RUN, ids=" ".join)
+@pytest.mark.parametrize("line", _parts())
 def test_a_command_of_a_page_ends_well(line, tiny, tmp_path, monkeypatch):
     """`gsparc study kind=effects` stood on two pages and ended after 8 s."""
     monkeypatch.chdir(tiny.folder)
