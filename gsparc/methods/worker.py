@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 _asked = threading.local()
 
@@ -14,14 +14,19 @@ class Ended(BaseException):
 
 
 @contextmanager
-def ended_by(unwanted: Callable[[], bool]) -> Iterator[None]:
-    """Within, `ask` raises `Ended` in this thread as soon as `unwanted`, or who surrounds it, says so."""
-    before = getattr(_asked, "unwanted", None)
-    _asked.unwanted = unwanted if before is None else lambda: before() or unwanted()
+def _within(name: str, said: Callable[[], bool]) -> Iterator[None]:
+    """Within, this thread is asked `said` as `name`, beside what surrounds it."""
+    before = getattr(_asked, name, None)
+    setattr(_asked, name, said if before is None else lambda: before() or said())
     try:
         yield
     finally:
-        _asked.unwanted = before
+        setattr(_asked, name, before)
+
+
+def ended_by(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Within, `ask` raises `Ended` in this thread as soon as `unwanted`, or who surrounds it, says so."""
+    return _within("unwanted", unwanted)
 
 
 def ask() -> None:
@@ -31,15 +36,9 @@ def ask() -> None:
         raise Ended
 
 
-@contextmanager
-def late_when(over: Callable[[], bool]) -> Iterator[None]:
+def late_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
     """Within, `late` says what `over`, or who surrounds it, says, in this thread."""
-    before = getattr(_asked, "over", None)
-    _asked.over = over if before is None else lambda: before() or over()
-    try:
-        yield
-    finally:
-        _asked.over = before
+    return _within("over", over)
 
 
 def late() -> bool:

@@ -181,7 +181,8 @@ class Gsparc(LearnedField):
         held = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
         init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
         until_s = budget.seconds * (1 - STEPS_SHARE)
-        data = self._aligned(data, known, context)
+        share = solutions.CLOSED_SHARE * max(budget.seconds - budget.spent, solutions.LEAST_S)
+        data = self._aligned(data, known, replace(context, budget_s=share))
         found, reports = solutions.find(
             chosen.parts, init, self.switches, data, fold, context, budget, until_s, held
         )
