@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 import os
 import re
 import sys
@@ -51,6 +52,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
+    logging.raiseExceptions = False  # a log that a full disk cannot take: results say so themselves
     try:
         main()
     except KeyboardInterrupt as interrupt:
@@ -68,6 +70,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         _print_error(_message_of(error))
         sys.exit(1)
     finally:
+        logging.raiseExceptions = True
         release()
         os.environ.pop(FULL_ERROR)
         if before is not None:

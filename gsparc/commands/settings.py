@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from hydra.utils import instantiate
+from lightning.pytorch.accelerators import AcceleratorRegistry
 from omegaconf import DictConfig, OmegaConf
 from threadpoolctl import threadpool_limits
 
@@ -53,10 +54,12 @@ class RunSettings(Checked):
         trainer = given.get("trainer") or {}
         clip = trainer.get("gradient_clip_val")
         or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
-        if trainer.get("accelerator") in ("gpu", "cuda") and not torch.cuda.is_available():
-            raise SettingError(
-                f"trainer.accelerator={trainer['accelerator']}: there is no GPU here; say trainer=cpu"
-            )
+        accelerator = trainer.get("accelerator", "auto")
+        kinds = ["auto", "gpu", *sorted(AcceleratorRegistry.available_accelerators())]
+        if accelerator not in kinds:  # Lightning says so, but not where a model takes no steps
+            raise SettingError(f"trainer.accelerator={accelerator!r}: one of {', '.join(kinds)}")
+        if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
+            raise SettingError(f"trainer.accelerator={accelerator}: there is no GPU here; say trainer=cpu")
         if "model" in config:
             build(config.model)  # its parts check themselves, and so do callbacks
         for node in (config.get("callbacks") or {}).values():

@@ -80,7 +80,8 @@ def test_a_band_of_hardly_any_noise_is_learned(tmp_path):
     """`cholesky: not positive-definite` ended this."""
     data = brought("ofdm", tmp_path)
     split = cut(data, 0)
-    field = fitted(gsparc(), data, split, tmp_path, 90.0)
+    seconds = 200.0  # the second search finds all: after 80 s of its own without AVX-512
+    field = fitted(gsparc(), data, split, tmp_path, seconds)
     assert score([field], data, split).figures()["nmse"] < LEAST_NMSE
 
 
