@@ -60,6 +60,7 @@ FIELDS = {  # fields whose weights are in closed form: what makes them of measur
         "gsparc.multipath.powers.together.field.restored",
     ),
     "bearings": ("gsparc.array.moving.initialise.bearings", "gsparc.array.moving.bearing_field.restored"),
+    "process": ("gsparc.training.process_field.initialise", "gsparc.training.process_field.restored"),
 }
 
 

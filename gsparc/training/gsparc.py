@@ -51,7 +51,7 @@ DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 BEFORE, AFTER = 3.0, 3.0  # validations that steps take at least, and that may follow when seconds end them
 LEAST_STEPS_S = 0.5  # less is not worth to set up
-RAYS_FACTORS = 300.0  # the same of measured rays, fitted and given all rows
+RAYS_FACTORS = 1_500.0  # the same of measured rays, fitted and given all rows
 LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fit makes, and rows of one
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
 

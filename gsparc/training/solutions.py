@@ -34,7 +34,7 @@ FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 SEARCH_LOOKS = 60  # at a search's rows, that the shortest takes
 LEAST_S = 0.2  # of a part, though others left none
 OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
-SEARCHES = ("sources", "bearings")  # of them, those that also give an answer of few sources
+SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
 
 
 def find(

@@ -45,7 +45,7 @@ class Plan:
         rasterized: whether Gaussians are rendered; else weights are in closed form.
         array: of rasterized ones, whether through the static array.
         parts: initialisers of conditional fields, weighed against each other where there are several.
-        plain: whether a plain process on the target may stand in, or be averaged in.
+        plain: of rasterized ones, whether a plain process on the target may stand in, or be averaged in.
         reasons: one line each.
     """
 
@@ -101,7 +101,8 @@ def plan(
             raise ValueError(
                 "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"
             )
-        return Plan(False, parts=("bearings",), plain=plain, reasons=tuple(reasons))
+        beside = ("process",) if plain else ()
+        return Plan(False, parts=("bearings", *beside), reasons=tuple(reasons))
     if on["phase"] and (count or not plain):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         parts = searched if init.name == "auto" else (str(init.name),)

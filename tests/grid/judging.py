@@ -78,7 +78,8 @@ def run(world: World, seed: int, folder: Path, more: tuple[str, ...] = ()) -> tu
         found.refused, found.seconds = str(error), time.perf_counter() - started
         return found, None
     data, split, gaussians = objects.data, objects.split, int(facts["model/num_gaussians"])
-    found.fit_s, found.plain = float(facts["time/train_s"]), gaussians == 0
+    found.fit_s = float(facts["time/train_s"])
+    found.plain = gaussians == 0 and facts["model/effects"] == "residual"
     found.model = f"{facts['model/effects']} from {facts['model/init']}, {gaussians} Gaussians"
     kind = data.site.kind
     own = _losses(kind, score(objects.methods, data, split).samples)

@@ -19,7 +19,7 @@ from judging import Outcome, repeated, run
 from product import PARTS
 from rich.console import Console
 from rich.table import Table
-from worlds import World, covering, drawn, every
+from worlds import CHOICES, World, covering, drawn, every
 
 MANY = 100
 
@@ -38,16 +38,36 @@ def one(world: World, folder: Path, more: tuple[str, ...]) -> tuple[Outcome, lis
     return (repeated(world, folder, more) if found.behind else found), failures
 
 
+HEADS = ("combination", "seconds", "fit s", "gsparc", "best plain", "allowed", "model", "verdict")
+
+
+def cells(entry: dict) -> tuple[str, ...]:
+    """One result, as `HEADS` name it."""
+    found = Outcome(**{key: value for key, value in entry.items() if key != "failures"})
+    verdict = found.refused or "; ".join(entry["failures"]) or ("behind" if found.behind else "")
+    figures = (f"{found.own:.4g}", f"{found.name} {found.best:.4g}", f"{found.allowed:.2g}")
+    model = found.model + (" (five seeds)" if found.seed < 0 else "")
+    return found.world, f"{found.seconds:.0f}", f"{found.fit_s:.1f}", *figures, model, verdict
+
+
 def table(lines: list[dict]) -> Table:
     """All results."""
-    shown = Table(*("combination", "seconds", "fit s", "gsparc", "best plain", "allowed", "model", "verdict"))
+    shown = Table(*HEADS)
     for entry in lines:
-        found = Outcome(**{key: value for key, value in entry.items() if key != "failures"})
-        verdict = found.refused or "; ".join(entry["failures"]) or ("behind" if found.behind else "")
-        figures = (f"{found.own:.4g}", f"{found.name} {found.best:.4g}", f"{found.allowed:.2g}")
-        model = found.model + (" (five seeds)" if found.seed < 0 else "")
-        shown.add_row(found.world, f"{found.seconds:.0f}", f"{found.fit_s:.1f}", *figures, model, verdict)
+        shown.add_row(*cells(entry))
     return shown
+
+
+def page(lines: list[dict]) -> str:
+    """All results in Markdown, kind by kind, with the share that is no more than a plain process."""
+    text = ""
+    for kind in CHOICES["kind"]:
+        some = sorted((e for e in lines if e["world"].split("-")[0] == kind), key=lambda e: e["world"])
+        plain = sum(e["plain"] for e in some)
+        text += f"\n### {kind}: {len(some)} combinations, {plain} no more than a plain process\n\n"
+        rows = [HEADS, ["---"] * len(HEADS), *map(cells, some)]
+        text += "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    return text
 
 
 def main() -> int:
@@ -56,6 +76,7 @@ def main() -> int:
     parser.add_argument("results", type=Path)
     parser.add_argument("--seed", type=int, help="draw 100 combinations instead of the covering set")
     parser.add_argument("--rows", type=int, nargs="+", default=[30, 300, 3000])
+    parser.add_argument("--page", type=Path, help="write the table as Markdown, too")
     parser.add_argument("more", nargs="*", help="overrides, such as budget_s=5")
     given = parser.parse_args()
     logging.disable(logging.WARNING)
@@ -78,6 +99,8 @@ def main() -> int:
             file.write(json.dumps(done[-1]) + "\n")
         console.print(f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False)
     console.print(table(done))
+    if given.page is not None:
+        given.page.write_text(page(done).lstrip())
     bad = [
         entry
         for entry in done

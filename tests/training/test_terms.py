@@ -46,7 +46,9 @@ def test_an_array_takes_part_where_it_is_declared():
     still = replace(invent("spectrum", 20), site=site)
     assert plan(AUTO, ANY, still, 0).array and not plan(EffectSettings(array=False), ANY, still, 0).array
     moving = replace(still, site=replace(site, static_end="tx"))
-    assert plan(AUTO, ANY, moving, 0).parts == ("bearings",)
+    assert plan(AUTO, ANY, moving, 0).parts == ("bearings", "process")
+    alone = EffectSettings(residual=False)
+    assert plan(alone, ANY, moving, 0).parts == ("bearings",)
     with pytest.raises(ValueError, match="the receiver moves"):
         plan(EffectSettings(array=True), ANY, moving, 0)
 
