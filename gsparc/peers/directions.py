@@ -11,6 +11,7 @@ from gsparc.physics.rays import closest_approach
 
 MISS = 0.01  # [m], two rays that pass this close to each other meet
 MERGE = 0.05  # [m], meeting points this close are one virtual transmitter
+LEAST = 5  # meeting points of a virtual transmitter: fewer meet by chance
 NEIGHBOURS = 8  # receivers whose rays are intersected with those of one receiver
 
 
@@ -22,7 +23,7 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
         rays: n arrays (paths, 3) of unit vectors in the frame of the places.
 
     Returns:
-        (V, 3) [m], and n arrays of rows of it, one entry per ray (-1: the ray meets no other).
+        (V, 3) [m], and n arrays of rows of it, one entry per ray (-1: the ray passes none).
     """
     near = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[1]
     points = []
@@ -34,30 +35,37 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
         known = np.ma.masked_invalid(np.concatenate(meetings, 1))
         distance = np.ma.median(known, axis=1).filled(np.nan)
         points.append(places[i] + distance[:, None] * rays[i])  # NaN where a ray meets no other
-    owner = np.repeat(np.arange(len(points)), [len(p) for p in points])
     flat = np.concatenate(points) if points else np.zeros((0, 3))
-    met = np.isfinite(flat[:, 0])
-    centres, labels = _merged(flat[met])
-    rows = np.full(len(flat), -1)
-    rows[met] = labels
-    return centres, [rows[owner == i] for i in range(len(points))]
+    centres = _merged(flat[np.isfinite(flat[:, 0])])
+    return centres, [_passed(place, own, centres) for place, own in zip(places, rays, strict=True)]
 
 
-def _merged(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Greedy clusters of radius MERGE, the densest first: centres (V, 3) and the label of every point."""
-    labels = np.full(len(points), -1)
+def _passed(place: np.ndarray, rays: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Row (paths,) of the centre that each ray comes nearest to, within the width of a cluster; -1: none."""
+    if not len(centres):
+        return np.full(len(rays), -1)
+    offset = centres - place
+    along = (rays @ offset.T).clip(min=0)
+    miss = np.linalg.norm(offset - along[..., None] * rays[:, None], axis=-1)
+    return np.where(miss.min(1) < 2 * MERGE, miss.argmin(1), -1)
+
+
+def _merged(points: np.ndarray) -> np.ndarray:
+    """Centres (V, 3) of greedy clusters of radius MERGE, the densest first, of at least LEAST points.
+
+    Where none has as many, of the largest.
+    """
     if not len(points):
-        return np.zeros((0, 3)), labels
-    tree = cKDTree(points)
-    around = tree.query_ball_point(points, MERGE)
-    centres: list[np.ndarray] = []
+        return np.zeros((0, 3))
+    free = np.full(len(points), True)
+    around = cKDTree(points).query_ball_point(points, MERGE)
+    clusters = []
     for seed in sorted(range(len(points)), key=lambda k: -len(around[k])):
-        if labels[seed] >= 0:
-            continue
-        members = [k for k in around[seed] if labels[k] < 0]
-        labels[members] = len(centres)
-        centres.append(np.median(points[members], axis=0))
-    return np.stack(centres), labels
+        if free[seed]:
+            clusters.append([k for k in around[seed] if free[k]])
+            free[clusters[-1]] = False
+    least = min(LEAST, max(map(len, clusters)))
+    return np.stack([np.median(points[rows], axis=0) for rows in clusters if len(rows) >= least])
 
 
 def votes(seen: list[np.ndarray], count: int) -> Tensor:

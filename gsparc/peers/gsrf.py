@@ -4,10 +4,14 @@ K. Yang, G. Dong, S. Ji, W. Du, M. Srivastava, "GSRF: Complex-Valued 3D Gaussian
 Radio-Frequency Data Synthesis", NeurIPS 2025. Its forerunner RFSPM (K. Yang et al., "Scalable 3D Gaussian
 Splatting-Based RF Signal Spatial Propagation Modeling", 2025) had a network per Gaussian instead.
 
-Kept: complex radiance without any network, front-to-back compositing, magnitude of the complex sum, the loss
-in the frequency domain. Left out: the phase of the transmittance (ours attenuates without a phase; radiances
-absorb it), adaptive density control, orthographic splatting onto a sphere of rays
-(our footprints lie on the tangent plane).
+Kept: complex radiance without any network, front-to-back compositing, magnitude of the complex sum, a loss of
+absolute errors, SSIM and the frequency domain. Left out: the phase of the transmittance (ours attenuates
+without a phase; radiances absorb it), adaptive density control, associated Legendre functions (ours are
+products of polynomials and a Fourier series), orthographic splatting onto a sphere of rays (our footprints
+lie on the tangent plane), spectra rendered about the transmitter (ours are about the receiver).
+
+Channels are an extension of ours: the distance to every Gaussian turns and fades its wave, and each has a
+response per antenna and tone. The published task, an uplink channel at a latent position, is another.
 """
 
 from __future__ import annotations
@@ -40,7 +44,7 @@ class GSRF(GaussianPeer):
     Args:
         count: Gaussians.
         degree, order: largest Legendre degree and Fourier order of the radiance.
-        fourier_weight: share of the loss in the frequency domain (spectra).
+        ssim_weight, fourier_weight: shares of SSIM and of the frequency domain in the loss (spectra).
         others: see `TrainedPeer`.
     """
 
@@ -50,23 +54,25 @@ class GSRF(GaussianPeer):
     count: int = 500
     degree: int = 3
     order: int = 3
+    ssim_weight: float = 0.19
     fourier_weight: float = 0.05
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
-        return ComplexGaussians(scene, self.count, self.degree, self.order, self.fourier_weight)
+        return ComplexGaussians(scene, self)
 
 
 class ComplexGaussians(GaussianNetwork):
     """N Gaussians, each with K complex coefficients."""
 
-    def __init__(self, scene: Scene, count: int, degree: int, order: int, fourier_weight: float) -> None:
+    def __init__(self, scene: Scene, settings: GSRF) -> None:
         super().__init__()
-        self.scene, self.count, self.degree, self.order = scene, count, degree, order
-        self.fourier_weight = fourier_weight
+        count, self.degree, self.order = settings.count, settings.degree, settings.order
+        self.scene, self.count, self.fourier_weight = scene, count, settings.fourier_weight
+        self.ssim_weight = settings.ssim_weight / (1 - settings.fourier_weight)  # of what the base counts
         self.field = gaussians_of(scene, count)
         self.grid, self.options = rendering_of(scene)
-        self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(degree, order), 2))
+        self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(self.degree, self.order), 2))
         with torch.no_grad():
             self.coefficients[:, 0, 0] += 0.3
         self.response: nn.Parameter | None = None
@@ -109,7 +115,7 @@ class ComplexGaussians(GaussianNetwork):
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain
         difference = torch.fft.rfft2(self(batch.tx, batch.rx) - batch.target, norm="ortho").abs().mean()
-        return plain + self.fourier_weight * difference
+        return (1 - self.fourier_weight) * plain + self.fourier_weight * difference
 
     def train(self, mode: bool = True) -> ComplexGaussians:
         """Further training drops the frozen view."""

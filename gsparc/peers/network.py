@@ -11,8 +11,6 @@ from gsparc.data.schema import Batch, Site
 from gsparc.ops import Pose
 from gsparc.training.losses import channel_loss, spectrum_loss
 
-SSIM_WEIGHT = 0.2
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -47,6 +45,7 @@ class Network(nn.Module):
 
     scene: Scene
     count = 0  # Gaussians, or virtual transmitters
+    ssim_weight = 0.2  # share of the loss of spectra
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """Training loss () of a batch; `draw` for whatever is drawn at random."""
@@ -55,7 +54,7 @@ class Network(nn.Module):
             return channel_loss(prediction, batch.target, batch.mask).mean()
         if batch.mask is not None:
             prediction = torch.where(batch.mask, prediction, batch.target)
-        return spectrum_loss(prediction, batch.target, SSIM_WEIGHT).mean()
+        return spectrum_loss(prediction, batch.target, self.ssim_weight).mean()
 
     @torch.no_grad()
     def answer(self, tx: Tensor, rx: Pose) -> Tensor:

@@ -7,8 +7,9 @@ Kept: training rays along measured directions of arrival, a network of place and
 the ray a virtual transmitter stands and what it sends, amplitude 1/d and the carrier's phase over the marched
 distance; at a query the directions are *searched* (rays of training receivers are intersected, the nearest
 receivers vote which of the virtual transmitters are seen). Left out: the network that predicts how many paths
-a query has (the neighbours' mean is taken); a density per metre (ours is an opacity per sample, since half of
-the samples lie within 10 cm of where the intersection found something, in place of hierarchical resampling).
+a query has (what at least half of the neighbours see is taken); a density per metre (ours is an opacity per
+sample, since half of the samples lie within 10 cm of where the intersection found something, in place of
+hierarchical resampling).
 """
 
 from __future__ import annotations
@@ -90,7 +91,6 @@ class DirectedRays(Network):
         self.scene, self.found, self.count = scene, found, len(found["virtual"])
         self.samples, self.neighbours = settings.samples, min(settings.neighbours, len(found["places"]))
         self.wavenumber = 2 * math.pi / scene.site.wavelength
-        self.paths = max(1, round(float((found["votes"] > 0).sum(1).float().mean())))
         reach = (found["virtual"][:, None] - found["places"][None]).norm(dim=-1)
         self.far = float(torch.quantile(reach[found["votes"].T > 0], 0.99)) + AROUND
         around = torch.stack([scene.box[0] - self.far, scene.box[1] + self.far])
@@ -102,18 +102,14 @@ class DirectedRays(Network):
     def search(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
         """Virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and whether each is (B, P).
 
-        Training receivers (`skip_self`) see what they were measured to see.
+        At least half of the nearest training receivers see them. Training receivers (`skip_self`) see what
+        they were measured to see.
         """
         distance = torch.cdist(places, self.found["places"])
-        table = self.found["votes"]
-        if skip_self:
-            counts = table[distance.argmin(1)]
-            width = int((table > 0).sum(1).max())
-        else:
-            near = distance.topk(self.neighbours, largest=False).indices
-            counts, width = (table[near] > 0).float().sum(1), self.paths
-        best = counts.topk(min(width, counts.shape[1]), dim=1)
-        return self.found["virtual"][best.indices], best.values > 0
+        near = distance.topk(1 if skip_self else self.neighbours, largest=False).indices
+        share = (self.found["votes"] > 0)[near].float().mean(1)
+        best = share.topk(max(int((share >= 0.5).sum(1).max()), 1), dim=1)
+        return self.found["virtual"][best.indices], best.values >= 0.5
 
     def march(self, places: Tensor, goals: Tensor, likely: Tensor, draw: torch.Generator | None) -> Tensor:
         """Channels (B,) of rays from places (B, 3) towards goals (B, P, 3) [m], those likely (B, P)."""

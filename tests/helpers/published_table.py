@@ -1,0 +1,57 @@
+"""The table of docs/peers.md: settings of the peers beside the published ones.
+
+Ours are in conf/model, the published ones in conf/paper; what was left out is in the modules' docstrings.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gsparc.methods.registry import METHODS
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "peers.md"
+BEGIN = "<!-- settings: written by `python tests/helpers/published_table.py` -->"
+END = "<!-- end of settings -->"
+PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf")
+NO_SETTING = ("_target_", "name", "seed", "budget_s")
+
+
+def table() -> str:
+    """A row for each peer; ValueError where conf/paper names what is no setting of the model."""
+    heads = ("`model=`", "as published", "ours (published)", "ours, no published value known", "left out")
+    rows = [heads, ("---",) * len(heads)]
+    for peer in PEERS:
+        ours, paper = settings("model", peer), settings("paper", peer)
+        if unknown := set(paper) - set(ours):
+            raise ValueError(f"conf/paper/{peer}.yaml: {unknown} are no settings of conf/model/{peer}.yaml")
+        same = [f"{key} {value}" for key, value in paper.items() if ours[key] == value]
+        other = [f"{key} {ours[key]} ({value})" for key, value in paper.items() if ours[key] != value]
+        alone = [f"{key} {value}" for key, value in ours.items() if key not in paper and value is not None]
+        said = " ".join((import_module(METHODS[peer].rpartition(".")[0]).__doc__ or "").split())
+        left_out = re.findall(r"Left out: (.*?)\.(?: |$)", said)
+        rows.append((f"`{peer}`", *map("; ".join, (same, other, alone, left_out))))
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows).replace("None", "null")
+
+
+def settings(group: str, peer: str) -> dict[str, Any]:
+    """Settings of a peer in conf/`group`: `model` or `paper`."""
+    file = ROOT / "conf" / group / f"{peer}.yaml"
+    told = yaml.safe_load(file.read_text(encoding="utf-8")) if file.exists() else {}
+    told = told if group == "model" else told.get("model", {})
+    return {key: value for key, value in told.items() if key not in NO_SETTING}
+
+
+def written(text: str) -> str:
+    """A page with the table of today between its markers."""
+    before, rest = text.split(BEGIN)
+    return f"{before}{BEGIN}\n\n{table()}\n\n{END}{rest.split(END)[1]}"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(written(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
