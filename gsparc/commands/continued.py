@@ -21,7 +21,7 @@ from gsparc.methods.parts import LAST
 
 log = logging.getLogger(__name__)
 
-RECORD = "job.json"  # of a job's folder: its settings, when it began, and what it returned
+RECORD = "job.json"  # of a job's folder: its settings and data, when it began, and what it returned
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 
 
@@ -44,9 +44,11 @@ def once(
         if not mine:
             raise ValueError(f"{run_dir}: another process does this job; wait for its end")
         settings = json.loads(json.dumps(plain(config), default=str))
+        now = {"settings": settings, "data": _files(settings.get("dataset"))}
         record, other = _read(run_dir / RECORD), None
-        if record is None or record["settings"] != settings or (again and record["returned"] is not None):
-            record = {"settings": settings, "program": provenance(), "began": time.time(), "returned": None}
+        same = record is not None and all(record.get(key, now[key]) == now[key] for key in now)
+        if record is None or not same or (again and record["returned"] is not None):
+            record = {**now, "program": provenance(), "began": time.time(), "returned": None}
             _write(run_dir / RECORD, record)
             other = _beside(run_dir, record) if again and config.ckpt_path is None else None
         elif record["returned"] is not None:
@@ -64,11 +66,22 @@ def once(
         return value
 
 
+def _files(dataset: Any) -> dict[str, list[int]]:
+    """Number, bytes and last change [ns] of the files that settings of a dataset name."""
+    named = {Path(value) for value in dict(dataset or {}).values() if isinstance(value, str) and value}
+    found = {}
+    for path in sorted(one for one in named if one.exists()):
+        inside = [one.stat() for one in (path.rglob("*") if path.is_dir() else [path]) if one.is_file()]
+        newest = max((one.st_mtime_ns for one in inside), default=0)
+        found[str(path.resolve())] = [len(inside), sum(one.st_size for one in inside), newest]
+    return found
+
+
 def _beside(run_dir: Path, record: dict[str, Any]) -> Path | None:
-    """The record of the newest run beside this one that was interrupted, of the same settings and program."""
+    """The record of the newest interrupted run beside this one, of the same settings, data and program."""
     for path in sorted(run_dir.parent.glob(f"*/{RECORD}"), reverse=True):
         one = None if path.parent == run_dir else _read(path)
-        if one is None or any(one.get(key) != record[key] for key in ("settings", "program", "returned")):
+        if one is None or any(one.get(k) != record[k] for k in ("settings", "data", "program", "returned")):
             continue
         if _left(path.parent, one["began"]) is not None and not in_use(path.parent):
             return path

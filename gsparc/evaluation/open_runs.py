@@ -21,6 +21,7 @@ from gsparc.methods.predictor import SAME_PLACE_M
 
 log = logging.getLogger(__name__)
 
+WATTS = {"dBW": 1.0, "dBm": 1e-3}  # that a power of 1 is, by the unit of levels
 SAME_ROW_M = 1e-3  # rows of two files this near are of the same place
 
 
@@ -170,7 +171,7 @@ def _training_folds(stored: Sequence[checkpoint.Stored], own: Measurements) -> S
 
 
 def aligned(data: Measurements, site: Site) -> Measurements:
-    """`data` in the local coordinates and target units that a model of `site` was trained in.
+    """`data` in the local coordinates and target units, watts or milliwatts, that a model was trained in.
 
     Raises:
         ValueError: another kind, grid, moving end or static place, or a station that the model does not know.
@@ -189,12 +190,14 @@ def aligned(data: Measurements, site: Site) -> Measurements:
             raise ValueError(f"the static {own.static_end} of {own.name} is {gap:.3g} m from the model's")
     data = _renumbered(data, site, shift)
     own = data.site
-    if not shift.any() and own.target_scale == site.target_scale:
+    units, rescale = (own.level_unit, site.level_unit), own.target_scale / site.target_scale
+    if set(units) <= set(WATTS):  # what is called dB may be either
+        rescale *= WATTS[units[0]] / WATTS[units[1]]
+    if not shift.any() and own.target_scale == site.target_scale and rescale == 1:
         return data
-    rescale = own.target_scale / site.target_scale
     there = replace(
         own, origin=site.origin, box=own.box + shift, static_position=site.static_position,
-        target_scale=site.target_scale,
+        target_scale=site.target_scale, level_unit=site.level_unit,
     )  # fmt: skip
     return replace(
         data, site=there, tx=data.tx + shift, rx_position=data.rx_position + shift,

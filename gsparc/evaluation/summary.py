@@ -106,8 +106,15 @@ def shown(value: float | None, form: str) -> str:
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """Remarks on a table: stand-ins, a busy machine, a baseline that is better."""
-    return run_conditions(facts) + decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
+    """Remarks on a table: rows that are not unseen, stand-ins, a busy machine, a baseline that is better."""
+    seen = {
+        "train": ["these rows were learned from: eval_on=test is about others"],
+        "val": [
+            "val rows were chosen by or learned from, too, except by baselines: eval_on=test compares methods"
+        ],
+    }
+    rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
+    return [*seen.get(prefix, []), *run_conditions(facts), *rest]
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:

@@ -19,6 +19,7 @@ from gsparc.maps.geojson import read_shapes
 from gsparc.methods.predictor import usual_heights
 
 CELLS = 20_000  # of a map whose step nobody chose, about
+LEAST = 1e-4  # of a site's width, of a rectangle: in degrees a site is 1e-5 as wide as in metres
 HEIGHT = 1.5  # of a hand, where nothing says another [m]
 BYTES = 4 * 4  # of a cell and station: power, both ends of the interval, expected error
 BYTES_MORE = 8 * 8  # of a cell besides: what pictures and files hold for a while
@@ -110,16 +111,20 @@ def grid_of(
 
 def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.ndarray, np.ndarray, Any]:
     """Corners (2,) of a rectangle, and what says which places (n, 2) are inside; None: all."""
+    box = None if site is None else site.moving_box
+    width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
     if isinstance(area, str | Path):
         if Path(area).suffix.lower() not in (".geojson", ".json"):
             raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
-        box = None if site is None else site.moving_box
-        width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
         origin = None if site is None else site.georeference
         shapes = read_shapes(area, "area", origin, site_m=width)
         return *shapes.bounds(), shapes.contains
     if area is not None:
-        return *_rectangle(area), None
+        low, high = _rectangle(area)
+        if (high - low).max() < LEAST * width:
+            fault = f"{(high - low).max():.2g} m wide, the site {width:.3g} m; a rectangle is in metres"
+            raise DataError(f"area={_as_text(area)}: {fault}, polygons of a *.geojson may be in degrees")
+        return low, high, None
     if plan is not None:
         corners = plan.corners()
         return corners.min(axis=0), corners.max(axis=0), Outline(corners).contains_points

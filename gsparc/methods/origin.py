@@ -19,7 +19,7 @@ from gsparc.methods.method import FitContext
 log = logging.getLogger(__name__)
 
 # Settings that a run must share with what it goes on from.
-DECIDING = ("model", "dataset.batch_size", "init_from")
+DECIDING = ("model", "dataset.batch_size", "init_from", "stations")
 CHANGEABLE = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
 """Settings that may change on the way, and are then named."""
 UNHASHED = (

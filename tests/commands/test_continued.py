@@ -56,6 +56,19 @@ def test_a_checkpoint_of_other_settings_is_not_gone_on_from(tmp_path):
     assert seen == [None]
 
 
+@pytest.mark.parametrize("what", ["file", "root"])
+def test_a_finished_job_answered_for_the_file_before(tmp_path, what):
+    """Other measurements under the same name had the figures of those before."""
+    data = tmp_path / "release" / "drive.csv"
+    data.parent.mkdir()
+    named, seen = job(dataset={what: str(data if what == "file" else data.parent)}), []
+    for content in ("x,y,rssi_db\n", "x,y,rssi_db\n", "x,y,z,rssi_db\n"):
+        if not data.exists() or data.read_text() != content:
+            data.write_text(content)
+        once(tmp_path, named, lambda config: seen.append(data.read_text()) or 1.0)
+    assert len(seen) == 2 and seen[0] != seen[1]
+
+
 def test_the_same_run_said_again_began_anew_without_a_word(tmp_path, caplog):
     """It goes on from the folder beside it where it was interrupted; one that has ended is done again."""
     caplog.set_level("INFO", "gsparc")

@@ -347,6 +347,16 @@ def test_places_far_outside_are_counted(town, tmp_path, caplog):
     assert "2 of 4 places lie more than" in caplog.text and "the first in line 4" in caplog.text
 
 
+@pytest.mark.parametrize("factor, said", [(1e-3, True), (1e-5, True), (1e-2, False)])
+def test_degrees_or_kilometres_as_metres_were_one_place_without_a_word(town, tmp_path, caplog, factor, said):
+    """All of them lay within millimetres, in the middle of what was measured, and were predicted alike."""
+    file = write_table(
+        tmp_path / "a.csv", "xyz", [[11 + x * factor, 4 + x * factor, 1 + x / 9] for x in range(19)]
+    )
+    predict(town, file)
+    assert ("degrees or km as x and y?" in caplog.text) == said
+
+
 @pytest.mark.parametrize("shape, heads", [((), ["csi_re", "csi_im"]), ((2, 3), ["csi_re_0_0", "csi_im_1_2"])])
 def test_channels(tmp_path, shape, heads):
     place = walk()

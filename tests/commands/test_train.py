@@ -198,6 +198,7 @@ def interrupted(tmp_path_factory):
         ("model.field.count=41", r"model\.field\.count=\d+ \(here 41\)"),
         ("model.emission.hidden=7", r"model\.emission\.hidden=\d+ \(here 7\)"),
         ("dataset.batch_size=5", r"dataset\.batch_size=\d+ \(here 5\)"),
+        ("stations=together", r"stations=auto \(here together\)"),  # a model of each was shown as one of all
     ],
 )
 def test_a_run_goes_on_with_the_same_split_seed_and_settings_or_not_at_all(

@@ -66,3 +66,11 @@ def test_a_no_break_space_between_columns(write):
     """Cells were counted by one rule and parsed by another: KeyError: 3."""
     arrays = read_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).arrays
     np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("x, asked", [("448,262", True), ("448,26", False)])
+def test_thousands_between_semicolons_were_decimals_without_a_question(write, x, asked):
+    """x of 448,262 m and y of 5412013 m: a drive 1000 times shorter to the east."""
+    notes = understand_table(write(f"x;y;rssi\n{x};5412013;-80\n448,291;5412100;-81\n")).notes
+    said = [note for note in notes if note.startswith("decimal commas")]
+    assert len(said) == 1 and ("448,262 is 448.262; if commas stand between thousands" in said[0]) == asked

@@ -9,6 +9,7 @@ import pytest
 
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.tables.read import read_table
 from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.scores import score
@@ -40,6 +41,24 @@ def test_stations_in_another_order_were_answered_by_each_other(chosen):
     assert [NAMES[t] for t in same.station[: len(chosen)]] == [NAMES[t] for t in chosen]
     split = make_split(same.moving, SplitSettings(), place=same.place)
     assert score([method], same, split).figures()["rmse_db"] < 4
+
+
+@pytest.mark.parametrize(("model", "unit", "power"), [("dBm", "W", -3), ("dBW", "mW", 0)])
+def test_watts_were_asked_of_a_model_of_milliwatts(tmp_path, model, unit, power):
+    """Errors of 30 dB beside baselines of one: a table of levels in dBm, another of powers in W."""
+    heads = f"x,y,z,power [{unit}]\n"
+    rows = (
+        f"{x},{y},{z},{10 ** (level / 10 + power)}\n"
+        for (x, y, z), level in zip(WALK, LEVELS[:, 0], strict=True)
+    )
+    (tmp_path / "drive.csv").write_text(heads + "".join(rows))
+    given = {"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0] - 30 * (model == "dBW")}
+    data = from_arrays(given, {"level_unit": model})
+    table = read_table(tmp_path / "drive.csv")
+    other = from_arrays({**table.arrays, "tx_position": POSTS[0]}, table.attributes)
+    same = aligned(other, data.site)
+    np.testing.assert_allclose(same.target, data.target, rtol=1e-5)
+    assert (same.site.level_unit, same.site.target_scale) == (model, data.site.target_scale)
 
 
 def test_a_station_that_the_model_does_not_know_is_refused():

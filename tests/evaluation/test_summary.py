@@ -103,6 +103,13 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
     assert "gp" in remarks({**quiet, "baseline/gp/psnr_db": 31.0})[0]
 
 
+@pytest.mark.parametrize("prefix", ["train", "val"])
+def test_rows_that_were_learned_from_were_shown_like_unseen_ones(prefix):
+    """gp with 0.11 dB on val rows stood beside gp (baseline) with 1.15, which had not learned them."""
+    facts = {"dataset/kind": "rssi", f"{prefix}/rmse_db": 0.11, "baseline/gp/rmse_db": 1.15}
+    assert "eval_on=test" in remarks(facts, prefix)[0]
+
+
 def test_a_report_of_an_installed_wheel_was_made_at_commit_none():
     assert re.fullmatch(r"gsparc \d+\.\d+\.\d+", program({"git": None}))
     assert program({"git": "c0ffee00" * 5}).endswith(" at commit c0ffee00")

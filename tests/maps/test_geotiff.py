@@ -67,6 +67,8 @@ def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
         predictor.map(tmp_path / "area.geojson")
     with pytest.raises(DataError, match="degrees mean nothing to"):
         plan_next(predictor, 3, walkable=tmp_path / "area.geojson")
+    with pytest.raises(DataError, match="a rectangle is in metres"):
+        predictor.map([11.3, 47.2, 11.301, 47.2008])
 
 
 def test_asked_for_without_a_place_on_earth():

@@ -125,6 +125,11 @@ def prepare(
         trainer["trainer"] = {name: v for name, v in whole["trainer"].items() if name != "strategy"}
     if whole["stations"] == "together" or (whole["stations"] == "auto" and problem.stations):
         trainer["stations"] = whole["stations"]
+    beside = {**whole, "batch_size": whole["dataset"].get("batch_size", 16)}
+    clock = "wall" if whole["budget_s"] is None else "processor"  # as cells without this in their name had
+    for setting, usual in (("budget_clock", clock), ("init_from", None), ("batch_size", 16)):
+        if beside[setting] != usual:
+            trainer[setting] = beside[setting]
     if problem.draw is None and cell.seed and "seed" not in whole["model"]:
         trainer["seed"] = cell.seed  # of a draw, the split's own hash tells
     name = key(whole["model"], trainer, *problem.hashes)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.predict.answers import Answers, answers
 from gsparc.commands.predict.files import check_fits, decibels, target, write
-from gsparc.commands.predict.placing import far_outside, in_world, stations_of, with_heights
+from gsparc.commands.predict.placing import far_outside, in_a_speck, in_world, stations_of, with_heights
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
@@ -62,6 +62,9 @@ def predict(
     )
     for line in left_out:
         log.warning(line)
+    speck = in_a_speck(queries, world, site)
+    if speck is not None:
+        log.warning("%s: %s", places, speck)
     if far.any():
         log.warning(
             "%s: %d of %d places lie more than %.3g m outside the box of the training places, the first in "

@@ -16,6 +16,7 @@ from gsparc.data.tables.places import Places
 from gsparc.methods.predictor import usual_heights
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
+SPECK = 1e-3  # of that side: in degrees a site is 1e-5 as wide as in metres, in kilometres 1e-3
 
 
 def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
@@ -77,6 +78,18 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
     low, high = np.tile(site.box, len(moving)) if site.moving_box is None else site.moving_box
     margin = MARGIN * float((high - low).max())
     return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
+
+
+def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
+    """In words that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
+    given = [world[end] for end, where in queries.ends.items() if not where.degrees]
+    low, high = site.box if site.moving_box is None else site.moving_box
+    wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in given), default=0.0)
+    side = float((high - low).max())
+    if not 0 < wide <= SPECK * side:
+        return None
+    here = f"all places lie within {wide:.2g} m of each other, those measured within {side:.3g} m"
+    return f"{here}: degrees or km as x and y?"
 
 
 def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> list[tuple[int, int | None]]:

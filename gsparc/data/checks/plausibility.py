@@ -79,12 +79,14 @@ def _units(position: np.ndarray) -> list[str]:
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
-    """Latitudes and longitudes (n,) [deg] on Earth that may be swapped."""
+    """Latitudes and longitudes (n,) [deg] on Earth that may be swapped, or radians."""
     where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
     if np.median(latitude) < -60:
         return [f"the places lie in the Antarctic ({where}): latitude and longitude swapped?"]
     if np.median(latitude) > 75:
         return [f"the places lie in the Arctic ({where}): latitude and longitude swapped?"]
+    if np.abs(latitude).max() <= np.pi / 2 and np.abs(longitude).max() <= np.pi:
+        return [f"the places lie in the Gulf of Guinea ({where}), at sea: radians? then say so in the heads"]
     return []
 
 
@@ -117,12 +119,12 @@ def marks(values: np.ndarray) -> list[str]:
     """A value (n,) that many rows have and that lies apart from all others, or at the lower end."""
     said = []
     for mark, apart in _marks(values):
-        count = int((values == mark).sum())
-        share = f"{count} of {len(values)} levels are exactly {mark:g}"
+        count, shown = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
+        share = f"{count} of {len(values)} levels are exactly {shown}"
         if apart:
             said.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
         else:
-            said.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={mark:g}")
+            said.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={shown}")
     return said
 
 

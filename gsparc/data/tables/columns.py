@@ -293,10 +293,13 @@ def _one_unit(sheet: Sheet, chosen: Chosen, problems: Problems) -> None:
     for kind in SCHEMA:
         columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
         turned = [c for c in columns if c.unit is not None and c.unit.changes]
-        silent = [c for c in columns if c.unit is None]
+        silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]  # to watts or milliwatts?
         if turned and silent and turned[0].unit is not None:
-            said = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} says no unit"
-            problems.add(sheet.source, f"{said}; rename one, e.g. to '{silent[0].head} [{SCHEMA[kind]}]'")
+            other = silent[0].unit
+            said = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} "
+            said += "says no unit" if other is None else f"in {other.name} of nothing"
+            plain = unit_of(silent[0].head or "")[0]
+            problems.add(sheet.source, f"{said}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
 
 
 def _ambiguous(sheet: Sheet, role: str, columns: list[Column], problems: Problems) -> None:

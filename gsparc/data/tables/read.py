@@ -73,6 +73,7 @@ def understand_table(
     problems.raise_if_any()
     level = chosen["rssi_db"][0] if "rssi_db" in chosen else None
     about = {} if level is None or level.unit is None else {"level_unit": schema_unit(level)}
+    about |= {"level_unit": "dBW"} if "rssi" in chosen else {}
     return Table(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 

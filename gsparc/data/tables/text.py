@@ -73,7 +73,7 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
     if decimal == ",":
-        notes.append("decimal commas")
+        notes.append("decimal commas" + _perhaps_thousands(frame))
     columns = tuple(frame[i] for i in range(len(heads)))
     return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines.number[1:]), decimal), notes
 
@@ -227,6 +227,16 @@ def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
         return False
     cells = pd.concat([frame[i] for i in frame.columns])
     return bool((cells.str.fullmatch(DECIMAL_COMMA) & ~cells.str.fullmatch(THOUSANDS)).any())
+
+
+def _perhaps_thousands(frame: pd.DataFrame) -> str:
+    """A question where all cells with a comma may be marked between thousands; else nothing."""
+    cells = pd.concat([frame[i] for i in frame.columns])
+    marked = cells[cells.str.fullmatch(DECIMAL_COMMA)]
+    if not marked.str.fullmatch(THOUSANDS).all():
+        return ""
+    first = marked.iloc[0].strip()
+    return f": {first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
 
 
 def _decimal(frame: pd.DataFrame) -> str:

@@ -114,7 +114,23 @@ def test_every_seed_is_a_cell_of_its_own(model, tmp_path):
             ).folder
             for seed in range(3)
         ]
-    assert len(folders) == 3
+    assert len(set(folders)) == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "choose"),
+    [({"batch_size": 4}, ()), ({}, ("budget_clock=processor",)), ({}, ("init_from=model.ckpt",))],
+)
+def test_a_cell_was_taken_for_one_of_another_batch_clock_or_start(settings, choose, tmp_path):
+    """These settings stand beside the model's: a table of batches of 4 showed cells of batches of 16."""
+    cell = Cell("own", "random", "gsparc", 5.0, 0)
+    problem = Problem("own", "random", "spectrum", ("d", "s", "i"))
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        folders = []
+        for own, more in (({}, ()), (settings, choose)):
+            contender = Contender("gsparc", ("model=gsparc", *more), ("budget_s={budget_s}",))
+            folders.append(prepare(cell, contender, {"file": "x", **own}, problem, tmp_path).folder)
+    assert folders[0] != folders[1]
 
 
 def test_a_full_disk_ends_a_comparison(campaign, folds, tmp_path, monkeypatch):

@@ -84,6 +84,7 @@ def test_small_tables_far_from_the_origin_are_not_degrees():
     [
         ([-74.0, -74.1], [40.7, 40.8], "Antarctic"),
         ([80.2, 80.3], [13.0, 13.1], "Arctic"),
+        (np.radians([48.1, 48.2]), np.radians([11.5, 11.6]), "at sea: radians?"),  # was 57 times too small
     ],
 )
 def test_degrees(latitude, longitude, said):
@@ -104,6 +105,7 @@ def test_sound_degrees():
         (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
         (lambda v: np.where(np.arange(len(v)) % 5 == 0, 100, v), "exactly 100, far from all others"),
         (lambda v: np.where(np.arange(len(v)) % 5 == 0, -200, v), "exactly -200, far from all others"),
+        (lambda v: np.where(np.arange(len(v)) % 5 == 0, 5.5e-9, v), "exactly 0, far"),  # 0 dB, of float32
         (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? leave them empty and give"),
         (lambda v: v * 0 - 3, "all levels are -3 dB"),
     ],
