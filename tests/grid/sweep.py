@@ -22,6 +22,7 @@ from rich.table import Table
 from worlds import CHOICES, World, covering, drawn, every
 
 MANY = 100
+MARK = "<!-- written by tests/grid/sweep.py -->\n"
 
 
 def one(world: World, folder: Path, more: tuple[str, ...]) -> tuple[Outcome, list[str]]:
@@ -76,7 +77,7 @@ def main() -> int:
     parser.add_argument("results", type=Path)
     parser.add_argument("--seed", type=int, help="draw 100 combinations instead of the covering set")
     parser.add_argument("--rows", type=int, nargs="+", default=[30, 300, 3000])
-    parser.add_argument("--page", type=Path, help="write the table as Markdown, too")
+    parser.add_argument("--page", type=Path, help="write the table as Markdown, below what stands there")
     parser.add_argument("more", nargs="*", help="overrides, such as budget_s=5")
     given = parser.parse_args()
     logging.disable(logging.WARNING)
@@ -100,7 +101,8 @@ def main() -> int:
         console.print(f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False)
     console.print(table(done))
     if given.page is not None:
-        given.page.write_text(page(done).lstrip())
+        kept = given.page.read_text().partition(MARK)[0] if given.page.exists() else ""
+        given.page.write_text(kept + MARK + page(done))
     bad = [
         entry
         for entry in done

@@ -133,6 +133,18 @@ def test_a_cell_was_taken_for_one_of_another_batch_clock_or_start(settings, choo
     assert folders[0] != folders[1]
 
 
+def test_a_cell_was_taken_for_one_of_other_walls_in_a_file_of_that_name(tmp_path):
+    cell, walls = Cell("own", "random", "gsparc", 5.0, 0), tmp_path / "walls.json"
+    problem = Problem("own", "random", "rssi", ("d", "s", "i"))
+    contender = Contender("gsparc", ("model=gsparc", "init=scene", f"init.file={walls}"), ("budget_s=5",))
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        folders = []
+        for text in ("[]", "[1]"):
+            walls.write_text(text)
+            folders.append(prepare(cell, contender, {"file": "x"}, problem, tmp_path).folder)
+    assert folders[0] != folders[1]
+
+
 def test_a_full_disk_ends_a_comparison(campaign, folds, tmp_path, monkeypatch):
     """Every further cell was trained in vain; then `no cell is filled (train=true fills them)`."""
     tried = []
