@@ -11,6 +11,7 @@ from gsparc.field.initial import InitSettings
 
 Switch = bool | Literal["auto"]
 SWITCH = switch("auto")
+PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def plan(
             raise ValueError(
                 "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"
             )
-        beside = ("process",) if plain else ()
+        beside = ("process",) if plain and len(data) <= PROCESS_ROWS else ()
         return Plan(False, parts=("bearings", *beside), reasons=tuple(reasons))
     if on["phase"] and (count or not plain):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
