@@ -29,6 +29,7 @@ FIXTURES = Path(__file__).parent / "old_checkpoints"
 FILES = {  # of methods whose name has changed since
     "moving_array": "bearings", "image_source_gp": "vsgp", "directional_gp": "directed",
     "gsparc": "gsparc_field", "array": "traded_array_field",
+    "nerf2": "nerf2_trunk",
 }  # fmt: skip
 DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink", "auto"), ""),
