@@ -164,7 +164,9 @@ class Search:
         """
         posterior = Posterior(self.rows, self.scene)
         parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
-        for parent in parents:
+        for number, parent in enumerate(parents):
+            if number and self.over():
+                break
             spread = partial(self._spread, parent)
             found = search_box(
                 self.rows, posterior.factor, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,

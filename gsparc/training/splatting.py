@@ -218,12 +218,17 @@ class LearnedField(Method):
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
             end = context.budget_s * 0.5 if first else context.budget_s - self._reserve_s
             pace = Pace(steps, end - budget.spent)
-            if pace.budget_s <= 0:
+            if pace.budget_s <= 0 and self._paying != 0:
+                blind = stage == "train" and self.keep_best and self.choices.closed_form
+                self._paying = 0 if blind else self._paying  # nothing shows that steps would gain
                 log.warning(
                     "budget_s=%.3g: %.1f of %.3g s went before the first step of stage %s (preparation, "
-                    "earlier stages), which has one step; give more",
-                    context.budget_s, budget.spent, end, stage,
+                    "earlier stages), which has %s; give more",
+                    context.budget_s, budget.spent, end, stage, "none" if blind else "one step",
                 )  # fmt: skip
+        if self._paying == 0:
+            self.steps = 0
+            return prepared
         module = self.module(steps, folder, pace)
         module.prepared_seconds, module.solved = earlier_s + prepared, self.choices.closed_form
         marks = {
@@ -232,9 +237,6 @@ class LearnedField(Method):
             "left_out": None if self._left_out is None else self._left_out.state(), **origin.marks(),
         }  # fmt: skip
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
-        if stage == "refit" and self._paying == 0:
-            self.steps = 0
-            return prepared
         watch: list[L.Callback] = []
         every = None
         if self.keep_best and stage == "train":
