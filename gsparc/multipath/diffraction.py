@@ -108,8 +108,9 @@ def edge_wave(
 
 
 def propose(
-    rows: Rows, factor: Factor, transmitter: Tensor, box: Tensor, generator: torch.Generator
-) -> tuple[Tensor, Tensor] | None:
+    rows: Rows, factor: Factor, transmitter: Tensor, box: Tensor, generator: torch.Generator,
+    late: Late = never,
+) -> tuple[Tensor, Tensor] | None:  # fmt: skip
     """Point and axis (3,) of the edge of largest gain given the sources of `factor`, or None.
 
     Args:
@@ -118,6 +119,7 @@ def propose(
         transmitter: (3,) float64 [m].
         box: (2, 3) float64 [m] where edges may pass.
         generator: of the candidates.
+        late: asked between steps; there is none when it says so.
     """
 
     def waves(point: Tensor, axis: Tensor) -> Tensor:
@@ -134,7 +136,11 @@ def propose(
     axis = normalize(axis, dim=1)
     arriving = (waves(*part) for part in zip(point.split(BLOCK), axis.split(BLOCK), strict=True))
     # `|a^H K^-1 y|^2 / |a|^2`
-    rough = [(a.mH @ factor.alpha).abs().square().sum(1) / a.abs().square().sum(0) for a in arriving]
+    rough = []
+    for a in arriving:
+        if late():
+            return None
+        rough.append((a.mH @ factor.alpha).abs().square().sum(1) / a.abs().square().sum(0))
     top = torch.cat(rough).topk(POLISHED).indices
     rates = [STEP_M * 0.5 * (1 + math.cos(math.pi * step / STEPS)) for step in range(STEPS)]
     point, axis = ascend([point[top], axis[top]], scores, rates)
@@ -158,18 +164,18 @@ def find_edges(
         box: (2, 3) float64 [m] where edges may pass.
         generator: of the candidates.
         noise_floor: known variance of the noise, in units of the rows' power.
-        late: asked before each; no more are looked for when it says so.
+        late: asked before each, and before every step of refining; no more are looked for when it says so.
     """
     edges, residual = Edges.none(), rows
     while len(edges) < MOST and not late():
         factor = Posterior(residual, scene, noise_floor).factor
-        found = propose(residual, factor, scene.transmitter, box, generator)
+        found = propose(residual, factor, scene.transmitter, box, generator, late)
         if found is None:
             break
         point, axis = (torch.cat([a, b[None]]) for a, b in zip((edges.point, edges.axis), found, strict=True))
         edges = fit_edge_gains(rows, point, axis, scene, noise_floor)
         residual = subtract_edges(rows, edges, scene.transmitter)
-        scene = refine(residual, scene, REFINE_STEPS, noise_floor=noise_floor)
+        scene = refine(residual, scene, REFINE_STEPS, noise_floor=noise_floor, late=late)
     return edges
 
 

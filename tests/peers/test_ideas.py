@@ -62,11 +62,11 @@ def test_gsrf_lets_opposite_phases_cancel(tmp_path):
             "nerf2",
             {
                 "width": 32,
-                "depth": 3,
+                "depth": 4,
                 "samples": 12,
                 "rays": 512,
                 "octaves": 2,
-                "max_steps": 400,
+                "max_steps": 800,
                 "rate": 5e-3,
             },
             0.75,
