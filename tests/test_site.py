@@ -15,7 +15,7 @@ import pytest
 from filelock import FileLock
 
 ROOT = Path(__file__).parents[1]
-MOST_S = 400  # of processor time, of all notebooks: 120 to 260 by the machine
+MOST_S = 400  # of processor time, of all notebooks: 262 without AVX-512
 
 
 class Links(HTMLParser):

@@ -44,7 +44,7 @@ def once(
         if not mine:
             raise ValueError(f"{run_dir}: another process does this job; wait for its end")
         settings = json.loads(json.dumps(plain(config), default=str))
-        now = {"settings": settings, "data": _files(settings.get("dataset"))}
+        now = {"settings": settings, "data": _files(settings.get("dataset"), run_dir)}
         record, other = _read(run_dir / RECORD), None
         same = record is not None and all(record.get(key, now[key]) == now[key] for key in now)
         if record is None or not same or (again and record["returned"] is not None):
@@ -66,14 +66,17 @@ def once(
         return value
 
 
-def _files(dataset: Any) -> dict[str, list[int]]:
-    """Number, bytes and last change [ns] of the files that settings of a dataset name."""
+def _files(dataset: Any, run_dir: Path) -> dict[str, list[int]]:
+    """Number, bytes and last change [ns] of the files that settings of a dataset name, but for runs' own."""
     named = {Path(value) for value in dict(dataset or {}).values() if isinstance(value, str) and value}
     found = {}
-    for path in sorted(one for one in named if one.exists()):
-        inside = [one.stat() for one in (path.rglob("*") if path.is_dir() else [path]) if one.is_file()]
+    for path in sorted(one.resolve() for one in named if one.exists()):
+        runs = {run_dir.resolve(), *(one.parent for one in path.rglob(RECORD))}
+        runs = {one for one in runs if path in one.parents}  # as with dataset.root=.
+        every = path.rglob("*") if path.is_dir() else [path]
+        inside = [one.stat() for one in every if one.is_file() and runs.isdisjoint(one.parents)]
         newest = max((one.st_mtime_ns for one in inside), default=0)
-        found[str(path.resolve())] = [len(inside), sum(one.st_size for one in inside), newest]
+        found[str(path)] = [len(inside), sum(one.st_size for one in inside), newest]
     return found
 
 

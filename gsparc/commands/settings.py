@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from hydra.utils import instantiate
-from lightning.pytorch.accelerators import AcceleratorRegistry
 from omegaconf import DictConfig, OmegaConf
 from threadpoolctl import threadpool_limits
 
@@ -55,7 +54,7 @@ class RunSettings(Checked):
         clip = trainer.get("gradient_clip_val")
         or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
         accelerator = trainer.get("accelerator", "auto")
-        kinds = ["auto", "gpu", *sorted(AcceleratorRegistry.available_accelerators())]
+        kinds = ["auto", "gpu", *_accelerators()] if trainer else [accelerator]
         if accelerator not in kinds:  # Lightning says so, but not where a model takes no steps
             raise SettingError(f"trainer.accelerator={accelerator!r}: one of {', '.join(kinds)}")
         if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
@@ -73,6 +72,12 @@ class RunSettings(Checked):
             1, "blas"
         )  # NumPy's: two threads beside other work took 10 to 400 times as long as one
         return found
+
+
+def _accelerators() -> list[str]:
+    from lightning.pytorch.accelerators import AcceleratorRegistry  # seconds; not every command trains
+
+    return sorted(AcceleratorRegistry.available_accelerators())
 
 
 def _methods(names: Any) -> tuple[str, ...] | None:

@@ -140,7 +140,7 @@ class LearnedField(Method):
             marks.get("left_out")
         )  # the initialiser of an interrupted run is not repeated
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
-        if (self._told_by_few(fold) or not _random(context)) and not self.choices.closed_form:
+        if self._told_by_few(fold) and not self.choices.closed_form:
             fold = _more_told(data, fold, context)
         if self._solved(fold):
             if self.refit:
@@ -410,11 +410,6 @@ def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
         return fold
     cut = cut_inside(data, fold, context.split, 3, context.seed).folds[0]
     return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
-
-
-def _random(context: FitContext) -> bool:
-    """Whether test rows lie among the training rows, as validation rows do."""
-    return context.split is None or context.split.name in ("random", "sparse", "file")
 
 
 def _apart(data: Measurements, fold: Fold) -> float | None:

@@ -94,3 +94,16 @@ def test_a_launcher_s_lost_job_is_said_with_what_to_do():
     said = _message_of(lost("Job 386 (task: 0) with path FILE\nhas not produced any output"))
     assert "\n" not in said and "Job 386" in said and said.endswith("the same command goes on with the rest")
     assert _message_of(ValueError("seed=x: no")) == "seed=x: no"
+
+
+def test_a_run_among_its_own_data_was_done_again(tmp_path):
+    """What a run writes under `dataset.root=.` is no change of the data."""
+    (tmp_path / "a.csv").write_text("x")
+    seen, config = [], job(dataset={"root": str(tmp_path)})
+    for _ in range(2):
+        once(tmp_path / "runs" / "1", config, lambda config: seen.append(1) or 7.5)
+        (tmp_path / "runs" / "1" / "summary.json").write_text("{}" * (1 + len(seen)))
+    assert seen == [1]
+    (tmp_path / "a.csv").write_text("changed")
+    once(tmp_path / "runs" / "1", config, lambda config: seen.append(1) or 7.5)
+    assert seen == [1, 1]

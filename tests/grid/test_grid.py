@@ -16,7 +16,7 @@ SOME = covering(every((300,)), 1)[:7]  # the first meet most pairs; `make grid` 
 GROSS = 1.5  # times the allowed error, in decibels as much more
 
 
-def judged(world: World, folder, budget_s: float, parts=PARTS) -> None:
+def assert_served(world: World, folder, budget_s: float, parts=PARTS) -> None:
     """Train, and fail where the default is behind on fresh seeds as well, or a part does not answer."""
     more = (f"budget_s={budget_s}", "threads=1")
     found, objects = run(world, 0, folder, more)
@@ -32,14 +32,14 @@ def judged(world: World, folder, budget_s: float, parts=PARTS) -> None:
 def test_every_kind_of_thirty_rows(number, tmp_path):
     # Each part of the product meets several kinds; all meet all in `make grid`.
     parts = [part for place, part in enumerate(PARTS) if place < 3 or (number + place) % 5 == 0]
-    judged(FEW[number], tmp_path, 1.5, parts)
+    assert_served(FEW[number], tmp_path, 1.5, parts)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("world", SOME, ids=[world.name for world in SOME])
 def test_every_kind_of_three_hundred_rows(world, tmp_path):
-    judged(world, tmp_path, 15.0)
+    assert_served(world, tmp_path, 15.0)
 
 
 def test_the_covering_set_has_every_pair():

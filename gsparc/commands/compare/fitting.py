@@ -131,10 +131,9 @@ def prepare(
     for setting, usual in (("budget_clock", clock), ("init_from", None), ("batch_size", 16)):
         if beside[setting] != usual:
             trainer[setting] = beside[setting]
-    for part in (whole["model"].get("init") or {}, whole):  # walls, and a start, are files that may change
-        file = Path(str(part.get("file") or part.get("init_from") or ""))
-        if file.is_file():
-            trainer[file.name] = sha256(file.read_bytes()).hexdigest()
+    for named in ((whole["model"].get("init") or {}).get("file"), whole["init_from"]):
+        if named and Path(named).is_file():  # walls, and a start, may change under their names
+            trainer[Path(named).name] = sha256(Path(named).read_bytes()).hexdigest()
     if problem.draw is None and cell.seed and "seed" not in whole["model"]:
         trainer["seed"] = cell.seed  # of a draw, the split's own hash tells
     name = key(whole["model"], trainer, *problem.hashes)
