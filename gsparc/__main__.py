@@ -20,6 +20,9 @@ def main() -> None:
     except BrokenPipeError:  # `| head` has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
         sys.exit(READER_LEFT)
+    except KeyboardInterrupt:  # while modules are loaded: cli.run says the others
+        sys.stderr.write("error: interrupted\n")
+        sys.exit(130)
 
 
 def _run() -> None:

@@ -65,6 +65,9 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         sys.exit(1)
     except (_Failed, Exception) as failure:
         error = failure.error if isinstance(failure, _Failed) else failure
+        if _began_as_interrupt(error):
+            _print_error("interrupted")
+            sys.exit(130)
         if before == "1":
             raise error from error.__cause__
         _print_error(_message_of(error))
@@ -75,6 +78,13 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
+
+
+def _began_as_interrupt(error: BaseException | None) -> bool:
+    """A clean-up that meets what Ctrl-C left half done raises an error of its own over the interrupt."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _message_of(error: Exception) -> str:

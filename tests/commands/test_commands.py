@@ -85,3 +85,27 @@ def test_files_need_no_name_where_a_command_is_about_files(monkeypatch, capsys, 
     assert COMMANDS["evaluate"].arguments(["a b"]) == ["a b"]
     status, out, _ = gsparc(monkeypatch, capsys, "check", str(tmp_path / "absent.npz"))
     assert status == 1 and "no such file" in out
+
+
+def test_ctrl_c_while_a_library_cleans_up_was_its_error_and_status_1(monkeypatch, capsys, tmp_path):
+    """An interrupt inside OmegaConf left a list half changed: its clean-up's error hid the interrupt."""
+
+    def task(config):
+        try:
+            raise KeyboardInterrupt
+        finally:
+            config.dataset.there_is_no_such_key.at_all  # noqa: B018
+
+    monkeypatch.setattr("gsparc.commands.train.task", task)
+    words = ("train", "dataset=rfid", "model=gsparc", f"hydra.run.dir={tmp_path}")
+    status, _, err = gsparc(monkeypatch, capsys, *words)
+    assert status == 130 and err.splitlines()[-1] == "error: interrupted"
+
+
+def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gsparc.commands.cli.offer", interrupted)
+    status, _, err = gsparc(monkeypatch, capsys, "train", "dataset=rfid", "model=gsparc")
+    assert (status, err) == (130, "error: interrupted\n")
