@@ -1,0 +1,128 @@
+"""Fields of powers at fixed settings: one station, several, and coherent waves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from worlds import LAW, rows, smooth, spread, trend
+
+from gsparc.data.own import from_arrays
+from gsparc.methods.power_kernel import PowerKernel
+from gsparc.multipath.powers import waves
+from gsparc.multipath.powers.blockers import Blockers
+from gsparc.multipath.powers.field import PowerField, ridge
+from gsparc.multipath.powers.likelihood import Covariance, left_out_losses
+from gsparc.multipath.powers.together.field import JointPowerField
+from gsparc.multipath.powers.together.law import fit_site_law
+from gsparc.multipath.powers.together.learning import _ends, left_out_loss, start
+from gsparc.multipath.powers.together.prior import grid
+from gsparc.multipath.powers.together.rows import heard_rows
+from gsparc.ops import Pose
+
+TWO = PowerKernel((1.2, 6.0), (0.4, 0.6), 0.08, 20.0)
+Arrays = dict[str, np.ndarray]
+
+
+def _seen(found: object) -> Arrays:
+    names = ("mean", "variance", "unknown", "explained")
+    return {name: getattr(found, name).numpy() for name in names if getattr(found, name) is not None}
+
+
+def field_of_one_station() -> Arrays:
+    """The field of powers without anything in the way."""
+    places = spread(60, 0)
+    told = rows(places)
+    arrays = {"rx_position": places, "tx_position": np.array(LAW.place), "rssi_db": told.decibels}
+    data = from_arrays(arrays)
+    field = PowerField(data.site, trend(data.moving), TWO, Blockers.none(), None)
+    field.condition(data, np.arange(50))
+    batch = data.batch(np.arange(50, 60))
+    left = field.left_out()
+    loss = field.loss(data.batch(np.arange(20)))
+    slope = torch.autograd.grad(loss.sum(), [field.log_lengths])
+    return _seen(field(batch.tx, batch.rx)) | {
+        "left_out": left.mean.numpy(), "left_variance": left.variance.numpy(),
+        "mean_at": field.mean_at(batch.tx, batch.rx).detach().numpy(),
+        "loss": loss.detach().numpy(), "slope": slope[0].numpy(),
+    }  # fmt: skip
+
+
+def density_of_powers() -> Arrays:
+    """Negative log density of each power given the others."""
+    places = spread(40, 1)
+    told, about = rows(places), trend(places)
+    at = torch.from_numpy(places)
+    kernel = Covariance.of(TWO)
+    gram = kernel.gram(torch.cdist(at, at), about.terms(at))
+    values = torch.from_numpy(told.decibels) - about.mean(at)
+    columns = np.c_[np.ones(40), places]
+    return {
+        "density": left_out_losses(gram, values, kernel.log_amplitude).numpy(),
+        "ridge": ridge(columns, told.decibels, 20.0),
+    }
+
+
+def _stations(quiet: bool) -> object:
+    rng = np.random.default_rng(2)
+    place = spread(45, 3, (40.0, 30.0, 1.5))
+    mast = np.array([[5.0, 5, 8], [35, 10, 8], [20, 28, 9], [10, 25, 7]])
+    away = np.linalg.norm(place[:, None] - mast, axis=-1)
+    power = -30 - 28 * np.log10(away) + 4 * smooth(place, 4, 4, 6.0) + rng.standard_normal((45, 4))
+    arrays = {"rx_position": place, "station_position": mast, "rssi_db": power}
+    if quiet:
+        level = np.quantile(power, 0.15)
+        arrays |= {"rssi_db": np.where(power < level, np.nan, power), "sensitivity_db": np.array(level)}
+    return from_arrays(arrays)
+
+
+def _together(quiet: bool) -> Arrays:
+    data = _stations(quiet)
+    known = np.arange(len(data) - 20)
+    places = np.array(data.site.stations.position, np.float64)
+    every = heard_rows(data, known, places)
+    law = fit_site_law(every)
+    prior = start(every, law, len(places), 0)
+    ends = torch.from_numpy(np.concatenate([every.moving, every.still]))
+    shared = replace(
+        prior,
+        departures=torch.linspace(-0.2, 0.2, prior.departures.numel()).double().view_as(prior.departures),
+        log_length=torch.tensor(math.log(6.0)).double(), log_shared=torch.tensor(1.0).double(),
+        log_cloud=torch.tensor(-1.0).double(), bend_db=5.0,
+        inducing=torch.from_numpy(np.unique(every.moving, axis=0)[::3]),
+        blockers=grid(ends.amin(0), ends.amax(0), 16),
+    )  # fmt: skip
+    field = JointPowerField(data.site, places, shared, shared, 1.3)
+    field.condition(data, known)
+    batch, left = data.batch(np.arange(len(data) - 20, len(data))), field.left_out()
+    loss = left_out_loss(shared, _ends(shared, every))
+    far = batch.tx + torch.tensor([2.0, 1.0, 0.5])
+    moved = field(far, Pose(batch.rx.position + torch.tensor([1.0, 0, 0]), batch.rx.rotation))
+    return _seen(field.answer(batch)) | {
+        "left_out": left.mean.numpy(), "left_variance": left.variance.numpy(), "loss": loss.numpy(),
+        "losses": field.loss(data.batch(np.arange(30))).numpy(), "unheard": moved.mean.numpy(),
+        "unheard_variance": moved.variance.numpy(),
+    }  # fmt: skip
+
+
+def field_of_four_stations() -> Arrays:
+    """Stations in one field with every shared term."""
+    return _together(quiet=False)
+
+
+def field_of_four_stations_censored() -> Arrays:
+    """The same where some rows lie below a level."""
+    return _together(quiet=True)
+
+
+def coherent_waves() -> Arrays:
+    """A damped step of coherent waves towards the powers of places."""
+    rng = np.random.default_rng(6)
+    columns = rng.standard_normal((80, 12, 2)) @ [1, 1j] / 12
+    decibels = waves.decibels_of(columns @ (rng.standard_normal((12, 2)) @ [1, 1j]))
+    begin = waves._Misfit.of(columns, decibels, rng.standard_normal((12, 2)) @ [1, 1j], 0.1, 2.0)
+    found = waves._step(columns, decibels, begin, 0.1, 2.0, 1e-2)
+    assert found is not None
+    return {"power": found[0].power.astype(np.float32), "value": np.array(found[0].value, np.float32)}
