@@ -6,7 +6,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from worlds import smooth, spread
+from small_worlds import smooth, spread
 
 from gsparc.array import vector_gp
 from gsparc.array.moving import power_gp, residual

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from rooms import directed
-from worlds import CARRIER, ceiling, channel, fold
+from small_worlds import CARRIER, ceiling, channel, fold
 
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from worlds import LAW, rows, smooth, spread, trend
+from small_worlds import LAW, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
 from gsparc.methods.power_kernel import PowerKernel

@@ -6,7 +6,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from worlds import LAW, fold, rows, smooth, spread, trend
+from small_worlds import LAW, fold, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
 from gsparc.field import kernels
@@ -166,9 +166,7 @@ def whitened_features() -> Arrays:
             found |= {
                 f"{name}{most}_places": told.places.numpy(),
                 f"{name}{most}_known": (features @ features.T).numpy(),
-                f"{name}{most}_mean": (
-                    features @ (told.weigh @ torch.from_numpy(smooth(PLACES, 2, 14)))
-                ).numpy(),
+                f"{name}{most}_mean": (features @ (told.weigh @ values)).numpy(),
             }
     return found
 
