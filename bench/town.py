@@ -11,7 +11,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.methods.nearest_process import Values, given
 from gsparc.methods.power_kernel import PowerKernel
-from gsparc.methods.trend import Trend
+from gsparc.processes.trend import Trend
 
 SIDE_M = 3_000.0
 SCALES = ((6.0, 250.0), (3.0, 40.0), (1.5, 8.0))  # deviation [dB] and wavelength / 2 pi [m] of shadowing

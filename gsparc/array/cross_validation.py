@@ -10,12 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from gsparc.array.vector_gp import Kernel, align, refine_alignment
+from gsparc.array.vector_gp import align, refine_alignment
 from gsparc.field.confidence import fit_errors
 from gsparc.methods.left_out_images import LeftOut, mean_log_error, predict_left_out
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import SmoothRough
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
 PIXELS = 600  # drawn from the grid: the score needs no more
@@ -36,7 +39,7 @@ class Tuned:
         left_out: the held-out predictions; None for too few samples.
     """
 
-    kernel: Kernel
+    kernel: SmoothRough
     unknown: np.ndarray
     error: np.ndarray
     left_out: LeftOut | None = None
@@ -86,20 +89,23 @@ def tune(
     )
     aligned = align(vectors, positions, partner)
 
-    def kernel_at(parameters: np.ndarray) -> Kernel:
+    def kernel_at(parameters: np.ndarray) -> SmoothRough:
         length, noise = np.exp(np.clip(parameters, np.log([0.02, 1e-4]), np.log([5.0, 1.0])))
-        return Kernel(float(length * wavelength), float(noise))
+        return SmoothRough.of_one(float(length * wavelength), float(noise))
+
+    def inverse_of(kernel: SmoothRough) -> np.ndarray:
+        return Factor.of(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
 
     def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
         kernel = kernel_at(parameters)
-        inverse = np.linalg.inv(kernel.gram(positions))
+        inverse = inverse_of(kernel)
         found = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
         return mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
 
     if len(positions) < 4:
         return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
     first = min((np.log(start) for start in STARTS), key=objective)
-    refined = refine_alignment(aligned, np.linalg.inv(kernel_at(first).gram(positions)), partner)
+    refined = refine_alignment(aligned, inverse_of(kernel_at(first)), partner)
     found = minimize(
         objective, first, args=(refined,), method="Nelder-Mead",
         options={
@@ -108,7 +114,7 @@ def tune(
         },
     )  # fmt: skip
     kernel = kernel_at(found.x)
-    inverse = np.linalg.inv(kernel.gram(positions))
+    inverse = inverse_of(kernel)
     unknown, predicted = samples.predictions(kernel, inverse, refine_alignment(refined, inverse, partner))
     error = samples.error(predicted)
     seen = ~np.isnan(error)
@@ -126,7 +132,7 @@ class _Samples:
     distance: np.ndarray
 
     def predictions(
-        self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray
+        self, kernel: SmoothRough, inverse: np.ndarray, vectors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posterior variance (g, c) and spectra (g, c, P) of held-out samples; NaN where no other is left."""
         mean, variance = predict_left_out(inverse, vectors, self.distance, self.centres, self.gaps)

@@ -17,6 +17,7 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.methods.time_budget import TimeBudget
 from gsparc.physics.array_response import lags
+from gsparc.processes.factor import Factor
 
 log = logging.getLogger(__name__)
 
@@ -211,8 +212,7 @@ def _search(
         normal = slope.transpose(1, 2) @ slope
         lift = damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-12
         normal.diagonal(dim1=1, dim2=2).add_(lift[:, None])
-        factor = torch.linalg.cholesky_ex(normal).L
-        step = torch.cholesky_solve(slope.transpose(1, 2) @ error[:, :, None], factor).squeeze(2)
+        step = Factor.of(normal, "ignore").solved(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
         tried = state - step
         new_error, new_slope = problem.residual(tried, rows[owner])
         new_cost = new_error.square().sum(1)

@@ -1,7 +1,7 @@
 """A splatted field whose array vectors are the posterior of the vector process, in closed form.
 
 Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen plan.
-Emissions are linear in the features of the process (`gsparc.field.kernels`), whose weights give its posterior
+Emissions are linear in the features of the process (`gsparc.processes.features`), whose weights give its posterior
 mean h(x) = phi(x) W: the emissions of least norm are phi(x) W G^+. The same features tell the unknown share.
 """
 
@@ -24,15 +24,15 @@ from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import seen_by_array
 from gsparc.field.initial import InitTask, Start
-from gsparc.field.kernels import whitened
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
-from gsparc.methods.covering import covering
 from gsparc.methods.left_out_images import LeftOut
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.methods.time_budget import Spent, TimeBudget
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
+from gsparc.processes.covering import covering
+from gsparc.processes.features import whitened
 
 log = logging.getLogger(__name__)
 

@@ -13,24 +13,14 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from gsparc.field.kernels import correlation
-from gsparc.methods import gp
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import SmoothRough
+from gsparc.processes.nearest import solved
 
 SWEEPS = 30
 TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
 NEAREST = 30  # aligned vectors that a further one is aligned to
 TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
-
-
-class Kernel(gp.Kernel):
-    """`amplitude * (a smooth long part + a rough short one + noise * identity)`, of array vectors.
-
-    `smooth_rough` of `gsparc.field.kernels`, the kernel of the emissions too.
-    """
-
-    def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """See the base class."""
-        return correlation(torch.from_numpy(a), torch.from_numpy(b), self.length, "smooth_rough").numpy()
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
@@ -132,7 +122,7 @@ def refine_alignment(
 
 
 def aligned_by(
-    vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
+    vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: SmoothRough
 ) -> np.ndarray:
     """Vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
 
@@ -142,7 +132,7 @@ def aligned_by(
         partner: of `mirror_elements`.
         kernel: length and noise.
     """
-    inverse = np.linalg.inv(kernel.gram(positions))
+    inverse = Factor.of(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
     return refine_alignment(align(vectors, positions, partner), inverse, partner)
 
 
@@ -152,7 +142,7 @@ def aligned_to(
     known: np.ndarray,
     places: np.ndarray,
     partner: np.ndarray | None,
-    kernel: Kernel,
+    kernel: SmoothRough,
 ) -> np.ndarray:
     """Vectors (m, M) complex128 with the phases and twins most likely given the nearest of aligned ones.
 
@@ -164,9 +154,12 @@ def aligned_to(
     """
     aligned, tree = np.array(vectors, dtype=np.complex128), cKDTree(places)
     near = tree.query(positions, k=np.arange(1, min(NEAREST, len(places)) + 1))[1]
+    around = torch.from_numpy(places[near])
+    gram = kernel.between(around, around)
+    gram.diagonal(dim1=-2, dim2=-1).add_(kernel.noise)
+    weights, _ = solved(gram, kernel.between(torch.from_numpy(positions)[:, None], around)[:, 0])
     for i, rows in enumerate(near):
-        weights = np.linalg.solve(kernel.gram(places[rows]), kernel.cross(places[rows], positions[i : i + 1]))
-        expected = weights[:, 0] @ known[rows]
+        expected = weights[i].numpy() @ known[rows]
         overlap = np.vdot(aligned[i], expected)
         if partner is not None:
             other = twin(aligned[i], partner)

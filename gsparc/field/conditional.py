@@ -19,6 +19,8 @@ from torch import Tensor, nn
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.ops import Pose
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out
 
 
 @dataclass(frozen=True)
@@ -268,7 +270,6 @@ def leave_one_out_density(covariance: Tensor, target: Tensor) -> Tensor:
         covariance: (n, n) real or complex, noise included.
         target: (n, R).
     """
-    inverse = torch.linalg.inv(covariance)
-    precision = inverse.diagonal().real.clamp_min(1e-30) if inverse.is_complex() else inverse.diagonal()
-    missed = (inverse @ target).abs().square() / precision[:, None]
-    return (missed - precision.log()[:, None]).mean(1) / 2
+    inverse = Factor.of(covariance).inverse
+    residual, variance = left_out(inverse, inverse @ target)
+    return (residual.abs().square() / variance[:, None] + variance.log()[:, None]).mean(1) / 2

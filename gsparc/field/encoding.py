@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, setting, whole
-from gsparc.field.kernels import Correlation, correlation
+from gsparc.processes.factor import Factor
+from gsparc.processes.features import Correlation, correlation
 
 JITTER = 1e-5  # relative to the unit variance of the kernel
 
@@ -123,6 +124,4 @@ def _whitening(prior: Prior) -> Tensor:
     anchors = prior.anchors.double()
     gram = correlation(anchors, anchors, prior.length, prior.kernel)
     gram.diagonal().add_(JITTER)  # repeated positions stay invertible
-    eye = torch.eye(len(gram), dtype=gram.dtype)
-    inverse = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), eye, upper=False)
-    return inverse.T.float().contiguous()
+    return Factor.of(gram).root.T.float().contiguous()

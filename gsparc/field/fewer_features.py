@@ -7,8 +7,8 @@ import math
 import torch
 
 from gsparc.field.encoding import PositionEncoding, Prior
-from gsparc.field.kernels import apart, correlation, with_places
 from gsparc.field.model import GaussianModel
+from gsparc.processes.features import correlation, farthest, with_places
 
 
 @torch.no_grad()
@@ -28,7 +28,7 @@ def tell_with_fewer(model: GaussianModel, share: float) -> None:
     own.diagonal().add_(noise)
     count, width, channels = emission.weight2.shape
     weights = emission.weight2.permute(1, 0, 2).reshape(width, count * channels).double()
-    chosen = apart(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
+    chosen = farthest(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
     features = with_places(places[chosen], places, length, noise, old.kernel)
     found = features.weigh @ (own @ (old.whitening.double() @ weights))
     prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())

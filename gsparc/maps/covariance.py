@@ -7,19 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import solve_triangular
-from scipy.spatial.distance import cdist
 
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Site
 from gsparc.maps.levels import predicted
 from gsparc.maps.making import CHUNK, ends_of
 from gsparc.maps.promise import Promise
-from gsparc.methods.distance_law import Rows
 from gsparc.methods.method import HasProcess
-from gsparc.methods.power_kernel import PowerKernel
-from gsparc.methods.power_process import PowerProcess, exact, fit_powers
+from gsparc.methods.power_settings import fit_powers
 from gsparc.methods.predictor import Predictor
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, Rows
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
 LEARNED = 1000  # predictions that stand for a model without a process of its own
@@ -101,18 +100,16 @@ def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCo
     """
     length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)
     variance = SHADOWING_DB**2
-    prior = variance * (PowerKernel((length,), (1.0,), NOISE, 1.0).correlation(cdist(places, places)) + 1)
-    return [ErrorCovariance(prior, variance * NOISE, np.ones(len(places)))]
+    at = torch.from_numpy(places)
+    prior = variance * (Kernel.of_one(length, NOISE).between(at, at) + 1)
+    return [ErrorCovariance(prior.numpy(), variance * NOISE, np.ones(len(places)))]
 
 
 def posterior(process: PowerProcess, places: np.ndarray) -> np.ndarray:
     """Covariance (S, S) [dB^2] of the power at places (S, D), given what the process knows."""
-    terms = process.trend.terms(torch.from_numpy(places)).numpy()
-    known = process.trend.terms(torch.from_numpy(process.places)).numpy()
-    cross = process.kernel.correlation(cdist(process.places, places)) + known @ terms.T
-    told = solve_triangular(process.factor, cross, lower=True, check_finite=False)
-    prior = process.kernel.correlation(cdist(places, places)) + terms @ terms.T
-    return process.kernel.amplitude * (prior - told.T @ told)
+    exact = process.posterior
+    assert isinstance(exact, Exact)
+    return exact.covariance(torch.from_numpy(places)).numpy()
 
 
 def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerProcess:
@@ -133,7 +130,7 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     level, _ = predicted(said, asking.site.kind)
     good = np.isfinite(level)
     rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
-    return exact(fit_powers(rows, asking.site, "constant")[0])
+    return fit_powers(rows, asking.site, "constant")[0].exact()
 
 
 def _queries(asking: Predictor, places: np.ndarray, other: Sequence[float] | None, width: int) -> np.ndarray:

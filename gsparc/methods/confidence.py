@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from gsparc.methods import checkpoint
 from gsparc.methods.confidence_scores import KINDS, expected_score, process_variance
-from gsparc.methods.gp import Kernel
 from gsparc.methods.method import Prediction
 from gsparc.methods.risk_threshold import Promise, Threshold
+from gsparc.processes.kernel import Kernel
 
 KEY = "confidence"
 

@@ -6,15 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.gp import Kernel, choose_kernel, principal_components
+from gsparc.methods.gp import choose_kernel, principal_components
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.target_rows import training_targets
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import Kernel
 
 KINDS = ("learned", "expected", "distance", "gp_variance")
 CHUNK = 64
@@ -92,9 +94,9 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
     """What a process of the positions `known` (n, 3) does not know of `places` (B, 3), share of the prior."""
-    factor = cho_factor(kernel.gram(known), lower=True)
-    cross = kernel.cross(places, known)
-    return 1 + kernel.noise - (cross * cho_solve(factor, cross.T).T).sum(1)
+    rows = torch.from_numpy(known)
+    white = Factor.of(kernel.gram(rows)).whitened(kernel.between(rows, torch.from_numpy(places)))
+    return (1 + kernel.noise - white.square().sum(0)).numpy()
 
 
 def expected_score(said: Prediction) -> Tensor:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import astuple, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,10 @@ from gsparc.data.schema import Site
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Prediction
 from gsparc.methods.target_rows import entry_variance, to_real
-from gsparc.methods.worker import stop_when_late
 from gsparc.ops import Pose
+from gsparc.processes.powers import Rows
+from gsparc.processes.trend import TINY_M, Law, law_of_state
+from gsparc.processes.worker import stop_when_late
 
 EXPONENTS = (0.0, 8.0)  # bounds of n: 2 in free space, 6 through many walls
 USUAL, SPREAD = 3.0, 2.0  # mean and deviation of a prior on n, which only few rows notice
@@ -36,60 +38,6 @@ SPREADS_DB = (0.05, 60.0)  # bounds of the scale of the residuals
 LOOKED_AT = 2_000  # rows that an unknown place is sought with
 STARTS = 6  # of that search, drawn at random, beside two that the powers suggest
 PARAMETERS = 3  # a, n and the scale
-TINY_M = 1e-6  # distance that has a logarithm
-
-
-@dataclass(frozen=True)
-class Law:
-    """`P [dB] = level - 10 exponent log10(max(distance, floor))`.
-
-    Attributes:
-        level: at 1 m [dB of stored units].
-        exponent: n.
-        floor: d0 [m].
-        scale: of the residuals' density [dB].
-        place: of the still end, local [m]; None where both ends move and places are (n, 6).
-    """
-
-    level: float
-    exponent: float
-    floor: float
-    scale: float
-    place: tuple[float, float, float] | None
-
-    def decades(self, places: Tensor) -> Tensor:
-        """log10 of the distance in metres, floored, (n,) at places (n, 3), or of both ends (n, 6) [m]."""
-        still = places[:, 3:] if self.place is None else places.new_tensor(self.place)
-        squared = (places[:, :3] - still).square().sum(1)
-        return 0.5 * torch.log10(squared.clamp_min(max(self.floor, TINY_M) ** 2))
-
-    def mean(self, places: Tensor) -> Tensor:
-        """Powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""
-        return self.level - 10 * self.exponent * self.decades(places)
-
-    @property
-    def variance(self) -> float:
-        """Of a measurement about the law [dB^2]."""
-        return self.scale**2 * VARIANCE
-
-
-@dataclass(frozen=True)
-class Rows:
-    """What a law is fitted to.
-
-    Attributes:
-        places: (n, 3) of the moving end, or (n, 6) of both [m].
-        decibels: (n,) powers, or levels where `silent` [dB].
-        silent: (n,) bool, True where nothing was heard.
-    """
-
-    places: np.ndarray
-    decibels: np.ndarray
-    silent: np.ndarray
-
-    def at(self, chosen: np.ndarray) -> Rows:
-        """The rows `chosen`."""
-        return Rows(self.places[chosen], self.decibels[chosen], self.silent[chosen])
 
 
 def _moment(corner: float) -> tuple[float, float]:
@@ -100,6 +48,11 @@ def _moment(corner: float) -> tuple[float, float]:
 
 
 MASS, VARIANCE = _moment(CORNER)
+
+
+def law_variance(law: Law) -> float:
+    """Of a measurement about the law [dB^2]."""
+    return law.scale**2 * VARIANCE
 
 
 def log_below(z: np.ndarray) -> np.ndarray:
@@ -250,7 +203,7 @@ class DistanceLaw(Interpolator):
         self.law, notes = law_of(Rows(positions, decibels, silent), self.site)
         law = self.law
         said = (
-            f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, deviation {law.variance**0.5:.3g} dB"
+            f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, deviation {law_variance(law) ** 0.5:.3g} dB"
             f" ({time.perf_counter() - started:.2g} s)"
         )
         return tuple(f"distance_law: {note}" for note in (said, *notes))
@@ -258,7 +211,7 @@ class DistanceLaw(Interpolator):
     def _look_up(self, queries: np.ndarray) -> Prediction:
         with torch.no_grad():
             mean = self._mean(torch.from_numpy(queries))
-        variance = torch.full((len(queries),), self.law.variance)
+        variance = torch.full((len(queries),), law_variance(self.law))
         return Prediction(mean, variance=entry_variance(variance, mean, self.kind))
 
     def _mean(self, places: Tensor) -> Tensor:
@@ -269,10 +222,9 @@ class DistanceLaw(Interpolator):
         return self._mean(self._queries(tx, rx))
 
     def _learned(self) -> dict[str, Any]:
-        return {"law": [*astuple(self.law)[:4]], "place": list(self.law.place or ())}
+        return self.law.state()
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        place = tuple(float(v) for v in state["place"])
-        values = [float(v) for v in state["law"]]
-        at = (place[0], place[1], place[2]) if place else None
-        self.law = Law(values[0], values[1], values[2], values[3], at)
+        found = law_of_state(state)
+        assert found is not None
+        self.law = found

@@ -4,46 +4,39 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, eigh
-from scipy.linalg.lapack import dtrtri
-from scipy.optimize import minimize
-from sklearn.gaussian_process.kernels import Matern
+from scipy.linalg import eigh
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements
 from gsparc.methods.censored import silent
 from gsparc.methods.coarse_grid import Filled
-from gsparc.methods.covering import covering
-from gsparc.methods.distance_law import Rows
 from gsparc.methods.haste import CHOSEN_ON
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Method, Prediction
-from gsparc.methods.nearest_targets import NearestTargets, learned, projected
-from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.pareto import Settings
-from gsparc.methods.power_kernel import PowerKernel
-from gsparc.methods.power_process import (
-    MEANS,
-    MOST_ROWS,
-    MeanName,
-    PowerProcess,
-    Process,
-    approximated,
-    conditioned,
-    draw,
-    exact,
-    fit_powers,
-    restored,
-)
+from gsparc.methods.power_settings import MEANS, MeanName, fit_powers
 from gsparc.methods.reduced import View
 from gsparc.methods.target_rows import entry_variance, from_real, to_real, training_targets
-from gsparc.methods.worker import stop_when_late
 from gsparc.ops import Pose
+from gsparc.processes.covering import covering
+from gsparc.processes.density import by_left_out
+from gsparc.processes.kernel import Kernel, apart
+from gsparc.processes.nearest import Nearest, Sample, Values, given, most_likely
+from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
+from gsparc.processes.prior import Prior
+
+LOOKS = 40  # of a choice of settings
+LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
+STRONGEST = 32  # components that they are chosen by
 
 
 @dataclass(frozen=True)
@@ -91,83 +84,31 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
 
-@dataclass(frozen=True)
-class Kernel:
-    """`amplitude * (Matern-3/2(distance / length) + noise * identity)`.
-
-    Attributes:
-        length: [m].
-        noise: variance relative to `amplitude`.
-        amplitude: variance per real number of a target.
-    """
-
-    length: float
-    noise: float
-    amplitude: float = 1.0
-
-    def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Correlations (A, B) without noise between positions (A, 3) and (B, 3) [m]."""
-        return Matern(self.length, nu=1.5)(a, b)
-
-    def gram(self, a: np.ndarray) -> np.ndarray:
-        """Correlations (A, A) with noise."""
-        matrix = self.cross(a, a)
-        matrix[np.diag_indices_from(matrix)] += self.noise
-        return matrix
-
-
-def leave_one_out(gram: np.ndarray, scores: np.ndarray, entries: int) -> tuple[float, float]:
-    """Negative leave-one-out log density per real number, and the amplitude that minimises it.
-
-    With R = K^-1 Y and d = diag(K^-1) the left-out error of row i is R_i / d_i and its variance
-    amplitude / d_i (Rasmussen and Williams 2006, eqs. 5.10 to 5.12, summed over outputs that share K).
-
-    Args:
-        gram: (n, n) correlations with noise.
-        scores: (n, P) centred targets in an orthonormal basis.
-        entries: real numbers per target, P or more.
-    """
-    factor = cholesky(gram, lower=True)
-    inverse_diagonal = (dtrtri(factor, lower=1)[0] ** 2).sum(0)  # K^-1 = L^-T L^-1, without forming it
-    squared = (cho_solve((factor, True), scores) ** 2).sum(1)
-    amplitude = float((squared / inverse_diagonal).sum()) / (len(gram) * entries)
-    amplitude = max(amplitude, np.finfo(float).tiny)
-    return 0.5 * (np.log(amplitude) - float(np.log(inverse_diagonal).mean())), amplitude
-
-
 def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
     """Length and noise of largest leave-one-out likelihood, from three starting lengths.
 
     Args:
         positions: (n, 3) [m].
-        scores, entries: as in `leave_one_out`.
+        scores: (n, P) centred targets in an orthonormal basis.
+        entries: real numbers per target, P or more.
     """
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     if len(positions) < 3 or not scores.any():
-        return Kernel(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
-
-    def objective(log_parameters: np.ndarray) -> float:
-        length, noise = np.exp(log_parameters)
-        try:
-            return leave_one_out(Kernel(length, noise).gram(positions), scores, entries)[0]
-        except LinAlgError:  # not positive definite in float64: as bad as it gets
-            return 1e12
-
-    bounds = [(np.log(spread * 1e-4), np.log(spread * 1e2)), (np.log(1e-8), np.log(1e2))]
+        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
+    bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
-    starts = [np.log([spread * share, 0.01]) for share in (0.01, 0.05, 0.25)]
-    pace = {"ftol": 1e-5, "maxfun": 60}  # seconds a look for thousands of rows; the figures move by 1e-4
-    start = min(starts, key=objective)
-    best = minimize(objective, start, method="L-BFGS-B", bounds=bounds, options=pace, callback=stop_when_late)
-    length, noise = (float(value) for value in np.exp(best.x))
-    return Kernel(length, noise, leave_one_out(Kernel(length, noise).gram(positions), scores, entries)[1])
+    starts = [Kernel.of_one(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
+    places, values = torch.from_numpy(positions), torch.from_numpy(scores)
+    distance = apart(places, places)
+    # The figures move by 1e-4 beyond so many looks.
+    return by_left_out(starts, distance, None, values, bounds, LOOKS, 1e-5, entries, bounded=False)[1]
 
 
 class GaussianProcess(Interpolator):
     """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
 
     Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows
-    where nothing was heard too (`gsparc.methods.power_process`).
+    where nothing was heard too (`gsparc.processes.powers`).
 
     Args:
         components: largest number of principal components kept; all of them when the training set is smaller.
@@ -175,10 +116,10 @@ class GaussianProcess(Interpolator):
     """
 
     name = "gp"
-    stored = ("mean", "axes", "weights", "lost")
+    stored = ("mean", "axes", "lost")
     uses_censored = True
-    powers: Process | None = None  # None: not powers, or learned by an earlier version
-    near: NearestTargets | None = None  # of rows too many for one factor
+    powers: PowerProcess | None = None  # None: not powers
+    scores: Posterior | None = None  # of what is not
 
     def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
         if components < 1:
@@ -192,39 +133,35 @@ class GaussianProcess(Interpolator):
             return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
-        self.near = None
         thinned: list[str] = []
         parts = principal_components(targets, self.kind, self.limit)
-        entries = len(parts.mean)
         looked_at: np.ndarray | slice = slice(None)
         if len(targets) > CHOSEN_ON:
             thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
             looked_at = draw(np.zeros(len(targets), bool), CHOSEN_ON, 0)
-        self.kernel = choose_kernel(positions[looked_at], parts.scores[looked_at], entries)
-        self.lost, self.positions = parts.lost, positions
-        self.factor = cho_factor(self.kernel.gram(positions), lower=True)
-        self.weights = torch.from_numpy(cho_solve(self.factor, parts.scores))
-        self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
-        found = self.kernel
-        notes = [f"gp: length {found.length:.4g} m, noise {found.noise:.3g} of the signal's variance"]
+        kernel = choose_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
+        self.scores = Exact.given(
+            Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores)
+        )
+        self.mean, self.axes, self.lost = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes), parts.lost
+        notes = [f"gp: length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"]
         if parts.lost > 0 and len(parts.axes) == self.limit < len(targets) - 1:
             notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
         return (*notes, *thinned)
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        """Of rows too many for one factor."""
+        """Of rows too many for one factor: components of rows that cover the site, scores by the nearest."""
         kept = covering(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[kept], self.kind, self.limit)
-        entries = len(parts.mean)
-        start = choose_kernel(positions[kept], parts.scores, entries)
-        scores, lost = projected(targets, self.kind, parts.mean, parts.axes)
-        first = PowerKernel((start.length,), (1.0,), start.noise, 1.0)
-        self.near, said = learned(positions, scores, lost, entries, first, 0)
+        start = choose_kernel(positions[kept], parts.scores, len(parts.mean))
+        scores, self.lost = projected(targets, self.kind, parts.mean, parts.axes)
+        kernel, said = kernel_given_nearest(positions, scores, len(parts.mean), start, 0)
+        once = torch.ones(len(scores), dtype=torch.float64)
+        self.scores = given(Prior(kernel), Values(positions, torch.from_numpy(scores), once), 0)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
-        found = self.near.kernel
-        basis = f"{len(parts.axes)} components of {len(kept)} rows, mean square left out {lost:.2e}"
+        basis = f"{len(parts.axes)} components of {len(kept)} rows, mean square left out {self.lost:.2e}"
         told_by = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
-        settings = f"length {found.lengths[0]:.4g} m, noise {found.noise:.3g} of the signal's variance"
+        settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
         return tuple(f"gp: {note}" for note in (settings, said, told_by, basis))
 
     def _learn_censored(
@@ -238,11 +175,11 @@ class GaussianProcess(Interpolator):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximated(self.name, self.powers or self.near)
+        return approximated(self.name, self.scores if self.powers is None else self.powers.posterior)
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return None if self.powers is None else exact(self.powers)
+        return None if self.powers is None else self.powers.exact()
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""
@@ -254,46 +191,31 @@ class GaussianProcess(Interpolator):
         found.powers, _ = conditioned(seen, self.powers.trend, self.powers.kernel, 0)
         return found
 
+    @torch.no_grad()
     def _look_up(self, queries: np.ndarray) -> Prediction:
+        places = torch.from_numpy(queries)
         if self.powers is not None:
-            decibels, spread, share = (torch.from_numpy(v) for v in self.powers.mean_and_variance(queries))
+            decibels, spread, share = self.powers.answer(places)
             power = self._decode(decibels[:, None].float())
             return Prediction(power, (1 - share).float(), entry_variance(spread.float(), power, self.kind))
-        if self.near is not None:
-            return self._look_up_near(self.near, torch.from_numpy(queries))
-        cross = self.kernel.cross(queries, self.positions)
-        scores = (torch.from_numpy(cross) @ self.weights).float()
-        mean = self._decode(torch.addmm(self.mean, scores, self.axes))
-        explained = (cross * cho_solve(self.factor, cross.T).T).sum(1)
-        prior = 1 + self.kernel.noise
-        left = np.clip(prior - explained, 0.0, prior)
-        variance = torch.from_numpy(self.kernel.amplitude * left + self.lost).float()
-        sure = torch.from_numpy(1 - left / prior).float()
-        return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
-
-    @torch.no_grad()
-    def _look_up_near(self, near: NearestTargets, queries: Tensor) -> Prediction:
-        scores, left = near.at(queries)
-        mean = self._decode(torch.addmm(self.mean, scores, self.axes))
-        variance = (near.kernel.amplitude * left + near.lost).float()
-        sure = (1 - left / (1 + near.kernel.noise)).float()
+        assert self.scores is not None
+        found, kernel = self.scores.answer(places), self.scores.prior.kernel
+        mean = self._decode(torch.addmm(self.mean, found.mean.float(), self.axes))
+        variance = (kernel.amplitude * found.left + self.lost).float()
+        sure = (1 - found.left / (1 + kernel.noise)).float()
         return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean (B, ...) alone; see `Differentiable`. The variance is most of a prediction."""
+        queries = self._queries(tx, rx)
         if self.powers is not None:
-            return self._decode(self.powers.mean_at(self._queries(tx, rx))[:, None].float())
-        if self.near is not None:
-            return self._decode(torch.addmm(self.mean, self.near.at(self._queries(tx, rx))[0], self.axes))
-        places = torch.from_numpy(self.positions)
-        squared = (self._queries(tx, rx)[:, None] - places).square().sum(-1)
-        far = squared.clamp_min(1e-24).sqrt() * (math.sqrt(3) / self.kernel.length)  # finite slope at 0
-        scores = (((1 + far) * torch.exp(-far)) @ self.weights).float()
-        return self._decode(torch.addmm(self.mean, scores, self.axes))
+            return self._decode(self.powers.mean_at(queries)[:, None].float())
+        assert self.scores is not None
+        return self._decode(torch.addmm(self.mean, self.scores.mean_at(queries).float(), self.axes))
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        if self.powers is not None or self.near is not None:
+        if not isinstance(self.scores, Exact):
             return ("confidence",)
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
@@ -306,7 +228,7 @@ class GaussianProcess(Interpolator):
         assert self.site is not None
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
-        if self.powers is not None or self.near is not None:
+        if not isinstance(self.scores, Exact):
             return MeanAlone(self)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
@@ -314,36 +236,68 @@ class GaussianProcess(Interpolator):
             None
         )  # a view: the axes of thousands of images are hundreds of megabytes
         if count < len(self.axes):
-            kept = self.weights.square().sum(0).topk(count).indices
+            kept = self.scores.weights.square().sum(0).topk(count).indices
         mean, axes, shape = self.mean, self.axes[kept], self.shape
         if stride > 1:
             assert grid is not None
             parts = [part.unflatten(-1, shape)[..., ::stride, ::stride] for part in (mean, axes)]
             shape = tuple(parts[0].shape)
             mean, axes = (part.flatten(-2).contiguous() for part in parts)
-        lean = ReducedMean(self, mean, axes, self.weights[:, kept], shape)
+        lean = ReducedMean(self, mean, axes, self.scores, kept, shape)
         return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
 
     def _learned(self) -> dict[str, Any]:
         if self.powers is not None:
             return {"powers": self.powers.state()}
-        if self.near is not None:
-            return {"near": self.near.state(), "mean": self.mean, "axes": self.axes}
-        kernel = [self.kernel.length, self.kernel.noise, self.kernel.amplitude]
-        return {**super()._learned(), "positions": torch.from_numpy(self.positions), "kernel": kernel}
+        assert self.scores is not None
+        return {**super()._learned(), "scores": self.scores.state()}
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        self.powers = restored(state["powers"]) if "powers" in state else None
-        self.near = NearestTargets.of(state["near"]) if "near" in state else None
-        if self.powers is not None:
-            return
-        if self.near is not None:
-            self.mean, self.axes = state["mean"], state["axes"]
+        self.powers, self.scores = None, None
+        if "powers" in state:
+            self.powers = PowerProcess.read(state["powers"])
             return
         super()._relearn(state)
-        self.kernel = Kernel(*(float(v) for v in state["kernel"]))
-        self.positions = state["positions"].numpy()
-        self.factor = cho_factor(self.kernel.gram(self.positions), lower=True)
+        self.scores = (Nearest if "level" in state["scores"] else Exact).read(state["scores"])
+
+
+def projected(
+    targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray, block: int = 256
+) -> tuple[np.ndarray, float]:
+    """Scores (n, P) float32 of stored targets (n, ...), and the mean square per real number beyond them.
+
+    `block` targets are floats at a time.
+    """
+    scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
+    for start in range(0, len(targets), block):
+        rows = to_real(targets[start : start + block], kind) - mean
+        scores[start : start + block] = found = rows @ axes.T
+        beyond += float((rows.astype(np.float64) ** 2).sum()) - float((found.astype(np.float64) ** 2).sum())
+    return scores, max(beyond, 0.0) / (len(targets) * len(mean))
+
+
+def kernel_given_nearest(
+    places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
+) -> tuple[Kernel, str]:
+    """Length and noise most likely given the nearest rows, by the strongest components, and a note.
+
+    Args:
+        places, scores: (n, D) [m] and (n, P) float32.
+        entries: real numbers of a target.
+        start: a kernel of one length, chosen on few rows.
+        seed: of rows that are drawn.
+    """
+    row = covering(places, LOOKED_AT, seed)
+    near = cKDTree(places).query(places[row], k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))[1]
+    own = np.argsort(near == row[:, None], axis=1, kind="stable")[:, : near.shape[1] - 1]
+    rows = np.c_[row, np.take_along_axis(near, own, 1)]
+    strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
+    values = torch.from_numpy(scores[rows][..., strong]).double()
+    sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
+    found = most_likely([start], sample, pdist(places[row]))
+    share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
+    said = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
+    return replace(found, amplitude=found.amplitude * len(strong) / entries * share), said
 
 
 class MeanAlone(View):
@@ -362,24 +316,32 @@ class ReducedMean(View):
     Args:
         inner: fitted.
         mean, axes: (P,) and (C, P), the basis of targets.
-        weights: (n, C), so that scores are `kernel(query, places) @ weights`.
+        scores: what the rows say of components; `kept` of them.
+        kept: see there.
         shape: of a target.
     """
 
     def __init__(
-        self, inner: GaussianProcess, mean: Tensor, axes: Tensor, weights: Tensor, shape: tuple[int, ...]
+        self,
+        inner: GaussianProcess,
+        mean: Tensor,
+        axes: Tensor,
+        scores: Exact,
+        kept: Tensor | slice,
+        shape: tuple[int, ...],
     ) -> None:
         super().__init__(inner)
         assert inner.site is not None
         self._kind, self._site, self._shape = inner.site.kind, inner.site, shape
-        self._mean, self._axes, self._weights = mean, axes, weights.float().contiguous()
-        self._middle = torch.from_numpy(inner.positions.mean(0)).float()
-        self._scale = math.sqrt(3) / inner.kernel.length
-        self._places = (torch.from_numpy(inner.positions).float() - self._middle) * self._scale
+        self._mean, self._axes = mean, axes
+        self._weights = scores.weights[:, kept].float().contiguous()
+        self._middle = scores.rows.mean(0).float()
+        self._scale = math.sqrt(3) / scores.prior.kernel.lengths[0]
+        self._places = (scores.rows.float() - self._middle) * self._scale
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; Matern-3/2 as in `Kernel`, in float32."""
+        """See `Method.predict`; Matern-3/2 in float32."""
         where = self._site.moving(tx, rx).expand(len(tx), -1)
         query = (where - self._middle) * self._scale
         far = torch.linalg.vector_norm(query[:, None] - self._places, dim=-1)  # cdist: three times slower

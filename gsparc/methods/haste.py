@@ -6,18 +6,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
-from gsparc.methods.power_kernel import PowerKernel, left_out
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.processes.density import LeftOutDensity, gram_of
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import Kernel
 
 CHOSEN_ON = 1_000  # rows that settings are chosen on: each look at them factors a matrix
 FEWEST = 150  # of them
 LOOKS = 80  # that a choice takes
 TIMED_ON = 300  # rows
 MAKING = 1.5  # times a factor: with making the covariance
-ONE = PowerKernel((1.0,), (1.0,), 0.1, 1.0)
+ONE = Kernel.of_one(1.0, 0.1)
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,9 @@ def haste(budget: TimeBudget | None, share: float, count: int) -> Haste:
         return UNHURRIED
     began = budget.spent
     given = share * max(budget.seconds - began, 0.0)
-    values = np.arange(TIMED_ON, dtype=np.float64)
-    left_out(ONE, np.abs(values[:, None] - values), np.ones((TIMED_ON, 1)), values)
+    values, at = torch.arange(TIMED_ON, dtype=torch.float64)[:, None], torch.from_numpy(ONE.parameters())
+    gram = gram_of(at.requires_grad_(), torch.cdist(values, values))
+    LeftOutDensity.apply(gram, values, 1, True)[0].backward()  # type: ignore[no-untyped-call]
     affordable = given / (LOOKS * max(budget.spent - began, 1e-6))
     rows = min(int(TIMED_ON * affordable ** (1 / 3)), CHOSEN_ON)
     budget.limited |= rows < min(count, CHOSEN_ON)
@@ -58,6 +60,6 @@ def factor_s(rows: int) -> float:
     few, tried = max(min(rows, TIMED_ON), 1), []
     for _ in range(3):  # the first makes room, and a busy machine makes one of them slow
         watch = TimeBudget()
-        torch.linalg.cholesky(torch.eye(few, dtype=torch.complex128) + 0.5)
+        Factor.of(torch.eye(few, dtype=torch.complex128) + 0.5)
         tried.append(watch.spent)
     return MAKING * min(tried) * (rows / few) ** 3

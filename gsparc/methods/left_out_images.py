@@ -16,6 +16,8 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from gsparc.methods.gp import choose_kernel
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out_group
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class LeftOut:
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
         kernel = choose_kernel(self.positions, vectors * lengths, len(mean))
-        inverse = np.linalg.inv(kernel.gram(self.positions))
+        inverse = Factor.of(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
         distance = cdist(self.positions, self.positions)
         return mean + predict_left_out(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
 
@@ -92,7 +94,7 @@ def predict_left_out(
     Returns:
         Means (g, c, M), and variances (g, c) with noise; NaN where nothing is left.
     """
-    weighted = inverse @ values
+    precision, weighted = torch.from_numpy(inverse), torch.from_numpy(inverse @ values)
     mean = np.full((len(gaps), len(centres), values.shape[1]), np.nan, dtype=values.dtype)
     variance = np.full(mean.shape[:2], np.nan)
     for g, gap in enumerate(gaps):
@@ -103,11 +105,9 @@ def predict_left_out(
                 continue
             rows = np.flatnonzero(near)
             own = int(np.searchsorted(rows, i))
-            unit = np.zeros(len(rows))
-            unit[own] = 1.0
-            share = np.linalg.solve(inverse[np.ix_(rows, rows)], unit)
-            mean[g, c] = values[i] - share @ weighted[rows]
-            variance[g, c] = share[own]
+            residual, covariance = left_out_group(precision, weighted, torch.from_numpy(rows))
+            mean[g, c] = values[i] - residual[own].numpy()
+            variance[g, c] = covariance[own, own]
     return mean, variance
 
 

@@ -23,7 +23,7 @@ from gsparc.ops import Pose
 
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
-    from gsparc.methods.power_process import PowerProcess
+    from gsparc.processes.powers import PowerProcess
 
 StationModels = Literal["auto", "each", "together"]
 

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.methods.worker import ask
-from gsparc.multipath.gp_likelihood import Factor, steering
+from gsparc.multipath.gp_likelihood import CircularFactor, steering
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import LIGHT, NEAR_M
+from gsparc.processes.worker import ask
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
 CANDIDATES, EXACT, POLISHED = 150_000, 1_500, 40  # points drawn in the box, scored exactly, moved by ascent
@@ -39,7 +39,7 @@ class Detections:
 Spread = Callable[[Tensor], Tensor]
 
 
-def score(rows: Rows, candidates: Tensor, factor: Factor) -> tuple[Tensor, Tensor]:
+def score(rows: Rows, candidates: Tensor, factor: CircularFactor) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
 
     Where the static end has E antennas, candidates are the images of each, (E, m, 3).
@@ -47,7 +47,7 @@ def score(rows: Rows, candidates: Tensor, factor: Factor) -> tuple[Tensor, Tenso
     return score_waves(steering(rows, candidates), factor)
 
 
-def score_waves(waves: Tensor, factor: Factor) -> tuple[Tensor, Tensor]:
+def score_waves(waves: Tensor, factor: CircularFactor) -> tuple[Tensor, Tensor]:
     """The same of any waves (n, m) complex64."""
     matched = (waves.mH @ factor.alpha).abs().square().sum(1)
     power = (factor.root @ waves).abs().square().sum(0)
@@ -90,7 +90,7 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
 
 def search_box(
     rows: Rows,
-    factor: Factor,
+    factor: CircularFactor,
     box: Tensor,
     min_distance: float,
     limit: int,

@@ -22,14 +22,15 @@ from gsparc.data.blocks import taken
 from gsparc.data.links.stations import numbered
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.covering import covering
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
-from gsparc.methods.neighbourhood import Neighbourhood
 from gsparc.methods.run_factors import RunFactors, run_factors
-from gsparc.methods.vecchia import solved
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.kernels import plain
 from gsparc.ops import Pose
+from gsparc.processes.covering import covering
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out
+from gsparc.processes.nearest import solved
+from gsparc.processes.neighbourhood import Neighbourhood
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
@@ -44,10 +45,10 @@ NAMED = 6  # factors of runs that a note gives
 
 @dataclass(frozen=True)
 class _Solved:
-    """Negative log likelihood, Cholesky factor (m, m), weights (m, R), factors that align rows (m,)."""
+    """Negative log likelihood, factor of m rows, weights (m, R), factors that align rows (m,)."""
 
     nll: float
-    lower: Tensor
+    factor: Factor
     weights: Tensor
     aligning: Tensor
 
@@ -99,7 +100,7 @@ class ComplexGP(Method):
         ]
         _, self.length, self.noise = min(tried, key=lambda t: t[0])
         solved = self._solve(target, self.length, self.noise, torch.arange(len(known)), run)
-        self.factor, self.weights, self.turned = solved.lower, solved.weights, 1 / solved.aligning
+        self.factor, self.weights, self.turned = solved.factor, solved.weights, 1 / solved.aligning
         self.power = max(float((target * solved.aligning[:, None]).abs().square().mean()), 1e-30)
         notes = [f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"]
         if len(known) > CHOSEN_ON:
@@ -181,20 +182,18 @@ class ComplexGP(Method):
         places, target, number = self.places[rows], target[rows], run[rows.numpy()]
         gram = self._correlation(places, places, length)
         gram.diagonal().add_(noise)
-        lower = cholesky(gram)
+        factor = Factor.of(gram)
         aligning = torch.ones(len(rows), dtype=torch.complex128)
         if len(np.unique(number)) > 1:
-            inverse = torch.cholesky_inverse(lower).numpy()
+            inverse = factor.inverse.numpy()
             _, number = np.unique(number, return_inverse=True)
             aligning = torch.from_numpy(run_factors(inverse, target.numpy(), number)[number])
             target = target * aligning[:, None]
-        parts = torch.cat([target.real, target.imag], 1)
-        weights = torch.cholesky_solve(parts, lower)
-        fit = float((parts * weights).sum()) / parts.numel()
-        half = target.shape[1]
-        determinant = float(lower.diagonal().log().sum()) / len(parts)
+        weights = factor.solved(target)
+        fit = float((target.conj() * weights).real.sum()) / (2 * target.numel())
+        determinant = 0.5 * float(factor.log_determinant) / len(target)
         nll = 0.5 * np.log(max(fit, 1e-300)) + determinant - float(aligning.abs().log().mean())
-        return _Solved(nll, lower, torch.complex(weights[:, :half], weights[:, half:]), aligning)
+        return _Solved(nll, factor, weights, aligning)
 
     def _correlation(self, a: Tensor, b: Tensor, length: float) -> Tensor:
         """Between places (..., n, 3) and (..., m, 3) [m], or (..., 6) of both ends."""
@@ -213,7 +212,7 @@ class ComplexGP(Method):
             return Prediction(mean, sure, (self.power * variance).float())
         with torch.no_grad():
             cross = self._cross(tx, rx)
-        known = torch.linalg.solve_triangular(self.factor, cross.T, upper=False).square().sum(0)
+        known = self.factor.whitened(cross.T).square().sum(0)
         variance = (1 + self.noise - known).clamp_min(0) / (1 + self.noise)
         return Prediction(
             self._mean(cross),
@@ -255,8 +254,8 @@ class ComplexGP(Method):
             every = np.arange(len(self.places))
             mean = self._nearest_posterior(self.near, self.places, every)[0].flatten(1)
             return LeftOut(self.first, (torch.from_numpy(self.targets) - mean).to(torch.complex128))
-        inverse = torch.cholesky_inverse(self.factor).diagonal()
-        return LeftOut(np.arange(len(self.places)), self.turned[:, None] * self.weights / inverse[:, None])
+        residual, _ = left_out(self.factor.precision, self.weights)
+        return LeftOut(np.arange(len(self.places)), self.turned[:, None] * residual)
 
     def _moving(self, tx: Tensor, rx: Pose) -> Tensor:
         """Places (B, 3) float64 [m] of the moving end, (B, 6) of both."""
@@ -280,8 +279,8 @@ class ComplexGP(Method):
             arrays |= {name: torch.from_numpy(getattr(self, name)) for name in ("targets", "count", "first")}
             stored = {**arrays, "shape": list(self.shape)}
             return {**stored, "length": self.length, "noise": self.noise, "power": self.power}
-        names = ("places", "weights", "factor", "length", "noise", "power", "turned")
-        own = {name: getattr(self, name) for name in names}
+        names = ("places", "weights", "length", "noise", "power", "turned")
+        own = {"factor": self.factor.lower, **{name: getattr(self, name) for name in names}}
         return {**own, **self.runs.state(), "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -297,7 +296,7 @@ class ComplexGP(Method):
             self.first = state["first"].numpy() if "first" in state else np.arange(len(self.places))
             self.runs = RunFactors.none()
             return
-        self.weights, self.factor = state["weights"], state["factor"]
+        self.weights, self.factor = state["weights"], Factor(state["factor"])
         ones = torch.ones(len(self.places), dtype=torch.complex128)  # earlier versions knew no runs
         self.turned = state.get("turned", ones)
         self.runs = RunFactors.read(state if "runs" in state else None)

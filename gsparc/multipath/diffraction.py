@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsparc.multipath.backprojection import ascend, score_waves
-from gsparc.multipath.gp_likelihood import Factor, Posterior, Scene
+from gsparc.multipath.gp_likelihood import CircularFactor, Posterior, Scene
 from gsparc.multipath.refine import Late, never, refine
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import NEAR_M, reduced_phase
@@ -108,7 +108,7 @@ def edge_wave(
 
 
 def propose(
-    rows: Rows, factor: Factor, transmitter: Tensor, box: Tensor, generator: torch.Generator,
+    rows: Rows, factor: CircularFactor, transmitter: Tensor, box: Tensor, generator: torch.Generator,
     late: Late = never,
 ) -> tuple[Tensor, Tensor] | None:  # fmt: skip
     """Point and axis (3,) of the edge of largest gain given the sources of `factor`, or None.

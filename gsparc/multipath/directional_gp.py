@@ -25,7 +25,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction
 from gsparc.multipath.frame import FramedMethod, frame_of, refuse
-from gsparc.multipath.gp_likelihood import Factor, steering
+from gsparc.multipath.gp_likelihood import CircularFactor, steering
 from gsparc.multipath.position_refine import PositionRefinement, UncertainPositions, coherence
 from gsparc.multipath.rows import Rows, gather
 from gsparc.multipath.triangulation import Rays, triangulate
@@ -33,6 +33,7 @@ from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.multipath.visibility_kernel import matern32
 from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
+from gsparc.processes.left_out import left_out, left_out_group
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.
 MIN_SEEN, MAX_SOURCES = 2, 60
@@ -180,7 +181,7 @@ class DirectionalGP(FramedMethod):
         for _ in range(ROUNDS):
             covariance = _covariance(waves, waves, self.power, uncertain, retained)
             tried = [
-                (Factor.with_noise(covariance * correlation[kernel], kernel.noise, rows.target), kernel)
+                (CircularFactor.with_noise(covariance * correlation[kernel], kernel.noise, rows.target), kernel)
                 for kernel in KERNELS
             ]
             factor, self.kernel = min(tried, key=lambda one: one[0].nll)
@@ -200,7 +201,7 @@ class DirectionalGP(FramedMethod):
         correlation = self.kernel.correlation(rows.position, rows.position)
         retained = coherence(self.phase_vectors, self.phase_vectors)
         covariance = _covariance(self.waves, self.waves, self.power, self.uncertain, retained)
-        self.factor = Factor.with_noise(covariance * correlation, self.kernel.noise, rows.target)
+        self.factor = CircularFactor.with_noise(covariance * correlation, self.kernel.noise, rows.target)
 
         # (n, K, R, 2), real and imaginary: what each row adds to each source's gain
         dual_weights = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
@@ -219,7 +220,7 @@ class DirectionalGP(FramedMethod):
         for turn in range(VISIBILITY_UPDATES):
             if turn % REFIT_EVERY == REFIT_EVERY - 1:
                 self._refit()
-            places, known = self.rows.position, self.factor.inverse.diagonal().real
+            places = self.rows.position
             query = QueryGeometry(
                 places,
                 len(rows),
@@ -230,8 +231,7 @@ class DirectionalGP(FramedMethod):
             )
             one = self._gains(query) * steering(self.rows, self.sources)[:, :, None]
             seen, odds = self.visibility.seen.float(), rates.odds(rays, probability)
-            residual = self.factor.alpha / known[:, None]  # leave-one-out, eq. 5.12
-            flip = flips(seen[rows], odds[rows], residual, 1 / known, one)
+            flip = flips(seen[rows], odds[rows], *left_out(self.factor.inverse, self.factor.alpha), one)
             if not bool(flip.any()):
                 break
             seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])
@@ -322,7 +322,7 @@ class DirectionalGP(FramedMethod):
         predicted = cross @ self.factor.alpha
         for one in self.observer.unique():
             group = torch.nonzero(self.observer == one).flatten()
-            own = torch.linalg.solve(self.factor.inverse[group[:, None], group], self.factor.alpha[group])
+            own, _ = left_out_group(self.factor.inverse, self.factor.alpha, group)
             predicted[group] -= cross[group] @ (self.factor.inverse[:, group] @ own)
         return self._left_out(self.rows, predicted)
 

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.worker import Ended, ended_by
 from gsparc.multipath import refine_phase
 from gsparc.multipath.clutter.search import find_clutter
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.search import Search, SearchSettings
 from gsparc.multipath.search_cache import Member, SearchCache
+from gsparc.processes.worker import Ended, ended_by
 
 log = logging.getLogger(__name__)
 

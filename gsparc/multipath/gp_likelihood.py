@@ -16,11 +16,11 @@ from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter, visible_share
 from gsparc.multipath.clutter.unfold import Unfolding
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, images
 from gsparc.physics.waves import ranges, wave
+from gsparc.processes.factor import Factor
 
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
 
@@ -130,45 +130,43 @@ class Factored:
     """A factored covariance of n numbers with R outputs.
 
     Attributes:
-        lower: (n, n) complex64 or float32, Cholesky factor.
+        factor: of the covariance (n, n), complex64 or float32.
         alpha: (n, R), K^-1 y.
         nll: negative log marginal likelihood up to a constant.
     """
 
-    lower: Tensor
+    factor: Factor
     alpha: Tensor
     nll: float
 
-    @cached_property
+    @property
     def root(self) -> Tensor:
-        """(n, n), inverse of `lower`: K^-1 = root^H root."""
-        eye = torch.eye(len(self.lower), dtype=self.lower.dtype)
-        return torch.linalg.solve_triangular(self.lower, eye, upper=False)
+        """See `Factor.root`."""
+        return self.factor.root
 
-    @cached_property
+    @property
     def inverse(self) -> Tensor:
         """K^-1 (n, n)."""
-        return torch.cholesky_inverse(self.lower)
+        return self.factor.inverse
 
 
-class Factor(Factored):
+class CircularFactor(Factored):
     """A factored covariance of n complex rows."""
 
     @staticmethod
-    def of(covariance: Tensor, target: Tensor) -> Factor:
+    def of(covariance: Tensor, target: Tensor) -> CircularFactor:
         """From a positive definite covariance, noise included."""
-        lower = cholesky(covariance)
-        alpha = torch.cholesky_solve(target, lower)
-        determinant = 2 * lower.diagonal().real.double().log().sum()
+        factor = Factor.of(covariance)
+        alpha = factor.solved(target)
         fit = (target.conj() * alpha).real.double().sum()
-        return Factor(lower, alpha, float(fit + target.shape[1] * determinant))
+        return CircularFactor(factor, alpha, float(fit + target.shape[1] * factor.log_determinant))
 
     @staticmethod
-    def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Factor:
+    def with_noise(covariance: Tensor, noise: float, target: Tensor) -> CircularFactor:
         """From a covariance to whose diagonal noise and jitter are added in place."""
         level = max(1.0, float(covariance.diagonal().real.mean()))
         covariance.diagonal().add_(noise + JITTER * level)
-        return Factor.of(covariance, target)
+        return CircularFactor.of(covariance, target)
 
     @cached_property
     def slope(self) -> Tensor:
@@ -200,9 +198,9 @@ class Posterior:
         return torch.complex(real, imag)
 
     @cached_property
-    def factor(self) -> Factor:
+    def factor(self) -> CircularFactor:
         """Of the covariance and the rows' targets."""
-        return Factor.of(self.covariance, self.rows.target)
+        return CircularFactor.of(self.covariance, self.rows.target)
 
     @property
     def nll(self) -> float:
@@ -216,4 +214,4 @@ class Posterior:
         real, imag = torch.zeros(n, n), torch.zeros(n, n)
         correlation = self.scene.visibility.correlation(self.rows.places, self.scene.sources[k])
         add_covariance(real, imag, scaled, correlation)
-        return Factor.of(self.covariance - torch.complex(real, imag), self.rows.target).nll
+        return CircularFactor.of(self.covariance - torch.complex(real, imag), self.rows.target).nll

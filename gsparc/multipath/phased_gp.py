@@ -23,9 +23,10 @@ from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter
 from gsparc.multipath.gp_likelihood import JITTER, Factored, Posterior, Scene
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out
 
 
 @dataclass(frozen=True)
@@ -113,12 +114,10 @@ class RealFactor(Factored):
     def of(covariance: Tensor, target: Tensor) -> RealFactor:
         """From a positive definite covariance (2, n, 2, n), noise included, and targets (n, R) complex."""
         size = 2 * len(target)
-        lower = cholesky(covariance.reshape(size, size))
-        flat = stacked(target)[0]
-        alpha = torch.cholesky_solve(flat, lower)
-        determinant = lower.diagonal().double().log().sum()
-        nll = 0.5 * (flat * alpha).double().sum() + target.shape[1] * determinant
-        return RealFactor(lower, alpha, float(nll))
+        factor, flat = Factor.of(covariance.reshape(size, size)), stacked(target)[0]
+        alpha = factor.solved(flat)
+        nll = 0.5 * ((flat * alpha).double().sum() + target.shape[1] * factor.log_determinant)
+        return RealFactor(factor, alpha, float(nll))
 
     @property
     def slope(self) -> Tensor:
@@ -177,8 +176,6 @@ class PhasedPosterior:
         n, alpha, inverse = len(self.rows), self.factor.alpha, self.factor.inverse
         order = torch.argsort(self.rows.receiver, stable=True)
         counts = torch.unique_consecutive(self.rows.receiver[order], return_counts=True)[1]
-        error = torch.empty_like(alpha)
-        for group in order.split(counts.tolist()):
-            both = torch.cat([group, group + n])
-            error[both] = torch.linalg.solve(inverse[both[:, None], both], alpha[both])
+        groups = (torch.cat([group, group + n]) for group in order.split(counts.tolist()))
+        error, _ = left_out(inverse, alpha, groups)
         return self.rows.target - torch.complex(error[:n], error[n:])

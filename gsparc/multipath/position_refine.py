@@ -21,9 +21,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.multipath.gp_likelihood import Factor, steering
+from gsparc.multipath.gp_likelihood import CircularFactor, steering
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.factor import Factor
 
 SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
 DRAWS_PER_CELL, MIN_DRAWS, MAX_DRAWS = 6, 32, 768  # positions per (quarter wavelength)^3 of the prior
@@ -52,7 +53,7 @@ class UncertainPositions:
     @cached_property
     def lower(self) -> Tensor:
         """(K, 3, 3), Cholesky factors of the covariances."""
-        return torch.linalg.cholesky(self.covariance + 1e-14 * torch.eye(3, dtype=torch.float64))
+        return Factor.of(self.covariance + 1e-14 * torch.eye(3, dtype=torch.float64), "raise").lower
 
     def phase_vectors(self, places: Tensor, frequency: Tensor) -> Tensor:
         """(K, n, 3) float32 [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
@@ -145,7 +146,7 @@ class PositionRefinement:
         """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            factor = Factor.with_noise(self._total(), self.noise, self.rows.target)
+            factor = CircularFactor.with_noise(self._total(), self.noise, self.rows.target)
             explained = (factor.alpha.conj() * (self.terms @ factor.alpha)).real.sum((1, 2))
             due = outputs * (factor.inverse.conj() * self.terms).real.sum((1, 2))
             self.power = self.power * (explained / due.clamp_min(1e-12)).clamp(1 / MAX_RATIO, MAX_RATIO)
@@ -157,7 +158,7 @@ class PositionRefinement:
     def _refine(self, k: int) -> None:
         """Position and covariance of source k given its rays, the channels and all other sources."""
         conditional = ConditionalLikelihood.of(
-            self, k, Factor.with_noise(self._total(without=k), self.noise, self.rows.target)
+            self, k, CircularFactor.with_noise(self._total(without=k), self.noise, self.rows.target)
         )
         if self.resolved[k]:
             places = self.current.points[k][None]
@@ -206,7 +207,7 @@ class ConditionalLikelihood:
     precision: Tensor
 
     @staticmethod
-    def of(refinement: PositionRefinement, k: int, factor: Factor) -> ConditionalLikelihood:
+    def of(refinement: PositionRefinement, k: int, factor: CircularFactor) -> ConditionalLikelihood:
         """Of source k, with the factor of the covariance without it."""
         rows_in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
         return ConditionalLikelihood(

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.visibility_kernel import matern32
+from gsparc.processes.left_out import left_out as residuals
 
 LENGTHS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # candidates for every source
 NOISES = (0.03, 0.1, 0.3, 1.0)  # candidates, in units of the process's variance
@@ -60,7 +61,7 @@ class VisibilityGP:
                 shrunk = 1 / (values.clamp_min(0) + noise)
                 alpha = vectors @ (shrunk[:, None] * turned)
                 inverse = (vectors.square() * shrunk).sum(1)
-                predicted = (seen - alpha / inverse[:, None]).clamp(0, 1)  # eq. 5.12
+                predicted = (seen - residuals(inverse, alpha)[0]).clamp(0, 1)
                 error = (predicted - seen).square().mean(0)
                 better = error < best
                 best = torch.where(better, error, best)

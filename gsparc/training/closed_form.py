@@ -18,12 +18,15 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import Prior
-from gsparc.field.kernels import Whitened, whitened
 from gsparc.field.model import GaussianModel
-from gsparc.methods.gp import Kernel, choose_kernel, principal_components
+from gsparc.methods.gp import choose_kernel, principal_components
 from gsparc.methods.left_out_images import LeftOut, predict_left_out
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
+from gsparc.processes.factor import Factor
+from gsparc.processes.features import Whitened, whitened
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.left_out import left_out
 
 IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular
 CHUNK = 256  # images held as floats at a time
@@ -149,7 +152,7 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
     batch = data.batch(rows)
     images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
-    emission = torch.linalg.solve(gram + ridge, weights.mT @ images.mT).mT
+    emission = Factor.of(gram + ridge).solved(weights.mT @ images.mT).mT
     distance = model.distances(batch.tx)
     attenuation = model.attenuation(distance)
     emission = emission if attenuation is None else emission / attenuation
@@ -162,10 +165,9 @@ def _errors(seen: Seen, inverse: Tensor, noise: float, mean: Tensor) -> tuple[fl
 
     Rasmussen and Williams (2006), eq. 5.12.
     """
-    diagonal = inverse.diagonal()
-    left_out = seen.outputs - inverse @ (seen.outputs - mean) / diagonal[:, None]
-    unknown = (1 / diagonal - noise).clamp(0, 1)
-    shown = [seen.rendered(left_out), seen.rendered(mean.expand_as(seen.outputs))]
+    residual, variance = left_out(inverse, inverse @ (seen.outputs - mean))
+    unknown = (variance - noise).clamp(0, 1)
+    shown = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in shown])
     return fit_errors(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
 

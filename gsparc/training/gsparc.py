@@ -24,14 +24,15 @@ from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, StackedField, learns
 from gsparc.methods.haste import factor_s
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
-from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.pareto import Settings
-from gsparc.methods.power_process import PowerProcess, approximated, exact
 from gsparc.methods.reduced import contributions, knobs, reduced
 from gsparc.methods.registry import field_initialiser, method_class
 from gsparc.methods.run_factors import RunFactors
 from gsparc.methods.time_budget import TimeBudget, less_repeatable
 from gsparc.ops import Pose
+from gsparc.processes.nearest import Nearest
+from gsparc.processes.posterior import approximated
+from gsparc.processes.powers import PowerProcess
 from gsparc.training import process_average, solution_weights, solutions, stations
 from gsparc.training.auto_settings import resolve
 from gsparc.training.checkpoint_io import GsparcCheckpointIO
@@ -80,7 +81,8 @@ class Gsparc(LearnedField):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximated(self.name, getattr(self.field, "process", None))
+        process = getattr(self.field, "process", None)
+        return approximated(self.name, getattr(process, "posterior", None))
 
     @property
     def takes_budget(self) -> bool:  # type: ignore[override]
@@ -244,7 +246,7 @@ class Gsparc(LearnedField):
             assert found.explained is not None
             own = comparable(found.explained, data.site)
             self.explained = solution_weights.explained(own, target, data.site.kind != "csi")
-        if isinstance(getattr(field, "process", None), NearestProcess):
+        if isinstance(getattr(getattr(field, "process", None), "posterior", None), Nearest):
             log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
             return 0, field.count > 0
         if not learns(field):
@@ -333,7 +335,7 @@ class Gsparc(LearnedField):
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
         found = getattr(self.field, "process", None)
-        return None if found is None else exact(found)
+        return None if found is None else found.exact()
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""

@@ -20,7 +20,7 @@ from gsparc.methods.haste import factor_s
 from gsparc.methods.method import FitContext, FitReport
 from gsparc.methods.registry import field_initialiser
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.worker import late_when
+from gsparc.processes.worker import late_when
 from gsparc.training import solution_weights
 from gsparc.training.solution_weights import LEAST_HELD, comparable
 from gsparc.training.terms import EffectSettings

@@ -12,7 +12,7 @@ from gsparc.data.raw import read_raw
 from gsparc.data.selection import keep_above
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.methods import neighbourhood, power_process
-from gsparc.methods.covering import covering
+from gsparc.processes.covering import covering
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.kriging import Kriging
@@ -21,7 +21,7 @@ from gsparc.methods.nearest_process import Values, given
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.power_process import conditioned, exact
 from gsparc.methods.reduced import reduced
-from gsparc.methods.trend import Trend
+from gsparc.processes.trend import Trend
 from tests.methods.test_power_process import error_db, fit, town
 
 KERNEL = PowerKernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)

@@ -10,7 +10,7 @@ import torch
 from gains import gains
 from rooms import PILLAR, WAVELENGTH, shoebox
 
-from gsparc.methods.worker import Ended, ended_by
+from gsparc.processes.worker import Ended, ended_by
 from gsparc.multipath.clutter import finite_mirrors, search
 from gsparc.multipath.clutter.blocking import Clutter, Obstacles, tangents, visible_share
 from gsparc.multipath.clutter.boxes import find_box

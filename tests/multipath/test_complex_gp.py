@@ -14,7 +14,7 @@ from gsparc.methods.registry import method_class
 from gsparc.methods.run_factors import run_factors
 from gsparc.multipath import complex_gp
 from gsparc.multipath.complex_gp import ComplexGP
-from gsparc.multipath.gp_likelihood import Factor
+from gsparc.multipath.gp_likelihood import CircularFactor
 from gsparc.multipath.ridge import cholesky
 from gsparc.physics.waves import LIGHT
 
@@ -200,7 +200,7 @@ def test_a_ridge_mends_what_rounding_broke():
     assert torch.linalg.cholesky_ex(covariance)[1] > 0
     lower = cholesky(covariance)
     assert torch.allclose(lower @ lower.mH, covariance, atol=0.05 * 50)
-    assert np.isfinite(Factor.of(covariance, covariance[:, :1]).nll)
+    assert np.isfinite(CircularFactor.of(covariance, covariance[:, :1]).nll)
     sound = covariance + 10 * torch.eye(len(covariance))
     assert torch.equal(cholesky(sound), torch.linalg.cholesky(sound))
     with pytest.raises(ValueError, match="no Cholesky factor"):

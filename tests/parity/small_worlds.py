@@ -8,8 +8,8 @@ import torch
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.distance_law import Law, Rows
-from gsparc.methods.trend import Trend
+from gsparc.processes.powers import Rows, trend_of_rows
+from gsparc.processes.trend import Law, Trend
 
 CARRIER = 2.4e9
 WAVENUMBER = 2 * np.pi * CARRIER / 299_792_458.0
@@ -31,7 +31,7 @@ def smooth(places: np.ndarray, outputs: int, seed: int, length: float = 2.0) -> 
 
 def trend(places: np.ndarray, law: Law | None = LAW) -> Trend:
     """A mean law as if it were fitted to places."""
-    return Trend.of(rows(places), law)
+    return trend_of_rows(rows(places), law)
 
 
 def rows(places: np.ndarray, quiet: int = 0, seed: int = 1) -> Rows:

@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 from sklearn.linear_model import RidgeCV
 from torch import Tensor
 
-from gsparc.array.moving.power_gp import matern
-from gsparc.methods.gp import Kernel
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import Kernel, matern32
 
 NEIGHBOURS = 16  # whose leave-one-out errors are averaged, and on which variances are conditioned
 NEAR = 4  # the distance to this neighbour is the reach of the average
@@ -85,7 +85,7 @@ class ErrorModel:
             power: (m,) mean square of the predicted images.
         """
         error, nearest = self.relative_error(far, features)
-        known = matern((nearest - self.farthest).clamp_min(0), self.reach)
+        known = matern32((nearest - self.farthest).clamp_min(0), self.reach)
         variance = known * (error * power).clamp_max(self.prior) + (1 - known) * self.prior
         return 1 - known / (1 + error), variance
 
@@ -105,12 +105,12 @@ class ErrorModel:
 
     def state(self) -> dict[str, Any]:
         """Plain tensors and numbers."""
-        return {**vars(self), "kernel": [*vars(self.kernel).values()]}
+        return {**vars(self), "kernel": self.kernel.state()}
 
     @staticmethod
     def from_state(state: Mapping[str, Any]) -> ErrorModel:
         """Inverse of `state`."""
-        return ErrorModel(**{**state, "kernel": Kernel(*map(float, state["kernel"]))})
+        return ErrorModel(**{**state, "kernel": Kernel.read(state["kernel"])})
 
 
 def fit_error_model(
@@ -159,9 +159,8 @@ def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor
 
 def _precision(kernel: Kernel, places: Tensor) -> Tensor:
     """Inverse correlations (m, k, k) with noise, of rows at (m, k, 3) float64 [m]."""
-    between = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
     noise = max(kernel.noise, LEAST_NOISE) * torch.eye(places.shape[1], dtype=torch.float64)
-    return torch.linalg.inv(matern(between, kernel.length) + noise)
+    return Factor.of(kernel.between(places, places) + noise, "raise").inverse
 
 
 def _variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
@@ -169,7 +168,7 @@ def _variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
 
     The nearest rows screen off the others (Stein 2002), whose Cholesky factor would be most of a query.
     """
-    cross = matern(distance.double(), kernel.length)[:, None]
+    cross = kernel.correlation(distance.double())[:, None]
     prior = 1 + kernel.noise
     return (prior - (cross @ precision @ cross.mT)[:, 0, 0]).clamp(max(kernel.noise, LEAST_NOISE), prior)
 

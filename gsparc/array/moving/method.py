@@ -29,7 +29,6 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import LeftOutRows, Posterior
 from gsparc.methods.censored import heard
-from gsparc.methods.gp import Kernel
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import FitContext, FitReport, Prediction
 from gsparc.methods.target_rows import to_real, training_targets
@@ -37,6 +36,7 @@ from gsparc.methods.time_budget import TimeBudget
 from gsparc.ops import Pose
 from gsparc.physics.lags import BLOCK, Lags
 from gsparc.physics.separable import Separable, separable
+from gsparc.processes.kernel import Kernel
 
 log = logging.getLogger(__name__)
 
@@ -269,7 +269,7 @@ class MovingArrayField(Interpolator):
         some, diagonal = held.at(rows), float(np.linalg.norm(np.ptp(held.places, axis=0))) or 1.0
         errors = {}
         for length in self.trend.lengths:
-            kernel = Kernel(length * diagonal, self.trend.noise)
+            kernel = Kernel.of_one(length * diagonal, self.trend.noise)
             left = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
             missed = some.values - self._modelled(some, sources, left)
             errors[kernel] = left_out_error(some.places, missed)[0]

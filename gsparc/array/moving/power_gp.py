@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import cho_solve, cholesky
-from scipy.linalg.lapack import dtrtri
 from torch import Tensor
 
-from gsparc.methods.gp import Kernel
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.left_out import left_out
+from gsparc.processes.posterior import Exact
+from gsparc.processes.prior import Prior
 
 
 @dataclass(frozen=True)
@@ -49,34 +49,23 @@ class Trend:
 
     def powers(self, far: Tensor) -> Tensor:
         """Power (m, K) of every source at places that are `far` (m, n) [m] from the training receivers."""
-        return torch.addmm(self.level, matern(far, self.kernel.length), self.weights)
+        return torch.addmm(self.level, self.kernel.correlation(far), self.weights)
 
     def state(self) -> dict[str, Any]:
         """Plain tensors and numbers."""
-        return {**vars(self), "kernel": [*vars(self.kernel).values()]}
+        return {**vars(self), "kernel": self.kernel.state()}
 
     @staticmethod
     def from_state(state: Mapping[str, Any]) -> Trend:
         """Inverse of `state`."""
-        kernel = Kernel(*map(float, state["kernel"]))
+        kernel = Kernel.read(state["kernel"])
         return Trend(state["sources"], kernel, state["level"].float(), state["weights"].float())
 
 
-def matern(far: Tensor, length: float) -> Tensor:
-    """Matern-3/2 correlations of distances [m], as `gsparc.methods.gp.Kernel`."""
-    scaled = far * (math.sqrt(3) / length)
-    return (1 + scaled) * torch.exp(-scaled)
-
-
-def solved(kernel: Kernel, places: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out variances (n,).
-
-    Variances are over the kernel's amplitude; a left-out prediction is `values - weights * variance`
-    (Rasmussen and Williams 2006, eq. 5.12).
-    """
-    factor = cholesky(kernel.gram(places), lower=True)
-    spread = 1 / (dtrtri(factor, lower=1)[0] ** 2).sum(0)  # of the inverse's diagonal, without forming it
-    return cho_solve((factor, True), values), spread
+def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights (n, K) of centred values (n, K) at places (n, 3) [m], and their left-out residuals (n, K)."""
+    posterior = Exact.given(Prior(kernel), torch.from_numpy(places), values)
+    return posterior.weights, left_out(posterior.factor.precision, posterior.weights)[0]
 
 
 def fit_trend(
@@ -84,8 +73,7 @@ def fit_trend(
 ) -> tuple[Trend, np.ndarray]:
     """The trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
     level = power.mean(0)
-    weights, spread = solved(kernel, places, power - level)
+    weights, residual = solved(kernel, places, torch.from_numpy(power - level))
     # in the order that a checkpoint keeps: in another one sums differ, and roots of small pixels by more
-    stored = torch.from_numpy(np.ascontiguousarray(weights)).float()
-    trend = Trend(sources, kernel, torch.from_numpy(level).float(), stored)
-    return trend, power - weights * spread[:, None]
+    trend = Trend(sources, kernel, torch.from_numpy(level).float(), weights.float().contiguous())
+    return trend, power - residual.numpy()

@@ -15,8 +15,9 @@ import torch
 from scipy.linalg import eigh
 from torch import Tensor
 
-from gsparc.array.moving.power_gp import matern, solved
-from gsparc.methods.gp import Kernel, choose_kernel
+from gsparc.array.moving.power_gp import solved
+from gsparc.methods.gp import choose_kernel
+from gsparc.processes.kernel import Kernel
 
 KERNEL_COMPONENTS = 128  # principal components that kernels are chosen on
 SPARED = 3e-4  # of the left-out error: energy of predictions along all axes left out
@@ -40,7 +41,7 @@ class Residual:
 
     def coefficients(self, far: Tensor) -> Tensor:
         """Of images (m, R) at places that are `far` (m, n) [m] from the training receivers."""
-        return torch.addmm(self.mean, matern(far, self.kernel.length) @ self.weights, self.axes)
+        return torch.addmm(self.mean, self.kernel.correlation(far) @ self.weights, self.axes)
 
     def first(self, count: int) -> Residual:
         """With the `count` axes that most is predicted along."""
@@ -48,12 +49,12 @@ class Residual:
 
     def state(self) -> dict[str, Any]:
         """Plain tensors and numbers."""
-        return {**vars(self), "kernel": [*vars(self.kernel).values()]}
+        return {**vars(self), "kernel": self.kernel.state()}
 
     @staticmethod
     def from_state(state: Mapping[str, Any]) -> Residual:
         """Inverse of `state`."""
-        return Residual(Kernel(*map(float, state["kernel"])), state["mean"], state["axes"], state["weights"])
+        return Residual(Kernel.read(state["kernel"]), state["mean"], state["axes"], state["weights"])
 
 
 def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int) -> tuple[Residual, Tensor]:
@@ -67,8 +68,7 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
         none = Residual(kernel, mean, torch.zeros(0, len(mean)), torch.zeros(len(values), 0))
         return none, mean.expand(values.shape)
     centred = (values - mean).double().numpy()
-    weights, spread = solved(kernel, places, centred)
-    missed = weights * spread[:, None]
+    weights, missed = (part.numpy() for part in solved(kernel, places, torch.from_numpy(centred)))
     predicted = centred - missed
     energy, axes = principal(predicted, limit)
     left_out = (predicted**2).sum() - energy.sum() + energy[::-1].cumsum()[::-1] - energy
@@ -84,8 +84,8 @@ def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
     centred = (values - mean).double().numpy()
     scores = centred @ principal(centred, KERNEL_COMPONENTS)[1].T
     kernel = choose_kernel(places, scores, values.shape[1])
-    weights, spread = solved(kernel, places, scores)
-    missed = ((weights * spread[:, None]) ** 2).sum() + (centred**2).sum() - (scores**2).sum()
+    residual = solved(kernel, places, torch.from_numpy(scores))[1]
+    missed = float(residual.square().sum()) + (centred**2).sum() - (scores**2).sum()
     return float(missed) / len(values), kernel
 
 

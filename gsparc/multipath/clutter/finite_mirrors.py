@@ -14,7 +14,6 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from gsparc.methods.worker import ask
 from gsparc.multipath.clutter.blocking import tangents, within
 from gsparc.multipath.clutter.boxes import evolve
 from gsparc.multipath.clutter.residual import CandidateScorer
@@ -22,6 +21,7 @@ from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.rows import Rows
 from gsparc.physics.mirror_planes import Reflections, reflect
 from gsparc.physics.waves import LIGHT, NEAR_M, wave
+from gsparc.processes.worker import ask
 
 log = logging.getLogger(__name__)
 

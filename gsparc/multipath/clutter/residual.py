@@ -14,11 +14,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.methods.worker import ask
 from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
+from gsparc.processes.factor import Factor
+from gsparc.processes.worker import ask
 
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
@@ -47,9 +47,9 @@ class Residual:
         constant = float(self.phased.scene.visibility.constant)
         self._factor(constant, self.phased.scene.log_noise, phased.quadrature)
         self.share = self._constant(constant, phased.quadrature)
-        self.root = torch.linalg.solve_triangular(self._lower, torch.eye(len(self.target)), upper=False)
+        self.root = self._own.root
         self.white = self.root @ self.target
-        del self._cached, self._lower
+        del self._cached, self._own
 
     def _parts(self, phased: PhasedScene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
@@ -70,10 +70,8 @@ class Residual:
 
         def cost(constant: float, noise: float) -> float:
             self._factor(constant, noise, phased.quadrature)
-            whitened = torch.linalg.solve_triangular(
-                self._lower, columns * self._constant(constant, phased.quadrature), upper=False
-            )
-            white = torch.linalg.solve_triangular(self._lower, self.target[:, None], upper=False)[:, 0]
+            whitened = self._own.whitened(columns * self._constant(constant, phased.quadrature))
+            white = self._own.whitened(self.target[:, None])[:, 0]
             return _cost(whitened, white, self._determinant).item()
 
         best = cost(constant, noise)
@@ -93,8 +91,8 @@ class Residual:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
-        self._lower = cholesky(covariance)
-        self._determinant = float(self._lower.diagonal().double().log().sum())
+        self._own = Factor.of(covariance)
+        self._determinant = 0.5 * float(self._own.log_determinant)
 
     @staticmethod
     def _constant(constant: float, quadrature: float) -> float:
@@ -116,7 +114,7 @@ class Residual:
         """Log likelihood lost without each source's constant part (K,) [nats]."""
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _inner(columns, self.white)
-        inverse = torch.linalg.inv(inner)
+        inverse = Factor.of(inner).inverse
         mean, spread = inverse @ seen, inverse.diagonal()
         return (0.5 * (mean.square() / spread + spread.log())).float()
 
@@ -124,9 +122,8 @@ class Residual:
         """Scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _inner(columns, self.white)
-        lower = torch.linalg.cholesky(inner)
-        mean = torch.cholesky_solve(seen[:, None], lower)[:, 0].float()
-        projection = torch.linalg.solve_triangular(lower, columns.T.double(), upper=False).float()
+        own = Factor.of(inner)
+        mean, projection = own.solved(seen[:, None])[:, 0].float(), own.whitened(columns.T.double()).float()
         gains = mean * self.share * log_amplitude.exp()
         return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
 
@@ -198,7 +195,6 @@ def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
 
 def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
     inner, seen = _inner(columns, white)
-    lower = torch.linalg.cholesky(inner)
-    fit = torch.linalg.solve_triangular(lower, seen[:, None], upper=False)
-    explained = white.double().square().sum() - fit.square().sum()
-    return determinant + lower.diagonal().log().sum() + 0.5 * explained
+    own = Factor.of(inner)
+    explained = white.double().square().sum() - own.whitened(seen[:, None]).square().sum()
+    return determinant + 0.5 * (own.log_determinant + explained)

@@ -11,7 +11,6 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsparc.methods.worker import Ended, ask, ended_by
 from gsparc.multipath import refine_phase
 from gsparc.multipath.backprojection import pick_apart
 from gsparc.multipath.clutter.blocking import SOFT, Clutter, tangents, visible_share, within
@@ -25,6 +24,7 @@ from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.worker import Ended, ask, ended_by
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from gsparc.methods.trend import Trend
 from gsparc.multipath.powers.extinction import extinctions
+from gsparc.processes.trend import Trend
 
 Place = tuple[float, float, float]
 

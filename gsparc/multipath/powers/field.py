@@ -10,7 +10,7 @@ here few, sought, and of any shape); one or two Matern-3/2 of place; noise. With
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,30 +23,23 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.censored import silent
-from gsparc.methods.covering import covering
-from gsparc.methods.distance_law import Rows
 from gsparc.methods.haste import UNHURRIED, haste
-from gsparc.methods.nearest_process import COVER, NearestProcess
-from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
-from gsparc.methods.power_process import (
-    LAW_NEEDS,
-    Process,
-    choose_about,
-    choose_prior,
-    conditioned,
-    draw,
-    fit_powers,
-)
-from gsparc.methods.power_process import restored as restored_process
+from gsparc.methods.power_settings import LAW_NEEDS, choose_about, choose_prior, fit_powers
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.trend import Trend, trend_of
 from gsparc.multipath.powers.blockers import Blockers, Place, ShadowedTrend
 from gsparc.multipath.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.likelihood import Covariance, left_out_losses
 from gsparc.multipath.powers.search import Seen, search
 from gsparc.ops import Pose
+from gsparc.processes.covering import covering
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import COVER, Nearest
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
+from gsparc.processes.trend import Trend, trend_of
 
 QUERIES = 512  # at a time: memory
 SOUGHT_ON = 600  # rows: each look factors a matrix
@@ -97,7 +90,7 @@ class PowerField(ConditionalField):
         self,
         site: Site,
         trend: Trend,
-        kernel: PowerKernel,
+        kernel: Kernel,
         blockers: Blockers,
         still: Place | None,
         seed: int = 0,
@@ -114,7 +107,7 @@ class PowerField(ConditionalField):
         self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude = (
             nn.Parameter(part) for part in vars(covariance).values()
         )
-        self.process: Process | None = None
+        self.process: PowerProcess | None = None
         self._tree: cKDTree | None = None  # of its places, made when it is asked
         self.known = np.zeros(0, np.int64)
         self.at = np.zeros(0, np.int64)  # places of the process that known rows are of, where rows share them
@@ -150,11 +143,11 @@ class PowerField(ConditionalField):
         losses = -self.alone[-len(self.means) :] * still[3].exp().numpy()
         return SiteObjects.of(gaussians=(still[0].numpy(), still[1].exp().numpy(), still[2].numpy(), losses))
 
-    def prior(self) -> tuple[Trend, PowerKernel]:
+    def prior(self) -> tuple[Trend, Kernel]:
         """What the parameters say, without gradients."""
         logit = [self.share_logit.item()] if len(self.log_lengths) == 2 else []
         settings = np.array([*self.log_lengths.tolist(), *logit, self.log_noise.item()])
-        kernel = kernel_of(settings, math.exp(self.log_amplitude.item()))
+        kernel = Kernel.of(settings, math.exp(self.log_amplitude.item()))
         if not len(self.means):
             return self.trend, kernel
         still = Blockers(*(part.detach().clone() for part in self.blockers.parts()), most=self.most)
@@ -191,9 +184,9 @@ class PowerField(ConditionalField):
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
-        if isinstance(self.process, NearestProcess):
+        if isinstance(nearest := self.process.posterior, Nearest):
             # A silent row may lie at the same place; its noise is larger than any mean's.
-            heard = np.flatnonzero(self.process.noise <= self.process.kernel.noise)
+            heard = np.flatnonzero(nearest.noise.numpy() <= self.process.kernel.noise)
             self.at = heard[cKDTree(self.process.places[heard]).query(loud.places)[1]]
         if len(self.means):
             trend = self.process.trend
@@ -214,9 +207,7 @@ class PowerField(ConditionalField):
         """
         process, places = self._conditioned(), self._places(tx, rx)
         parts = [self._answer(process, part) for part in places.split(QUERIES)]
-        mean, spread, share, explained = (
-            torch.from_numpy(np.concatenate(v)) for v in zip(*parts, strict=True)
-        )
+        mean, spread, share, explained = (torch.cat(part) for part in zip(*parts, strict=True))
         power = self._power(mean)
         said = self._power(explained) if self.count else None
         return Posterior(power, entry_variance(spread.float(), power, "rssi"), said, share.float())
@@ -238,17 +229,11 @@ class PowerField(ConditionalField):
             ValueError: before `condition`.
         """
         process = self._conditioned()
-        if isinstance(process, NearestProcess):
-            means, variances = process.left_out()
-            decibels, spread = torch.from_numpy(means[self.at]), torch.from_numpy(variances[self.at])
-            places = process.places[self.at]
-        else:
-            inverse, _ = inverse_of(np.tril(process.factor) @ np.tril(process.factor).T)
-            loud = process.extra == 0
-            share = inverse.diagonal()[loud]
-            decibels = torch.from_numpy(self.decibels - process.weights[loud] / share)
-            spread = torch.from_numpy(process.kernel.amplitude / share)
-            places = process.places[loud]
+        posterior = process.posterior
+        mean, variance = posterior.left_out()
+        loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
+        decibels, spread = mean[loud, 0], process.kernel.amplitude * variance[loud]
+        places = process.places[loud]
         if self.fringes is not None:
             decibels, factor = self.fringes.blended_unseen(
                 decibels, torch.from_numpy(places), nearest(places), self.known
@@ -274,17 +259,16 @@ class PowerField(ConditionalField):
             **({} if self.process is None else {"process": self.process.state()}),
         }
 
-    def _answer(self, process: Process, places: Tensor) -> tuple[np.ndarray, ...]:
+    def _answer(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
         """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
-        mean, spread, share = process.mean_and_variance(places.numpy())
+        mean, spread, share = process.answer(places)
         if self.fringes is not None:
-            both, factor = self.fringes.blended(torch.from_numpy(mean), places, self._distance(places))
-            explained = self.fringes.solutions(places).mean(1).numpy()
-            return both.numpy(), spread * factor.numpy(), share, explained
+            mean, factor = self.fringes.blended(mean, places, self._distance(places))
+            return mean, spread * factor, share, self.fringes.solutions(places).mean(1)
         if not self.count:
             return mean, spread, share, mean
-        explained = process.trend.mean(places).numpy() + process.trend.terms(places).numpy() @ self.alone
-        return mean, spread, share, explained
+        law = process.trend.mean(places)
+        return mean, spread, share, law + process.trend.terms(places) @ torch.from_numpy(self.alone)
 
     def _distance(self, places: Tensor) -> np.ndarray:
         """From the nearest known row (B,) [m]."""
@@ -292,7 +276,7 @@ class PowerField(ConditionalField):
             self._tree = cKDTree(self._conditioned().places)
         return self._tree.query(places.numpy())[0]
 
-    def _conditioned(self) -> Process:
+    def _conditioned(self) -> PowerProcess:
         if self.process is None:
             raise ValueError("a field of powers: condition it first")
         return self.process
@@ -310,7 +294,7 @@ def ridge(columns: np.ndarray, values: np.ndarray, prior: float) -> np.ndarray:
     weights, left = np.zeros(columns.shape[1]), float((values**2).mean())
     for _ in range(RIDGE_STEPS):
         gram = columns.T @ columns + left / prior * np.eye(columns.shape[1])
-        weights = np.linalg.solve(gram, columns.T @ values)
+        weights = Factor.of(torch.from_numpy(gram)).solved(torch.from_numpy(columns.T @ values)[:, None])[:, 0].numpy()
         left = max(float(((values - columns @ weights) ** 2).mean()), 1e-12)
     return weights
 
@@ -401,7 +385,7 @@ def shadowed(
     seed: int,
     budget: TimeBudget | None,
     known: Blockers | None = None,
-) -> tuple[ShadowedTrend, PowerKernel, tuple[str, ...]] | None:
+) -> tuple[ShadowedTrend, Kernel, tuple[str, ...]] | None:
     """A prior with Gaussians beside a distance law, and notes; None where no candidate is worth its place.
 
     Those that are known have theirs, with strengths in decibels.
@@ -446,13 +430,13 @@ def gain_of_groups(
         learned = rows.at(rest).at(draw(rows.silent[rest], SOUGHT_ON, seed))
         if len(asked) == 0 or int((~learned.silent).sum()) < least:
             continue
-        queries, measured = rows.places[asked], rows.decibels[asked]
+        queries, measured = torch.from_numpy(rows.places[asked]), rows.decibels[asked]
         process, _ = fit_powers(learned, site, "auto", seed, haste(budget, HASTY, len(learned.places)))
-        without = process.mean_and_variance(queries)[0] - measured
+        without = process.mean_at(queries).numpy() - measured
         found = shadowed(learned, site, settings, seed, budget, known)
         if found is not None:
             process, _ = conditioned(learned, found[0], found[1], seed)
-        error = process.mean_and_variance(queries)[0] - measured
+        error = process.mean_at(queries).numpy() - measured
         parts.append((error**2, without**2, group[asked]))
     if not parts:
         return None
@@ -465,7 +449,7 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
     still = [float(v) for v in state["still"]]
     names = ("means", "log_scales", "turns", "log_strengths")
     two = len(state["log_lengths"]) == 2
-    kernel = PowerKernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
+    kernel = Kernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
     most = torch.as_tensor(state.get("most", math.inf)).double()
     field = PowerField(
         site, trend_of(state), kernel, Blockers(*(state[name] for name in names), most=most),
@@ -478,9 +462,7 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
     field.alone = state["alone"].numpy()
     field.at = state["at"].numpy() if "at" in state else field.at  # earlier versions had no such processes
     if "process" in state:
-        process = restored_process(state["process"])
-        trend, _ = field.prior()
-        field.process = replace(process, trend=trend)
+        field.process = PowerProcess.read(state["process"]).about(field.prior()[0])
     return field
 
 

@@ -18,13 +18,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.methods.distance_law import Rows
-from gsparc.methods.power_kernel import PowerKernel, inverse_of
-from gsparc.methods.power_process import PowerProcess, conditioned, draw, exact
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.trend import Trend
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.left_out import left_out, left_out_group
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
+from gsparc.processes.trend import Trend
 
 SOLUTIONS, FOLDS = 20, 5
 SIDES = 8  # squares along the longer side
@@ -162,7 +163,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 def find_fringes(
     rows: Rows,
     numbers: np.ndarray,
-    plain: tuple[Trend, PowerKernel],
+    plain: tuple[Trend, Kernel],
     wavelength: float,
     seed: int,
     budget: TimeBudget | None,
@@ -191,7 +192,7 @@ def find_fringes(
     for k, part in enumerate(folds(group, FOLDS, seed)):
         fold[part] = k
     fold[rng.permutation(count)[: count // PROBES]] = -1
-    process = exact(conditioned(rows, *plain, seed)[0])
+    process = conditioned(rows, *plain, seed)[0].exact()
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None
@@ -239,13 +240,15 @@ def _blend(
     process: PowerProcess,
 ) -> tuple[Blend, Gain]:
     """How to share predictions with a process, and what that gains at places left out."""
-    inverse, _ = inverse_of(np.tril(process.factor) @ np.tril(process.factor).T)
-    probes, distance, error = fold < 0, np.zeros(len(fold)), np.zeros(len(fold))
-    error[probes] = -process.weights[probes] / inverse.diagonal()[probes]
+    exact = process.posterior
+    assert isinstance(exact, Exact)
+    inverse, weights = exact.factor.inverse, exact.weights[:, :1]
+    probes, distance = fold < 0, np.zeros(len(fold))
+    error = np.where(probes, -left_out(inverse, weights)[0][:, 0].numpy(), 0.0)
     distance[probes] = nearest(rows.places)[probes]
     for k in range(FOLDS):
         part, rest = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
-        error[part] = -np.linalg.solve(inverse[np.ix_(part, part)], process.weights[part])
+        error[part] = -left_out_group(inverse, weights, torch.from_numpy(part))[0][:, 0].numpy()
         distance[part] = cKDTree(rows.places[rest]).query(rows.places[part])[0]
     towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
     excess = _excess_variance(powers, fold, blind)

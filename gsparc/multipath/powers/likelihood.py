@@ -1,6 +1,6 @@
 """Leave-one-out likelihood of powers under a process with Gaussians, with autograd.
 
-The covariance is that of `gsparc.methods.power_kernel`; here its slopes go on to the Gaussians.
+The covariance is that of `gsparc.processes.density`; here its slopes go on to the Gaussians.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.methods.power_kernel import PowerKernel
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import Kernel, matern_sum
+from gsparc.processes.left_out import left_out
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """The kernel of `PowerKernel` in logarithms, as tensors.
+    """The kernel of `Kernel` in logarithms, as tensors.
 
     Attributes:
         log_lengths: (1,) or (2,), of metres.
@@ -31,7 +33,7 @@ class Covariance:
     log_amplitude: Tensor
 
     @classmethod
-    def of(cls, kernel: PowerKernel) -> Covariance:
+    def of(cls, kernel: Kernel) -> Covariance:
         """A kernel's, float64."""
         shares = kernel.shares
         logit = math.log(shares[0] / shares[1]) if len(shares) == 2 else 0.0
@@ -50,12 +52,9 @@ class Covariance:
             distance: (n, n) [m].
             terms: (n, P) of the mean law and the Gaussians.
         """
-        total = terms @ terms.T
         first = torch.sigmoid(self.share_logit)
         shares = [first, 1 - first] if len(self.log_lengths) == 2 else [torch.ones_like(first)]
-        for log_length, share in zip(self.log_lengths, shares, strict=True):
-            far = distance * (math.sqrt(3) * torch.exp(-log_length))
-            total = total + share * (1 + far) * torch.exp(-far)
+        total = matern_sum(distance, list(self.log_lengths.exp()), shares) + terms @ terms.T
         return total + self.log_noise.exp() * torch.eye(len(terms), dtype=terms.dtype)
 
 
@@ -71,10 +70,9 @@ def left_out_losses(gram: Tensor, values: Tensor, log_amplitude: Tensor) -> Tens
         log_amplitude: () of dB^2.
 
     Raises:
-        torch.linalg.LinAlgError: the covariance is not positive definite.
+        NotPositiveDefiniteError: the covariance is not positive definite.
     """
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
-    share = inverse.diagonal()
-    log_variance = log_amplitude - share.log()
-    squared = ((inverse @ values) / share).square()
-    return 0.5 * (math.log(2 * math.pi) + log_variance + squared * torch.exp(-log_variance))
+    inverse = Factor.of(gram, "raise").inverse
+    residual, variance = left_out(inverse, inverse @ values)
+    log_variance = log_amplitude + variance.log()
+    return 0.5 * (math.log(2 * math.pi) + log_variance + residual.square() * torch.exp(-log_variance))

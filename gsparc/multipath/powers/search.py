@@ -18,12 +18,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from gsparc.methods.distance_law import Rows
-from gsparc.methods.power_kernel import PowerKernel, choose, inverse_of
+from gsparc.methods.power_settings import _by_left_out
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.trend import Trend
-from gsparc.methods.worker import stop_when_late
 from gsparc.multipath.powers.blockers import Blockers, Place
+from gsparc.processes.density import gram_of
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.powers import Rows
+from gsparc.processes.trend import Trend
+from gsparc.processes.worker import stop_when_late
 
 CANDIDATES = 3_000  # drawn for each Gaussian
 ODDS = 20.0  # that the best of them must be worth against nothing
@@ -109,8 +112,8 @@ def drawn(seen: Seen, count: int, rng: np.random.Generator) -> Blockers:
 
 
 def search(
-    seen: Seen, kernel: PowerKernel, most: int, seed: int, budget: TimeBudget | None = None
-) -> tuple[Blockers, PowerKernel, float]:
+    seen: Seen, kernel: Kernel, most: int, seed: int, budget: TimeBudget | None = None
+) -> tuple[Blockers, Kernel, float]:
     """Gaussians, the kernel with them, and the log evidence that they add.
 
     Args:
@@ -124,7 +127,8 @@ def search(
     values = torch.from_numpy(seen.values)
     while len(found) < most and not (budget and budget.over()):
         terms = np.c_[seen.terms, found.terms(seen.places, seen.still).numpy()]
-        inverse = torch.from_numpy(inverse_of(kernel.gram(seen.distance, terms))[0] / kernel.amplitude)
+        gram = gram_of(torch.from_numpy(kernel.parameters()), torch.from_numpy(seen.distance), torch.from_numpy(terms))
+        inverse = Factor.of(gram).inverse / kernel.amplitude
         pool = drawn(seen, CANDIDATES, rng)
         first = gains(inverse, values, pool.shadows(seen.places, seen.still))[0].topk(POLISHED).indices
         worth, one = max((_polished(_at(pool, i), seen, inverse) for i in first), key=lambda pair: pair[0])
@@ -133,7 +137,7 @@ def search(
         strength = gains(inverse, values, one.shadows(seen.places, seen.still))[1] / kernel.amplitude
         found, total = found.joined(replace(one, log_strengths=0.5 * strength.log())), total + worth
         terms = np.c_[seen.terms, found.terms(seen.places, seen.still).numpy()]
-        kernel = choose([kernel], seen.distance, terms, seen.values)[1]
+        kernel = _by_left_out([kernel], torch.from_numpy(seen.distance), torch.from_numpy(terms), values[:, None])[1]
     return found.within(seen.places, seen.still), kernel, total
 
 

@@ -11,7 +11,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
+import torch
+from scipy.linalg import eigh
+
+from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 
 WAVES = 800  # on the sphere: twelve wavelengths of places are resolved
 KEPT = 1e-3  # eigenvalues kept, of the largest
@@ -138,10 +141,11 @@ def _step(
         damped = normal.copy()
         damped[diagonal] += damping * middle
         try:
-            by = -cho_solve(cho_factor(damped, lower=True, overwrite_a=True), right)
-        except LinAlgError:  # rounding: more damping mends it
+            factor = Factor.of(torch.from_numpy(damped), "raise")
+        except NotPositiveDefiniteError:  # rounding: more damping mends it
             damping *= 4
             continue
+        by = -factor.solved(torch.from_numpy(right)[:, None])[:, 0].numpy()
         better = _Misfit.of(columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale)
         if better.value < now.value:
             return better, max(damping / 3, 1e-5)

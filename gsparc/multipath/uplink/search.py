@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gsparc.multipath.uplink.posterior import Sources
 from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
+from gsparc.processes.factor import Factor
 
 LEAST_SHARE = 1e-7  # of a snapshot's power, lower bound of a source's prior against division by zero
 UNEXPLAINED = 0.2  # of a round's residual that counts as noise: sources not found yet bias those found
@@ -111,8 +112,8 @@ class SourceSearch:
         """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on the residual of the best gains."""
         n = fit.gain.shape[1]
         reach = self._reach(n)
-        factor, _ = torch.linalg.cholesky_ex(self._scaled(fit, noise))
-        step = torch.cholesky_solve((fit.slope * reach)[..., None], factor)[..., 0] * reach
+        factor = Factor.of(self._scaled(fit, noise), "ignore")
+        step = factor.solved((fit.slope * reach)[..., None])[..., 0] * reach
         turned = step[:, : 2 * n].view(-1, 2, n).transpose(1, 2).clamp(-LARGEST_STEP[0], LARGEST_STEP[0])
         return turned, step[:, 2 * n :].clamp(-LARGEST_STEP[1], LARGEST_STEP[1])
 

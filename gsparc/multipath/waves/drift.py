@@ -14,10 +14,11 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from gsparc.methods.worker import stop_when_late
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, specular, temporal
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import groups_of, left_out_signal
+from gsparc.processes.worker import stop_when_late
 
 STRETCH = 400  # rows looked at
 COLUMNS = 3  # groups looked at
@@ -91,24 +92,12 @@ def left_out_cells(group: Group, signal: Tensor, other: Tensor, cells: list[np.n
         cells: numbers (n,) of cells.
     """
     other = other.to(torch.complex128)
-    inverse = torch.cholesky_inverse(cholesky(signal + other))
-    return [_left_out(group, other, inverse, cell) for cell in cells]
-
-
-def _left_out(group: Group, other: Tensor, inverse: Tensor, cell: np.ndarray) -> Tensor:
-    alpha = inverse @ group.target
-    known = group.target - other @ alpha
-    mixed = other @ inverse
-    if len(np.unique(cell)) == len(cell):
-        own = (1 - mixed.diagonal()) / inverse.diagonal()
-        return group.target - known + own[:, None] * alpha
-    error = torch.empty_like(alpha)
-    for number in np.unique(cell):
-        mine = torch.from_numpy(np.flatnonzero(cell == number))
-        share = torch.eye(len(mine), dtype=torch.complex128) - mixed[mine[:, None], mine]
-        own = torch.linalg.solve(inverse[mine[:, None], mine], alpha[mine])
-        error[mine] = group.target[mine] - (known[mine] - share @ own)
-    return error
+    inverse = Factor.of(signal + other).inverse
+    alpha, found = inverse @ group.target, []
+    for cell in cells:
+        own = None if len(np.unique(cell)) == len(cell) else groups_of(cell)
+        found.append(left_out_signal(inverse, alpha, other, own)[0])
+    return found
 
 
 def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
@@ -125,11 +114,11 @@ def _likelihood(
 ) -> tuple[float, np.ndarray]:
     """Negative log likelihood with the scale profiled, and its slope by the terms' powers."""
     covariance = signal + sum(float(level) * term for level, term in zip(power, terms, strict=True))
-    lower = cholesky(covariance)
-    inverse = torch.cholesky_inverse(lower)
+    factor = Factor.of(covariance)
+    inverse = factor.inverse
     alpha = inverse @ group.target
     count, outputs = group.target.shape
     scale = float((group.target.conj() * alpha).real.mean())
-    nll = outputs * (count * math.log(scale) + 2 * float(lower.diagonal().real.log().sum()))
+    nll = outputs * (count * math.log(scale) + float(factor.log_determinant))
     weight = outputs * inverse - alpha @ alpha.mH / scale
     return nll, np.array([float((term * weight.mT).sum().real) for term in terms])

@@ -19,8 +19,6 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from gsparc.methods.worker import stop_when_late
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import (
     Shape,
@@ -32,6 +30,9 @@ from gsparc.multipath.waves.covariance import (
     ways,
 )
 from gsparc.multipath.waves.kernels import envelope, plain, smooth
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out
+from gsparc.processes.worker import stop_when_late
 
 FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
@@ -236,14 +237,13 @@ def solved(part: Compressed, power: Tensor) -> Solved:
     for level, term in zip(power[room:], part.terms, strict=False):
         covariance = term.added(covariance, level)
     covariance.diagonal().add_(noise)
-    lower = cholesky(covariance)
-    inverse = torch.cholesky_inverse(lower)
+    factor = Factor.of(covariance)
+    inverse = factor.inverse
     alpha = inverse @ part.target
     count, outputs = part.group.target.shape
     quadratic = float((part.target.conj() * alpha).real.sum()) + part.rest / float(noise)
     scale = max(quadratic / (count * outputs), 1e-300)
-    determinant = 2 * float(lower.diagonal().real.log().sum())
-    determinant += (count - len(lower)) * math.log(float(noise))
+    determinant = float(factor.log_determinant) + (count - len(covariance)) * math.log(float(noise))
     return Solved(outputs * (count * math.log(scale) + determinant), inverse, alpha, scale)
 
 
@@ -341,12 +341,12 @@ def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:
     alpha = wide @ at.alpha + (part.group.target - wide @ part.target) / noise
     if len(np.unique(cell)) == len(cell):
         own = ((wide @ at.inverse) * wide.conj()).sum(1) + (1 - wide.abs().square().sum(1)) / noise
-        return alpha / own[:, None]
+        return left_out(own.real, alpha)[0]
     error = torch.empty_like(alpha)
     for number in np.unique(cell):
         mine = torch.from_numpy(np.flatnonzero(cell == number))
         own = wide[mine]
         block = own @ (at.inverse @ own.mH) - own @ own.mH / noise
         block.diagonal().add_(1 / noise)
-        error[mine] = torch.linalg.solve(block, alpha[mine])
+        error[mine] = Factor.of(block).solved(alpha[mine])
     return error

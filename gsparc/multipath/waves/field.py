@@ -15,7 +15,6 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.run_factors import RunFactors, aligning, run_quadratic
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group, Slot, asked, gather, of_runs, static_place
 from gsparc.multipath.waves.common import Common
 from gsparc.multipath.waves.covariance import (
@@ -30,6 +29,8 @@ from gsparc.multipath.waves.covariance import (
     specular,
 )
 from gsparc.ops import Pose
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out, left_out_signal
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
@@ -42,7 +43,7 @@ class Weights:
 
     Attributes:
         group: with targets in the phase and level of the largest run.
-        lower: (n, n) complex128, Cholesky factor of the covariance.
+        factor: of the covariance (n, n) complex128.
         alpha: (n, D) complex128, its inverse times the targets.
         scale: power that the covariance is in units of.
         noise: least variance of a prediction, in these units.
@@ -50,7 +51,7 @@ class Weights:
     """
 
     group: Group
-    lower: Tensor
+    factor: Factor
     alpha: Tensor
     scale: float
     noise: float
@@ -62,8 +63,9 @@ class Weights:
 
         A row's covariances c with all rows, its noise included, have c^H C^-1 c = C_ii: that tells the error.
         """
-        lower = self.lower.real if self.is_real else self.lower
-        root = torch.linalg.solve_triangular(lower, torch.eye(len(lower), dtype=lower.dtype), upper=False)
+        whole = self.factor.lower
+        lower = whole.real.contiguous() if self.is_real else whole
+        root = Factor(lower).root
         few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
         short = root.to(torch.float32 if self.is_real else torch.complex64)
         found = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)
@@ -173,9 +175,9 @@ class ChannelField(ConditionalField):
             run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
             places = slot.places(moving[here], turned[here])
             group = Group(slot, here, places, _entries(target, here, slot), run, order)
-            inverse = torch.linalg.inv(_covariances((group,), shape, values)[0])
-            variance = known.scale / inverse.diagonal().real
-            error = (inverse @ group.target) / inverse.diagonal()[:, None]
+            inverse = Factor.of(_covariances((group,), shape, values)[0]).inverse
+            error, variance = left_out(inverse, inverse @ group.target)
+            variance = known.scale * variance
             density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
             outputs = group.target.shape[1]
             total = total.index_add(0, here, density * outputs / 2)
@@ -201,18 +203,18 @@ class ChannelField(ConditionalField):
     def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
         """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
         shape, values = self.shape, self.values
-        lowers = [cholesky(covariance) for covariance in _covariances(groups, shape, values)]
+        all_factors = [Factor.of(covariance) for covariance in _covariances(groups, shape, values)]
         if factors is None:
             factors = torch.ones(len(runs), dtype=torch.complex128)
             if len(runs) > 1:
-                factors = of_runs(_factors(groups, lowers, len(runs)), groups)
+                factors = of_runs(_factors(groups, all_factors, len(runs)), groups)
         self.runs = RunFactors(runs, factors)
         found, noise = [], float(shape.of("noise", values.power))
-        for group, lower in zip(groups, lowers, strict=True):
+        for group, factor in zip(groups, all_factors, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])
-            alpha = torch.cholesky_solve(aligned.target, lower)
+            alpha = factor.solved(aligned.target)
             scale = float((aligned.target.conj() * alpha).real.mean())
-            found.append(Weights(aligned, lower, alpha, max(scale, 1e-300), noise, shape.is_real))
+            found.append(Weights(aligned, factor, alpha, max(scale, 1e-300), noise, shape.is_real))
         self.weights = tuple(found)
         self.stations = {}
         for known in found:
@@ -344,13 +346,10 @@ class ChannelField(ConditionalField):
         with torch.no_grad():
             for known in self._conditioned():
                 group, outputs = known.group, known.alpha.shape[1]
-                inverse = torch.cholesky_inverse(known.lower)
-                # With C = S + N: S_i,-i C_-i^-1 y_-i = y - (N + D) C^-1 y; D takes away its own weight.
                 other = disturbance(shape, values, group).to(torch.complex128)
-                own = (1 - (other * inverse.mT).sum(1)) / inverse.diagonal()
-                rest = other + torch.diag(own)
-                predicted = group.target - rest @ known.alpha
-                error = (rest * (rest @ inverse).conj()).sum(1).real
+                residual, error = left_out_signal(known.factor.inverse, known.alpha, other)
+                assert error is not None
+                predicted = group.target - residual
                 group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
                 level = known.scale * outputs * self.runs.factors[group.run].abs().square()
                 variance.index_add_(0, group.rows, error * level)
@@ -435,11 +434,11 @@ def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:
     return whole[rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(rows), -1)
 
 
-def _factors(groups: tuple[Group, ...], lowers: list[Tensor], runs: int) -> Tensor:
+def _factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) -> Tensor:
     """Factors of runs (runs,), as measured over the largest one's."""
     quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
-    for group, lower in zip(groups, lowers, strict=True):
-        inverse, run = torch.cholesky_inverse(lower).numpy(), group.run.numpy()
+    for group, factor in zip(groups, factors, strict=True):
+        inverse, run = factor.inverse.numpy(), group.run.numpy()
         level = float(group.target.abs().square().mean())
         own = run_quadratic(inverse, group.target.numpy(), run) / max(level, 1e-300)
         quadratic[: len(own), : len(own)] += own

@@ -20,9 +20,7 @@ from gsparc.data.schema import Measurements
 from gsparc.methods.haste import factor_s
 from gsparc.methods.run_factors import aligning, run_quadratic
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.worker import Ended, ended_by
 from gsparc.multipath.complex_gp import CHOSEN_ON, LENGTHS, NOISES
-from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves import drift
 from gsparc.multipath.waves.columns import Group, ends_of, gather, of_runs, thinned
 from gsparc.multipath.waves.covariance import BEYOND, Shape, Values, disturbance
@@ -43,6 +41,8 @@ from gsparc.multipath.waves.kernels import cells, directions, plain
 from gsparc.multipath.waves.mirrors import find_mirrors
 from gsparc.multipath.waves.offset import best_offset
 from gsparc.multipath.waves.settings import ChannelSettings
+from gsparc.processes.factor import Factor
+from gsparc.processes.worker import Ended, ended_by
 
 COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on at most
 ENDS = 64  # of several static ends, those that powers are learned on in the end
@@ -158,11 +158,11 @@ def _grid_point(
     for group, kernel in zip(groups, kernels, strict=True):
         covariance = kernel.clone()
         covariance.diagonal().add_(noise)
-        solved.append(cholesky(covariance))
+        solved.append(Factor.of(covariance))
         if runs > 1:
             level = float(group.target.abs().square().mean())
             run = group.run.numpy()
-            own = run_quadratic(torch.cholesky_inverse(solved[-1]).numpy(), group.target.numpy(), run)
+            own = run_quadratic(solved[-1].inverse.numpy(), group.target.numpy(), run)
             total[: len(own), : len(own)] += own / max(level, 1e-300)
             size += np.bincount(run, minlength=runs) * group.target.shape[1]
     factors = np.ones(runs, np.complex128)
@@ -170,12 +170,11 @@ def _grid_point(
     if runs > 1:
         factors[heard] = aligning(total[np.ix_(heard, heard)], size[heard])
     turn, nll = of_runs(torch.from_numpy(factors), groups), 0.0
-    for group, lower in zip(groups, solved, strict=True):
+    for group, factor in zip(groups, solved, strict=True):
         target = group.target * turn[group.run][:, None]
-        white = torch.cat([target.real, target.imag], 1)
         count, outputs = target.shape
-        fit = float((white * torch.cholesky_solve(white, lower)).sum()) / (count * outputs)
-        nll += outputs * (count * math.log(max(fit, 1e-300)) + 2 * float(lower.diagonal().log().sum()))
+        fit = float((target.conj() * factor.solved(target)).real.sum()) / (count * outputs)
+        nll += outputs * (count * math.log(max(fit, 1e-300)) + float(factor.log_determinant))
         nll -= 2 * outputs * float(turn.abs().log()[group.run].sum())
     return nll, 1 / turn
 

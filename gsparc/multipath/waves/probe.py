@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.evidence import Compressed, solved
+from gsparc.processes.factor import Factor
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Probe:
         at, basis = solved(part, power), part.basis.to(torch.complex128)
         noise = float(power[len(part.room) + len(part.terms)])
         alpha = basis @ at.alpha + (part.group.target - basis @ part.target) / noise
-        root = basis @ torch.linalg.cholesky(at.inverse + 1e-12 * torch.eye(len(at.inverse)))
+        root = basis @ Factor.of(at.inverse + 1e-12 * torch.eye(len(at.inverse))).lower
         return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
 
     def known(self, waves: Tensor) -> Tensor:

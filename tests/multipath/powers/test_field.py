@@ -22,7 +22,7 @@ from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.power_process import fit_powers
 from gsparc.methods.registry import field_initialiser
-from gsparc.methods.trend import Trend
+from gsparc.processes.trend import Trend
 from gsparc.multipath.powers import field as powers
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.field import (

@@ -21,7 +21,6 @@ from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.per_station import SAME_PLACE_M
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.trend import REACH
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.together import posterior as joint
 from gsparc.multipath.powers.together.law import fit_site_law
@@ -31,6 +30,7 @@ from gsparc.multipath.powers.together.prior import Prior, restored_prior
 from gsparc.multipath.powers.together.rows import Heard, heard_rows, is_together, places_of, thinned
 from gsparc.multipath.powers.together.unheard import for_unheard
 from gsparc.ops import Pose
+from gsparc.processes.powers import REACH
 
 QUERIES = 512  # at a time: memory
 MOST_EACH = 6_000  # rows of a station

@@ -12,12 +12,13 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.methods.worker import stop_when_late
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.together.law import SiteLaw
 from gsparc.multipath.powers.together.posterior import End, Factored, left_out_of, weights_of
 from gsparc.multipath.powers.together.prior import LENGTHS, OWN, Prior
 from gsparc.multipath.powers.together.rows import Heard
+from gsparc.processes.factor import NotPositiveDefiniteError
+from gsparc.processes.worker import stop_when_late
 
 LOOKS = 40
 STARTS = (0.1, 1.0)  # lengths, of the median distance between places
@@ -129,7 +130,7 @@ def _walk(
         x = torch.from_numpy(at).requires_grad_()
         try:
             value = loss(named(x))
-        except torch.linalg.LinAlgError:  # in float64: as bad as it gets
+        except NotPositiveDefiniteError:  # in float64: as bad as it gets
             return BAD, np.zeros_like(at)
         (slope,) = torch.autograd.grad(value, x)
         return float(value.detach()), slope.numpy()
@@ -157,10 +158,10 @@ def _ends(prior: Prior, rows: Heard) -> list[End]:
 def left_out_loss(prior: Prior, ends: list[End]) -> Tensor:
     """Negative log density () [nats] of all rows, each given all others, with autograd."""
     factored = [Factored.of(end, prior) for end in ends]
-    lower, mean = weights_of(factored)
+    shared, mean = weights_of(factored)
     total = prior.own.new_zeros(())
     for one in factored:
-        error, variance = left_out_of(one, lower, mean)
+        error, variance = left_out_of(one, shared, mean)
         total = total + 0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi)).sum()
     return total
 

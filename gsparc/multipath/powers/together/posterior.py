@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.methods.censored_ep import condition, propagate
 from gsparc.multipath.powers.together.prior import Prior, restored_prior
 from gsparc.multipath.powers.together.rows import Heard
+from gsparc.processes.censored import ConditionalGaussian, propagate
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out
 
 NEVER = -1  # in place of a station's number: one that was never heard
 
@@ -63,12 +65,12 @@ class Factored:
     """An end's covariance, factored.
 
     Attributes:
-        lower: (n, n) Cholesky factor without the shared columns.
+        factor: of the covariance (n, n) without the shared columns.
         whitened: (n, P) columns, `lower`^-1 of them.
         values: (n,) likewise.
     """
 
-    lower: Tensor
+    factor: Factor
     whitened: Tensor
     values: Tensor
 
@@ -77,40 +79,32 @@ class Factored:
         """Under a prior, with autograd.
 
         Raises:
-            torch.linalg.LinAlgError: the covariance is not positive definite.
+            NotPositiveDefiniteError: the covariance is not positive definite.
         """
         columns, lacks = prior.shared(end.moving, end.decades, end.shadows)
-        lower = torch.linalg.cholesky(end.gram(prior, lacks))
-        both = torch.linalg.solve_triangular(lower, torch.cat([columns, end.values[:, None]], 1), upper=False)
-        return cls(lower, both[:, :-1], both[:, -1])
+        factor = Factor.of(end.gram(prior, lacks), "raise")
+        both = factor.whitened(torch.cat([columns, end.values[:, None]], 1))
+        return cls(factor, both[:, :-1], both[:, -1])
 
 
-def weights_of(factored: list[Factored]) -> tuple[Tensor, Tensor]:
-    """Cholesky factor (P, P) of the precision of the shared weights, and their mean (P,)."""
+def weights_of(factored: list[Factored]) -> tuple[Factor, Tensor]:
+    """Factor of the precision (P, P) of the shared weights, and their mean (P,)."""
     first = factored[0].whitened
     precision = torch.eye(first.shape[1], dtype=first.dtype)
     right = first.new_zeros(first.shape[1])
     for one in factored:
         precision = precision + one.whitened.T @ one.whitened
         right = right + one.whitened.T @ one.values
-    lower = torch.linalg.cholesky(precision)
-    return lower, torch.cholesky_solve(right[:, None], lower)[:, 0]
+    factor = Factor.of(precision, "raise")
+    return factor, factor.solved(right[:, None])[:, 0]
 
 
-def left_out_of(one: Factored, lower: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Errors (n,) [dB] of an end's rows, each predicted from all others, and their variances (n,) [dB^2].
-
-    With R = K^-1 y and q = diag(K^-1) the error is R / q, the variance 1 / q (Rasmussen and Williams 2006,
-    eq. 5.12).
-    """
-    inverse = torch.linalg.solve_triangular(
-        one.lower, torch.eye(len(one.lower), dtype=one.lower.dtype), upper=False
-    )
-    columns = inverse.T @ one.whitened
-    known = torch.linalg.solve_triangular(lower, columns.T, upper=False)
-    share = inverse.square().sum(0) - known.square().sum(0)
-    weights = inverse.T @ (one.values - one.whitened @ mean)
-    return weights / share, 1 / share
+def left_out_of(one: Factored, shared: Factor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """Errors (n,) [dB] of an end's rows, each predicted from all others, and their variances (n,) [dB^2]."""
+    root = one.factor.root
+    known = shared.whitened((root.T @ one.whitened).T)
+    precision = root.square().sum(0) - known.square().sum(0)
+    return left_out(precision, root.T @ (one.values - one.whitened @ mean))
 
 
 @dataclass
@@ -121,7 +115,7 @@ class Posterior:
         prior: the settings, without gradients.
         ends: by station.
         weights: by station, (n,) of the covariances with its rows.
-        lower: (P, P) Cholesky factor of the precision of the shared weights.
+        shared: factor of the precision (P, P) of the shared weights.
         mean: (P,) of these.
         whole: variance of what was measured, of all ends [dB^2].
     """
@@ -129,7 +123,7 @@ class Posterior:
     prior: Prior
     ends: dict[int, End]
     weights: dict[int, Tensor]
-    lower: Tensor
+    shared: Factor
     mean: Tensor
     whole: float
     _factored: dict[int, Factored] = field(default_factory=dict, repr=False)
@@ -156,7 +150,7 @@ class Posterior:
         one = self._factor(station)
         cross = prior.process(station, moving, end.moving) + terms @ prior.law.terms(end.decades).T
         mean = explained + cross @ self.weights[station]
-        white = torch.linalg.solve_triangular(one.lower, cross.T, upper=False)
+        white = one.factor.whitened(cross.T)
         left = (own - white.square().sum(0)).clamp_min(0.0)
         left = left + self._weights_variance(columns - white.T @ one.whitened)
         return mean, left, (left / self.whole).clamp_max(1.0), explained
@@ -180,7 +174,7 @@ class Posterior:
         """By station errors (n,) [dB] of rows that were heard, each from all others, and variances [dB^2]."""
         found = {}
         for number, end in self.ends.items():
-            error, variance = left_out_of(self._factor(number), self.lower, self.mean)
+            error, variance = left_out_of(self._factor(number), self.shared, self.mean)
             loud = end.extra == 0
             found[number] = error[loud], variance[loud]
         return found
@@ -202,12 +196,12 @@ class Posterior:
         }
         weights = {str(number): value for number, value in self.weights.items()}
         return {
-            "prior": self.prior.state(), "ends": ends, "weights": weights, "lower": self.lower,
+            "prior": self.prior.state(), "ends": ends, "weights": weights, "lower": self.shared.lower,
             "mean": self.mean, "whole": self.whole,
         }  # fmt: skip
 
     def _weights_variance(self, columns: Tensor) -> Tensor:
-        return torch.linalg.solve_triangular(self.lower, columns.T, upper=False).square().sum(0)
+        return self.shared.whitened(columns.T).square().sum(0)
 
     def _factor(self, station: int) -> Factored:
         if station not in self._factored:
@@ -226,7 +220,7 @@ def restored_posterior(state: dict[str, Any]) -> Posterior:
         decades = prior.law.decades(moving, still)
         ends[int(name)] = End(int(name), moving, still, decades, shadows, part["values"], part["extra"])
     weights = {int(name): value for name, value in state["weights"].items()}
-    return Posterior(prior, ends, weights, state["lower"], state["mean"], float(state["whole"]))
+    return Posterior(prior, ends, weights, Factor(state["lower"]), state["mean"], float(state["whole"]))
 
 
 @torch.no_grad()
@@ -243,16 +237,14 @@ def given(rows: Heard, prior: Prior) -> tuple[Posterior, tuple[str, ...], list[n
         kept.append(own)
     if rows.silent.any():
         notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
-    lower, mean = weights_of(list(factored.values()))
+    shared, mean = weights_of(list(factored.values()))
     weights = {
-        number: torch.linalg.solve_triangular(
-            one.lower.T, (one.values - one.whitened @ mean)[:, None], upper=True
-        )[:, 0]
+        number: one.factor.root.T @ (one.values - one.whitened @ mean)
         for number, one in factored.items()
     }
     loud = rows.decibels[~rows.silent] if not rows.silent.all() else rows.decibels
     whole = max(float(loud.var()), float(prior.variance(NEVER)))
-    return Posterior(prior, ends, weights, lower, mean, whole, factored), tuple(notes), kept
+    return Posterior(prior, ends, weights, shared, mean, whole, factored), tuple(notes), kept
 
 
 def _with_pseudo_values(end: End, silent: np.ndarray, prior: Prior) -> tuple[End, np.ndarray]:
@@ -261,23 +253,15 @@ def _with_pseudo_values(end: End, silent: np.ndarray, prior: Prior) -> tuple[End
     They follow from its own rows, with the shared terms as the prior has them.
     """
     columns, lacks = prior.shared(end.moving, end.decades, end.shadows)
-    gram = (end.gram(prior, lacks) + columns @ columns.T).numpy()
-    values = end.values.numpy().copy()
-    extra = np.zeros(len(values))
-    unit = float(np.sqrt(gram.diagonal().mean()))
-    told, level = condition(gram / unit**2, values / unit, silent), values[silent] / unit
-    near = np.flatnonzero(told.uncertain(level))
-    used = np.sort(np.concatenate([np.flatnonzero(~silent), np.flatnonzero(silent)[near]]))
-    if len(near):
-        sites = propagate(told.of(near), level[near])
-        at = np.flatnonzero(silent)[near]
+    gram = end.gram(prior, lacks) + columns @ columns.T
+    values, extra, quiet = end.values.clone(), torch.zeros_like(end.values), torch.from_numpy(silent)
+    unit = float(gram.diagonal().mean().sqrt())
+    known, level = ConditionalGaussian.of(gram / unit**2, values / unit, quiet), values[quiet] / unit
+    near = known.uncertain(level)
+    at = quiet.nonzero()[near, 0]
+    if len(at):
+        sites = propagate(known.at(near), level[near])
         values[at], extra[at] = unit * sites.value, unit**2 * sites.variance
-    parts = (
-        end.moving,
-        end.still,
-        end.decades,
-        end.shadows,
-        torch.from_numpy(values),
-        torch.from_numpy(extra),
-    )
-    return End(end.station, *(part[used] for part in parts)), used
+    used = torch.cat([(~quiet).nonzero()[:, 0], at]).sort().values
+    parts = (end.moving, end.still, end.decades, end.shadows, values, extra)
+    return End(end.station, *(part[used] for part in parts)), used.numpy()

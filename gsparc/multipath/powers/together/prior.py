@@ -19,6 +19,8 @@ from torch import Tensor
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.extinction import extinctions
 from gsparc.multipath.powers.together.law import SiteLaw
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import apart, matern32, matern_sum
 
 JITTER = 1e-6  # of a correlation's diagonal
 TALL = 1e4  # of a Gaussian of the grid, in its widths: places' heights hardly differ against it
@@ -78,11 +80,7 @@ class Prior:
     def process(self, station: int, one: Tensor, other: Tensor) -> Tensor:
         """Covariance (a, b) of an end's own process between places (a, 3) and (b, 3)."""
         settings = self.settings_of(station)
-        distance = torch.cdist(one, other, compute_mode="donot_use_mm_for_euclid_dist")
-        total = torch.zeros_like(distance)
-        for log_length, log_variance in zip(settings[:LENGTHS], settings[LENGTHS:-1], strict=True):
-            total = total + log_variance.exp() * matern(distance, log_length)
-        return total
+        return matern_sum(apart(one, other), list(settings[:LENGTHS].exp()), list(settings[LENGTHS:-1].exp()))
 
     def noise(self, station: int) -> Tensor:
         """Variance () of an end's noise."""
@@ -106,8 +104,7 @@ class Prior:
         if not len(self.inducing):
             return columns, torch.zeros_like(moving[:, 0])
         among = self._place(self.inducing, self.inducing) + JITTER * torch.eye(len(self.inducing)).to(moving)
-        lower = torch.linalg.cholesky(among)
-        known = torch.linalg.solve_triangular(lower, self._place(self.inducing, moving), upper=False).T
+        known = Factor.of(among, "raise").whitened(self._place(self.inducing, moving)).T
         lacks = (1 - known.square().sum(1)).clamp_min(0.0)
         deviation = self.log_shared.mul(0.5).exp()
         return torch.cat([deviation * known, columns], 1), self.log_shared.exp() * lacks
@@ -120,8 +117,7 @@ class Prior:
         return extinctions(moving, still, means, scales, turns)
 
     def _place(self, one: Tensor, other: Tensor) -> Tensor:
-        distance = torch.cdist(one, other, compute_mode="donot_use_mm_for_euclid_dist")
-        return matern(distance, self.log_length)
+        return matern32(apart(one, other), self.log_length.exp())
 
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `restored_prior` needs."""
@@ -149,12 +145,6 @@ def restored_prior(state: Mapping[str, Any]) -> Prior:
         blockers=blockers,
         bend_db=float(state["bend_db"]),
     )
-
-
-def matern(distance: Tensor, log_length: Tensor) -> Tensor:
-    """Matern-3/2 of distances [m], with autograd also at 0."""
-    far = distance * (math.sqrt(3) * torch.exp(-log_length))
-    return (1 + far) * torch.exp(-far)
 
 
 def grid(low: Tensor, high: Tensor, most: int) -> Blockers:

@@ -8,8 +8,9 @@ import numpy as np
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.methods.censored import silent
-from gsparc.methods.distance_law import Rows, seek_place
+from gsparc.methods.distance_law import seek_place
 from gsparc.methods.target_rows import to_real, training_targets
+from gsparc.processes.powers import Rows
 
 
 @dataclass(frozen=True)

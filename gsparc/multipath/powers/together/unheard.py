@@ -20,6 +20,7 @@ from gsparc.multipath.powers.together.learning import with_inducing
 from gsparc.multipath.powers.together.posterior import NEVER, End, Factored
 from gsparc.multipath.powers.together.prior import Prior, grid
 from gsparc.multipath.powers.together.rows import Heard, thinned
+from gsparc.processes.factor import Factor
 
 LEAST_ENDS = 3
 ROWS = 3_600  # of all stations
@@ -156,11 +157,11 @@ def _left_out(views: list[_View], prior: Prior) -> tuple[np.ndarray, float]:
     for view in views:
         gram = (every - view.gram)[used][:, used]
         precision = torch.eye(int(used.sum()), dtype=torch.float64) + scale[:, None] * gram * scale
-        lower = torch.linalg.cholesky(precision)
-        mean = torch.cholesky_solve((scale * (right - view.right)[used])[:, None], lower)[:, 0]
+        factor = Factor.of(precision)
+        mean = factor.solved((scale * (right - view.right)[used])[:, None])[:, 0]
         columns = view.columns[:, used] * scale
         error = view.end.values - columns @ mean
-        unknown = torch.linalg.solve_triangular(lower, columns.T, upper=False).square().sum(0)
+        unknown = factor.whitened(columns.T).square().sum(0)
         ratios.append(float((error.square() / (view.own + unknown)).mean()))
         errors.append((error - error.mean()).numpy())
     return np.concatenate(errors), float(np.mean(ratios))

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.methods.covering import covering
+from gsparc.processes.covering import covering
 
 NEIGHBOURS = 30  # that tell of a place
 WIDER = 0.5  # share of them that are of sparser sets

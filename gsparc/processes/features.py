@@ -1,4 +1,4 @@
-"""Correlations over position, and features whose squared length is the part of a process that is known.
+"""Features of a process whose squared length is the part of it that is known.
 
 A Gaussian process of unit variance and noise s, conditioned on rows X, has at x the mean `phi(x) . w` and the
 variance `1 - |phi(x)|^2` with `phi(x) = C^T k(Z, x)`: C C^T = (K + s)^-1 where Z = X (Rasmussen and Williams
@@ -8,19 +8,18 @@ variance `1 - |phi(x)|^2` with `phi(x) = C^T k(Z, x)`: C C^T = (K + s)^-1 where 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import apart, matern32, smooth_rough
+
 Correlation = Literal["matern32", "smooth_rough"]
 
-ROUGH_SHARE = 0.15  # of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
-ROUGH_RATIO = 1 / 3  # of the lengths
 ENOUGH = 0.5  # of the noise: a row this well known from the places before it is no further place
-ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 JITTER = 1e-8  # of the unit variance: places lie apart, this covers rounding
 LEAST = 1e-12  # eigenvalue below which a feature is none
 
@@ -28,27 +27,14 @@ LEAST = 1e-12  # eigenvalue below which a feature is none
 def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tensor:
     """Correlations (A, B) of unit variance between positions (A, 3) and (B, 3) [m].
 
-    `matern32` has one `length` [m]. `smooth_rough` is a smooth long part, Matern-5/2 of `length`, and a rough
-    short one, Matern-3/2 of a third of it.
-
     Raises:
         ValueError: another name.
     """
-    # Differences are formed before squaring: the expanded form loses millimetres in float32.
-    distance = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
     if name == "matern32":
-        return _matern32(distance * (-math.sqrt(3) / length))
+        return matern32(apart(a, b), length)
     if name != "smooth_rough":
         raise ValueError(f"correlation {name!r} is none of {', '.join(get_args(Correlation))}")
-    rough = _matern32(distance * (-math.sqrt(3) / (ROUGH_RATIO * length)))
-    smooth = distance * (-math.sqrt(5) / length)
-    long = torch.addcmul(torch.sub(ONE, smooth), smooth, smooth, value=1 / 3) * smooth.exp()
-    return torch.lerp(long, rough, ROUGH_SHARE)
-
-
-def _matern32(scaled: Tensor) -> Tensor:
-    """Of minus sqrt(3) lengths: few operations, because single queries cost one call each."""
-    return torch.sub(ONE, scaled) * scaled.exp()
+    return smooth_rough(apart(a, b), length)
 
 
 @dataclass(frozen=True)
@@ -79,29 +65,27 @@ def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most:
     if len(rows) <= most:
         gram = correlation(rows, rows, length, name)
         gram.diagonal().add_(noise)
-        lower = torch.linalg.cholesky(gram)
-        eye = torch.eye(len(rows), dtype=rows.dtype)
-        inverse = torch.linalg.solve_triangular(lower, eye, upper=False)
-        return Whitened(rows, inverse.T.contiguous(), inverse)
-    return with_places(rows[apart(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name)
+        root = Factor.of(gram).root
+        return Whitened(rows, root.T.contiguous(), root)
+    return with_places(rows[farthest(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name)
 
 
 def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Whitened:
     """Features at given places (E, 3) that stand for all rows (n, 3); see `whitened`."""
     own = correlation(places, places, length, name)
     own.diagonal().add_(JITTER)
-    lower = torch.linalg.cholesky(own)
-    seen = torch.linalg.solve_triangular(lower, correlation(places, rows, length, name), upper=False)
+    factor = Factor.of(own)
+    seen = factor.whitened(correlation(places, rows, length, name))
     size, turn = torch.linalg.eigh(seen @ seen.T)
     size = size.clamp_min(LEAST)
     # K_ZZ^-1 - (K_ZZ + K_ZX K_XZ / s)^-1 = L^-T U q / (s + q) U^T L^-1
-    back = torch.linalg.solve_triangular(lower.T, turn, upper=True)
+    back = factor.root.T @ turn
     whitening = back * (size / (noise + size)).sqrt()
     weigh = (turn / (size * (noise + size)).sqrt()).T @ seen
     return Whitened(places, whitening.contiguous(), weigh)
 
 
-def apart(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:
+def farthest(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:
     """Indices of up to `most` rows (n, 3), each the one that those before it tell least about.
 
     It ends when every row's variance given these is at most `enough`: a pivoted Cholesky factorization (Fine

@@ -8,7 +8,7 @@ import torch
 from sklearn.gaussian_process.kernels import Matern
 
 from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior, unknown_share
-from gsparc.field.kernels import apart, correlation, whitened, with_places
+from gsparc.processes.features import apart, correlation, whitened, with_places
 
 LENGTH, NOISE, NAME = 0.4, 0.01, "smooth_rough"
 

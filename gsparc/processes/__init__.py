@@ -1,0 +1,1 @@
+"""Gaussian processes: priors whose covariance terms add, conditioned on rows."""

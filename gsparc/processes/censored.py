@@ -1,0 +1,142 @@
+"""A Gaussian vector of which some entries are known and others only to lie below a level.
+
+Expectation propagation: each factor "below the level" is replaced by a Gaussian that gives the same mean
+and variance together with all others (T. Minka, "Expectation propagation for approximate Bayesian inference",
+UAI 2001; Rasmussen and Williams 2006, section 3.6; for truncated Gaussians J. P. Cunningham et al., "Gaussian
+probabilities and expectation propagation", 2011). Noise belongs to the vector's covariance, so the factors
+are steps; with the noise in the factor, Phi((level - f) / sigma), the fixed point is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.processes.factor import Factor
+
+FAR = -30.0  # standard deviations below which the ratio of density and distribution is a series
+LEAST = 1e-6  # share of its variance that a factor takes away at least: none at all has no pseudo-value
+DAMPING = 0.8
+MOST_SWEEPS = 50
+SETTLED = 1e-3  # standard deviations that no mean moves by any more
+CERTAIN = 4.0  # standard deviations below its level: being told so changes nothing
+
+
+@dataclass(frozen=True)
+class Sites:
+    """Gaussian stand-ins of the factors of m censored rows.
+
+    Attributes:
+        value: (m,) pseudo-measured values.
+        variance: (m,) their variances, beyond the noise.
+        log_evidence: logarithm of the probability of everything that was given.
+        settled: whether the sweeps came to rest.
+    """
+
+    value: Tensor
+    variance: Tensor
+    log_evidence: float
+    settled: bool
+
+
+def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
+    """Of a standard normal cut off above z (n,): minus its mean, and the share of its variance lost."""
+    inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
+    ratio = (-inside.square() / 2 - 0.5 * math.log(2 * math.pi) - torch.special.log_ndtr(inside)).exp()
+    series = -1 / t - t + 2 * t**3  # Abramowitz and Stegun 26.2.12
+    kept = t**2 * (1 - 6 * t**2 + 50 * t**4)
+    lost = torch.where(z < FAR, 1 - kept, ratio * (inside + ratio))
+    return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
+
+
+def propagate(known: ConditionalGaussian, level: Tensor) -> Sites:
+    """Stand-ins for "below `level`" (m,) of the unknown entries of a Gaussian vector."""
+    mean, covariance = known.mean, known.covariance
+    total = covariance.diagonal()
+    value, variance = _sites(mean, total, level)
+    settled, before = False, mean
+    for _ in range(MOST_SWEEPS):
+        factor = Factor.of(covariance + torch.diag(variance), "raise")
+        precision = factor.inverse.diagonal()
+        weights = factor.inverse @ (value - mean)
+        cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
+        cavity = value - weights / precision
+        found, wide = _sites(cavity, cavity_variance, level)
+        settled = bool(((cavity - before).abs() / total.sqrt()).max() < SETTLED)
+        if settled:
+            break
+        before = cavity
+        both = (1 - DAMPING) / variance + DAMPING / wide
+        value = ((1 - DAMPING) * value / variance + DAMPING * found / wide) / both
+        variance = 1 / both
+    apart = cavity_variance + variance
+    evidence = -0.5 * (((value - mean) @ weights) + factor.log_determinant)
+    evidence += torch.special.log_ndtr((level - cavity) / cavity_variance.sqrt()).sum()
+    evidence += 0.5 * (apart.log() + (cavity - value).square() / apart).sum()
+    return Sites(value, variance, float(evidence), settled)
+
+
+def _sites(mean: Tensor, variance: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
+    """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of their lower parts."""
+    deviation = variance.sqrt()
+    ratio, lost = truncated((level - mean) / deviation)
+    return mean - deviation * ratio / lost, variance * (1 - lost) / lost
+
+
+@dataclass(frozen=True)
+class ConditionalGaussian:
+    """Unknown entries given the known ones.
+
+    Attributes:
+        mean: (m,), and covariance (m, m).
+        log_evidence: logarithm of the density of the known ones.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    log_evidence: float
+
+    @classmethod
+    def of(cls, gram: Tensor, values: Tensor, unknown: Tensor) -> ConditionalGaussian:
+        """Of a vector of mean zero.
+
+        Args:
+            gram: (n, n) covariance with noise.
+            values: (n,), read where known.
+            unknown: (n,) bool.
+        """
+        known = ~unknown
+        factor = Factor.of(gram[known][:, known], "raise")
+        white = factor.whitened(torch.cat([gram[known][:, unknown], values[known][:, None]], 1))
+        cross, white = white[:, :-1], white[:, -1]
+        evidence = -0.5 * (white @ white + factor.log_determinant + len(white) * math.log(2 * math.pi))
+        return cls(cross.T @ white, gram[unknown][:, unknown] - cross.T @ cross, float(evidence))
+
+    def uncertain(self, level: Tensor) -> Tensor:
+        """Entries (m,) bool that the known ones leave in doubt to lie below `level` (m,)."""
+        return level - self.mean < CERTAIN * self.covariance.diagonal().sqrt()
+
+    def at(self, kept: Tensor) -> ConditionalGaussian:
+        """The entries `kept` alone."""
+        return ConditionalGaussian(self.mean[kept], self.covariance[kept][:, kept], self.log_evidence)
+
+
+def log_evidence(gram: Tensor, values: Tensor, unknown: Tensor) -> tuple[float, Tensor]:
+    """Logarithm of the probability of known values and of the rest below their levels; slopes by `gram`.
+
+    At the fixed point the stand-ins' own change has no effect (Rasmussen and Williams 2006, section 5.5.2).
+
+    Args:
+        gram: (n, n) covariance with noise.
+        values: (n,) known values, levels where `unknown`.
+        unknown: (n,) bool.
+    """
+    known = ConditionalGaussian.of(gram, values, unknown)
+    sites = propagate(known, values[unknown])
+    extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
+    inverse = Factor.of(gram + torch.diag(extra), "raise").inverse
+    weights = inverse @ values.masked_scatter(unknown, sites.value)
+    return known.log_evidence + sites.log_evidence, 0.5 * (torch.outer(weights, weights) - inverse)

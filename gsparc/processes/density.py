@@ -1,0 +1,156 @@
+"""Settings of a covariance by the density of rows left out, or by evidence, and the walk to the best.
+
+Hyper-parameters of largest leave-one-out density (Rasmussen and Williams 2006, section 5.4.2), by its exact
+slopes: autograd brings them from the covariance to lengths, shares and noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import blas
+from scipy.optimize import minimize
+from torch import Tensor
+
+from gsparc.processes.censored import log_evidence
+from gsparc.processes.factor import Factor, NotPositiveDefiniteError
+from gsparc.processes.kernel import Kernel, matern_sum, unpacked
+from gsparc.processes.worker import stop_when_late
+
+BAD = 1e12  # in place of a density where no Cholesky factor exists
+TINY = np.finfo(float).tiny
+
+
+class LeftOutDensity(torch.autograd.Function):
+    """Negative density of rows left out one by one, and the amplitude that minimises it.
+
+    With R = K^-1 Y and q = diag(K^-1) the error of row i is R_i / q_i, its variance amplitude / q_i (Rasmussen
+    and Williams 2006, eqs. 5.10 to 5.13, over outputs that share K).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, gram: Tensor, values: Tensor, entries: int, bounded: bool) -> tuple[Tensor, Tensor]:
+        """Of values (n, P) with a covariance `gram` (n, n) with noise, relative to the amplitude.
+
+        Args:
+            ctx: of autograd.
+            gram: see there.
+            values: less the mean; coordinates in an orthonormal basis.
+            entries: real numbers of a value, P or more.
+            bounded: adds half the square of the amplitude's excess in nats over the values' variance; without
+                it few rows may choose a long process with next to no noise, good at its neighbours alone.
+
+        Returns:
+            The density [nats per output], and the amplitude.
+        """
+        count, inverse = len(values), Factor.of(gram.detach(), "raise").inverse
+        ratio, share = inverse @ values, inverse.diagonal()
+        squared = ratio.square().sum(1)
+        amplitude = max(float((squared / share).sum()) / (count * entries), TINY)
+        density = 0.5 * count * math.log(2 * math.pi * math.e * amplitude) - 0.5 * float(share.log().sum())
+        least = float(values.square().sum()) / (count * entries) if bounded else amplitude
+        excess = max(math.log(amplitude / max(least, amplitude * 1e-12)), 0.0)
+        steeper = (1 + 2 * excess / count) / (entries * amplitude)
+        ctx.save_for_backward(inverse, ratio, steeper * ratio / share[:, None])
+        ctx.by_share = -0.5 * (steeper * squared / share.square() + 1 / share)
+        found = gram.new_tensor(amplitude)
+        ctx.mark_non_differentiable(found)
+        return gram.new_tensor(density + 0.5 * excess**2), found
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        """dK^-1 = -K^-1 dK K^-1: the slopes by R = K^-1 Y and by diag(K^-1) become one by K."""
+        inverse, ratio, by_ratio = ctx.saved_tensors
+        scaled = (inverse * (-ctx.by_share).sqrt()).numpy()
+        lower = torch.from_numpy(blas.dsyrk(1.0, scaled.T, lower=0, trans=1)).T
+        column = inverse @ by_ratio
+        mixed = column @ ratio.T
+        return slopes[0] * (lower + lower.tril(-1).T - 0.5 * (mixed + mixed.T)), None, None, None
+
+
+class Evidence(torch.autograd.Function):
+    """Negative logarithm of the probability of values, some of them only below a level."""
+
+    @staticmethod
+    def forward(ctx: Any, gram: Tensor, values: Tensor, unknown: Tensor) -> Tensor:
+        """See `log_evidence`."""
+        value, slope = log_evidence(gram.detach(), values, unknown)
+        ctx.save_for_backward(slope)
+        return gram.new_tensor(-value)
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        """By the covariance alone."""
+        return -slopes[0] * ctx.saved_tensors[0], None, None
+
+
+def gram_of(parameters: Tensor, distance: Tensor, columns: Tensor | None = None) -> Tensor:
+    """Covariance (n, n) with noise, relative to the amplitude, differentiable in `Kernel.parameters()`.
+
+    Args:
+        parameters: (2,) or (4,) float64.
+        distance: (n, n) [m].
+        columns: (n, P) of terms with unit normal weights; None: none.
+    """
+    lengths, shares, noise = unpacked(parameters)
+    total = matern_sum(distance, lengths, shares)
+    if columns is not None:
+        total = total + columns @ columns.T
+    return total + noise * torch.eye(len(distance), dtype=distance.dtype)
+
+
+def walked(
+    objective: Callable[[Tensor], Tensor],
+    starts: Sequence[np.ndarray],
+    bounds: Sequence[tuple[float, float]],
+    looks: int,
+    tolerance: float,
+) -> tuple[np.ndarray, float]:
+    """Where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
+
+    Args:
+        objective: of parameters (p,) float64, with autograd.
+        starts: (p,) each.
+        bounds: p of them.
+        looks: most evaluations.
+        tolerance: relative gain of a step that is the last.
+    """
+    low, high = np.array(bounds).T
+
+    def ask(point: np.ndarray) -> tuple[float, np.ndarray]:
+        at = torch.from_numpy(point.copy()).requires_grad_()
+        try:
+            value = objective(at)
+        except NotPositiveDefiniteError:  # in float64: as bad as it gets
+            return BAD, np.zeros(len(point))
+        (slope,) = torch.autograd.grad(value, at)
+        return float(value.detach()), slope.numpy()
+
+    points = [np.clip(start, low, high) for start in starts]
+    start = min(points, key=lambda point: ask(point)[0]) if len(points) > 1 else points[0]
+    found = minimize(
+        ask, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
+        options={"ftol": tolerance, "maxfun": looks}, callback=stop_when_late,
+    )  # fmt: skip
+    return found.x, float(found.fun)
+
+
+def by_left_out(
+    starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
+    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float, entries: int = 1, bounded: bool = True,
+) -> tuple[float, Kernel]:  # fmt: skip
+    """Least negative density of rows left out [nats per output], and its kernel; see `LeftOutDensity`."""
+
+    def objective(at: Tensor) -> Tensor:
+        gram = gram_of(at, distance, columns)
+        return LeftOutDensity.apply(gram, values, entries, bounded)[0] / len(values)  # type: ignore[no-untyped-call]
+
+    best, _ = walked(objective, [one.parameters() for one in starts], bounds, looks, tolerance)
+    with torch.no_grad():
+        gram = gram_of(torch.from_numpy(best), distance, columns)
+        value, amplitude = LeftOutDensity.apply(gram, values, entries, bounded)  # type: ignore[no-untyped-call]
+    return float(value), Kernel.of(best, float(amplitude))

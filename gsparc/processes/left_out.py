@@ -1,0 +1,69 @@
+"""Rows predicted from all others, or from all outside a group (Rasmussen and Williams 2006, eq. 5.12).
+
+Without a group S its residuals are `(K^-1_SS)^-1 (K^-1 Y)_S`, their covariance `(K^-1_SS)^-1`: a small system
+for each group instead of one of all other rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.processes.factor import Factor
+
+
+def left_out(
+    inverse: Tensor, weights: Tensor, groups: Iterable[Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Residuals, shaped as the weights, and their variances (n,).
+
+    Args:
+        inverse: `K^-1` (n, n), or its diagonal (n,) where rows are left out one by one.
+        weights: `K^-1 Y` (n, ...), real or complex.
+        groups: numbers of rows that are left out together, every row in one of them; None: one by one.
+    """
+    if groups is None:
+        precision = inverse if inverse.dim() == 1 else inverse.diagonal().real
+        return weights / precision.view(-1, *[1] * (weights.dim() - 1)), 1 / precision
+    residual, variance = torch.empty_like(weights), torch.empty_like(inverse.diagonal().real)
+    for rows in groups:
+        residual[rows], covariance = left_out_group(inverse, weights, rows)
+        variance[rows] = covariance.diagonal().real
+    return residual, variance
+
+
+def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Residuals (s, R) of rows (s,) left out together, and their covariance (s, s); see `left_out`."""
+    block = Factor.of(inverse[rows[:, None], rows])
+    return block.solved(weights[rows]), block.inverse
+
+
+def left_out_signal(
+    inverse: Tensor, weights: Tensor, disturbance: Tensor, groups: Iterable[Tensor] | None = None
+) -> tuple[Tensor, Tensor | None]:
+    """What the signal of all other rows misses of each (n, R), and its variance (n,) without groups.
+
+    With K = S + N the signal of all rows outside a group is, in it, `y - N K^-1 y - (1 - N K^-1) r` with the
+    residual r of `left_out`: what disturbs others by their order alone is not predicted.
+
+    Args:
+        inverse, weights, groups: as in `left_out`.
+        disturbance: N (n, n), covariance of what is no signal.
+    """
+    if groups is None:
+        own = (1 - (disturbance * inverse.mT).sum(1)) / inverse.diagonal()
+        rest = disturbance + torch.diag(own)
+        return rest @ weights, (rest * (rest @ inverse).conj()).sum(1).real
+    residual, mixed = disturbance @ weights, disturbance @ inverse
+    for rows in groups:
+        own, _ = left_out_group(inverse, weights, rows)
+        residual[rows] += own - mixed[rows[:, None], rows] @ own
+    return residual, None
+
+
+def groups_of(number: np.ndarray) -> list[Tensor]:
+    """Rows of each group by their numbers (n,)."""
+    return [torch.from_numpy(np.flatnonzero(number == one)) for one in np.unique(number)]

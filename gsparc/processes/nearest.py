@@ -1,0 +1,318 @@
+"""A process given very many rows: each place is predicted from the rows nearest to it.
+
+A. V. Vecchia, "Estimation and model identification for continuous spatial processes", J. R. Stat. Soc. B 50
+(1988); A. Datta et al., "Hierarchical nearest-neighbor Gaussian process models for large geostatistical
+datasets", JASA 111 (2016): near rows screen far ones, so that a density given all rows is nearly that given
+the nearest. The mean law's terms, which reach everywhere, are weighed once on rows that cover the site.
+Rows of one place are their mean, with the noise of that mean, which loses nothing. Settings maximise the
+density of rows given their nearest ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
+from torch import Tensor
+
+from gsparc.processes.covering import covering
+from gsparc.processes.density import walked
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import Kernel, apart, bounds_of, matern_sum, unpacked
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood
+from gsparc.processes.posterior import Answer, Posterior
+from gsparc.processes.prior import Prior
+
+COVER = 20_000  # rows that weigh the mean law
+FIRST = 256  # rows of an ordering that condition on each other alone
+BLOCK = 1_024  # systems solved at a time: memory
+LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
+SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
+JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
+LOOKS, SETTLED = 40, 5e-6
+EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
+TINY = 1e-30  # an amplitude has a logarithm
+
+
+def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights (B, k) of near values in the mean at places, and what they take off its variance (B,).
+
+    Args:
+        gram: (B, k, k) covariances of the near values, with their noise.
+        cross: (B, k) of the places with them.
+    """
+    weights = Factor.of(gram, "raise").solved(cross[..., None])[..., 0]
+    return weights, (weights * cross).sum(-1)
+
+
+def weights_of(kernel: Kernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """The same of places (B, D) float64 [m], with autograd, by near rows (B, k, D) of `noise` (B, k)."""
+    gram = kernel.between(near, near)
+    gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
+    return solved(gram, kernel.between(places[:, None], near)[:, 0])
+
+
+@dataclass(frozen=True)
+class Values:
+    """Places, each once, and what was measured there.
+
+    Attributes:
+        places: (n, D) float64 [m].
+        values: (n, P) mean over the rows of a place.
+        count: (n,) float64, rows of each place.
+    """
+
+    places: np.ndarray
+    values: Tensor
+    count: Tensor
+
+    @classmethod
+    def of(cls, places: np.ndarray, values: Tensor) -> Values:
+        """Of rows (n, D), (n, P)."""
+        alone, group, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+        counted = torch.from_numpy(count).to(values.dtype)
+        sums = values.new_zeros(len(alone), values.shape[1]).index_add_(
+            0, torch.from_numpy(group.reshape(-1)), values
+        )
+        return cls(alone, sums / counted[:, None], counted.double())
+
+
+@dataclass(frozen=True)
+class Nearest(Posterior):
+    """Given the nearest of n places.
+
+    Attributes:
+        prior: see there.
+        near: the places.
+        rest: (n, P) values less the mean law, float32 or float64.
+        noise: (n,) variance of each value.
+        terms: (Q, P) and `spread` (Q, Q): weights of the mean law's terms, and their covariance.
+    """
+
+    prior: Prior
+    near: Neighbourhood
+    rest: Tensor
+    noise: Tensor
+    terms: Tensor
+    spread: Tensor
+
+    approximation = f"Vecchia {NEIGHBOURS}"
+
+    @property
+    def places(self) -> Tensor:
+        """See `Posterior`."""
+        return torch.from_numpy(self.near.places)
+
+    def answer(self, queries: Tensor) -> Answer:
+        """See `Posterior`."""
+        return self._answers(queries, None)
+
+    def mean_at(self, queries: Tensor) -> Tensor:
+        """See `Posterior`; which rows are nearest has no gradient."""
+        return torch.cat([self._answer(part, None).mean for part in queries.split(BLOCK)])
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        """See `Posterior`."""
+        found = self._answers(self.places, np.arange(len(self.places)))
+        return found.mean, found.left
+
+    @torch.no_grad()
+    def _answers(self, queries: Tensor, without: np.ndarray | None) -> Answer:
+        blocks = [slice(start, start + BLOCK) for start in range(0, len(queries), BLOCK)]
+        parts = [self._answer(queries[b], None if without is None else without[b]) for b in blocks]
+        return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
+
+    def _answer(self, queries: Tensor, without: np.ndarray | None) -> Answer:
+        row, far = self.near.nearest(queries.detach().numpy(), without)
+        near, index = torch.from_numpy(self.near.places[row]), torch.from_numpy(row)
+        weights, known = weights_of(self.prior.kernel, queries, near, self.noise[index])
+        mean = torch.einsum("bk,bkp->bp", weights.to(self.rest.dtype), self.rest[index])
+        left = 1 + self.prior.kernel.noise - known
+        if self.prior.trend is not None:
+            own = self.prior.columns(queries)
+            about = self.prior.columns(near.flatten(0, 1)).view(*near.shape[:2], -1)
+            unsure = own - torch.einsum("bk,bkp->bp", weights, about)
+            mean = self.prior.mean(queries) + mean + unsure @ self.terms
+            left = left + ((unsure @ self.spread) * unsure).sum(1)
+        return Answer(mean, left.clamp_min(0.0), torch.from_numpy(far))
+
+    def state(self) -> dict[str, Any]:
+        """See `Posterior`."""
+        arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
+        parts = {name: getattr(self, name) for name in ("rest", "noise", "terms", "spread")}
+        return {**self.prior.state(), **arrays, **parts}
+
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> Nearest:
+        """The posterior whose `state()` this was."""
+        near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
+        parts = (state[name] for name in ("rest", "noise", "terms", "spread"))
+        return cls(Prior.read(state), near, *parts)
+
+
+def given(
+    prior: Prior, values: Values, seed: int, more: Values | None = None, extra: Tensor | None = None
+) -> Nearest:
+    """The process given places, with settings as they are.
+
+    Args:
+        prior: see there.
+        values: at least one place.
+        seed: of rows that weigh the mean law.
+        more: pseudo-values of other places, whose variances beyond the noise are `extra` (m,).
+        extra: see `more`.
+    """
+    noise, every = prior.kernel.noise / values.count, values
+    if more is not None and extra is not None:
+        noise = torch.cat([noise, prior.kernel.noise + extra])
+        every = Values(
+            np.concatenate([values.places, more.places]),
+            torch.cat([values.values, more.values]),
+            torch.cat([values.count, more.count]),
+        )
+    near = Neighbourhood.of(every.places, seed)
+    if prior.trend is None:
+        none = torch.zeros(0, every.values.shape[1], dtype=torch.float64)
+        return Nearest(prior, near, every.values, noise, none, none[:, :0])
+    places = torch.from_numpy(every.places)
+    rest = every.values - prior.mean(places)
+    chosen = covering(every.places, COVER, seed)
+    terms, spread = weighed(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
+    return Nearest(prior, near, rest, noise, terms, spread)
+
+
+@torch.no_grad()
+def weighed(
+    prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Posterior mean (Q, P) and covariance (Q, Q) of the mean law's terms, the prior's being the unit matrix.
+
+    Rows in random order condition on their nearest ones in the half before them: what is left of them is
+    white, and of the terms too.
+
+    Args:
+        prior: see there.
+        places, rest, noise: (m, D), (m, P), (m,) as in `Nearest`.
+        seed: of the order.
+    """
+    order = np.random.default_rng(seed).permutation(len(places))
+    places, noise = places[order], noise[torch.from_numpy(order)]
+    at, kernel = torch.from_numpy(places), prior.kernel
+    both = torch.cat([rest[torch.from_numpy(order)], prior.columns(at)], 1)
+    first = min(FIRST, len(places))
+    gram = kernel.between(at[:first], at[:first])
+    gram.diagonal().add_(noise[:first])
+    white = [Factor.of(gram, "raise").whitened(both[:first])]
+    start = first
+    while start < len(places):
+        tree, end = cKDTree(places[:start]), min(2 * start, len(places))
+        for a in range(start, end, BLOCK):
+            block = slice(a, min(a + BLOCK, end))
+            row = tree.query(places[block], k=np.arange(1, min(NEIGHBOURS, tree.n) + 1))[1]
+            shares, known = weights_of(kernel, at[block], at[row], noise[row])
+            left = (1 + noise[block] - known).sqrt()
+            white.append((both[block] - torch.einsum("bk,bkp->bp", shares, both[row])) / left[:, None])
+        start = end
+    flat, outputs = torch.cat(white), rest.shape[1]
+    terms, values = flat[:, outputs:], flat[:, :outputs]
+    precision = Factor.of(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
+    return precision.solved(terms.T @ values), precision.inverse
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Rows with their nearest others.
+
+    Attributes:
+        far, apart: (T, k) and (T, k, k) distances from the near ones, and between these [m].
+        value, near: (T, P) and (T, k, P), less the mean law and its weighed terms; outputs share kernel and
+            amplitude.
+        count, counts: (T,) and (T, k) rows that each value is the mean of.
+    """
+
+    far: Tensor
+    apart: Tensor
+    value: Tensor
+    near: Tensor
+    count: Tensor
+    counts: Tensor
+
+    @classmethod
+    def of(cls, places: Tensor, values: Tensor, counts: Tensor) -> Sample:
+        """Of (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
+        between = apart(places, places)
+        return cls(
+            between[:, 0, 1:], between[:, 1:, 1:], values[:, 0], values[:, 1:], counts[:, 0], counts[:, 1:]
+        )
+
+
+def density_given_nearest(parameters: Tensor, sample: Sample) -> tuple[Tensor, Tensor]:
+    """Negative log density, mean over rows [nats], and the best amplitude, at `Kernel.parameters()`."""
+    lengths, shares, noise = unpacked(parameters)
+    gram = matern_sum(sample.apart, lengths, shares) + torch.diag_embed(noise / sample.counts + JITTER)
+    weights, known = solved(gram, matern_sum(sample.far, lengths, shares))
+    variance = 1 + noise / sample.count - known
+    squared = (sample.value - torch.einsum("tk,tkp->tp", weights, sample.near)).square().mean(1)
+    amplitude = (squared / variance).mean().clamp_min(TINY)
+    # Near rows alone tell no long process of a huge amplitude from one of the values' own.
+    excess = (amplitude / sample.value.square().mean().clamp_min(TINY)).log().clamp_min(0.0)
+    density = 0.5 * (amplitude.log() + variance.log().mean())
+    return density + EXCESS * excess.square() / len(variance), amplitude
+
+
+def most_likely(starts: list[Kernel], sample: Sample, distance: np.ndarray) -> Kernel:
+    """The kernel of largest density of rows given their neighbours, walked to from the best of `starts`.
+
+    Args:
+        starts: all of one number of lengths.
+        sample: the rows.
+        distance: between rows of the whole site [m], for bounds of lengths.
+    """
+    bounds = bounds_of(len(starts[0].lengths), distance)
+    points = [one.parameters() for one in starts]
+    best, _ = walked(lambda at: density_given_nearest(at, sample)[0], points, bounds, LOOKS, SETTLED)
+    with torch.no_grad():
+        amplitude = float(density_given_nearest(torch.from_numpy(best), sample)[1])
+    return Kernel.of(best, amplitude)
+
+
+def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
+    """The kernel most likely by rows that cover the site, given their neighbours, and what is to be said.
+
+    Neighbours are looked for among all places, among an eighth of them, and so on: what is near shows the
+    short length, what is sparse the long one.
+
+    Args:
+        prior: mean law, and a kernel chosen on few rows.
+        values: where something was heard.
+        seed: of what is drawn.
+    """
+    count, start = len(values.places), prior.kernel
+    if count <= NEIGHBOURS:
+        return start, f"settings of {count} places, as they were"
+    chosen = covering(values.places, COVER, seed)
+    every = torch.from_numpy(values.places)
+    rest = values.values - prior.mean(every)
+    noise = start.noise / values.count[chosen]
+    about, _ = weighed(prior, values.places[chosen], rest[chosen], noise, seed)
+    rest = rest - prior.columns(every) @ about
+    level = Neighbourhood.of(values.places, seed).level
+    sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
+    parts = []
+    for own in sets:
+        row = own[covering(values.places[own], LOOKED_AT // len(sets), seed)]
+        tree = cKDTree(values.places[own])  # the nearest of all is the row itself
+        parts.append(own[tree.query(values.places[row], k=NEIGHBOURS + 1)[1]])
+    rows = np.concatenate(parts)
+    sample = Sample.of(every[rows], rest[rows], values.count[rows])
+    scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
+    long, shares = start.lengths[-1], (0.5, 0.5)
+    starts = [Kernel((long * share, long), shares, start.noise, 1.0) for share in SHORTER]
+    if len(start.lengths) == 2:
+        starts.append(start)
+    said = f"settings chosen on {len(rows)} of {count} places, each given its nearest {NEIGHBOURS}"
+    return most_likely(starts, sample, scale), f"{said} among {' and '.join(str(len(o)) for o in sets)}"

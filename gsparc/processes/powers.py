@@ -1,0 +1,221 @@
+"""Powers in decibels given rows, silent ones included: what a process says of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.processes.censored import ConditionalGaussian, propagate
+from gsparc.processes.covering import covering
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import Nearest, Values, given
+from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.posterior import Exact, Posterior
+from gsparc.processes.prior import Prior
+from gsparc.processes.trend import Law, Trend
+
+MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
+MOST_SILENT = 3_000  # of them, where nothing was heard
+REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Powers and where they were measured.
+
+    Attributes:
+        places: (n, 3) of the moving end, or (n, 6) of both [m].
+        decibels: (n,) powers, or levels where `silent` [dB].
+        silent: (n,) bool, True where nothing was heard.
+    """
+
+    places: np.ndarray
+    decibels: np.ndarray
+    silent: np.ndarray
+
+    def at(self, chosen: np.ndarray) -> Rows:
+        """The rows `chosen`."""
+        return Rows(self.places[chosen], self.decibels[chosen], self.silent[chosen])
+
+    @property
+    def loud(self) -> Rows:
+        """Those that were heard."""
+        return self.at(np.flatnonzero(~self.silent))
+
+    def drawn(self, most: int, seed: int) -> Rows:
+        """At most so many, in their order; at least half of them were heard where as many were."""
+        return self.at(draw(self.silent, most, seed))
+
+
+def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
+    """At most so many rows, sorted; at least half of them were heard where as many were."""
+    rng = np.random.default_rng(seed)
+    loud, quiet = (rng.permutation(np.flatnonzero(one)) for one in (~silent, silent))
+    if len(loud) + len(quiet) > most:
+        share = round(most * len(loud) / (len(loud) + len(quiet)))
+        first = max(share, min(len(loud), most // 2))
+        loud, quiet = loud[:first], quiet[: most - first]
+    return np.sort(np.concatenate([loud, quiet]))
+
+
+def trend_of_rows(rows: Rows, law: Law | None) -> Trend:
+    """About a law; about the mean of what was heard where that is None."""
+    if law is not None:
+        return Trend.about(law, torch.from_numpy(rows.places))
+    return Trend(float((rows if rows.silent.all() else rows.loud).decibels.mean()))
+
+
+@dataclass(frozen=True)
+class PowerProcess:
+    """A process of powers given rows.
+
+    Attributes:
+        posterior: of decibels (P = 1).
+        heard: variance of the rows that were heard, of the amplitude.
+    """
+
+    posterior: Posterior
+    heard: float
+
+    @property
+    def kernel(self) -> Kernel:
+        """Of the prior."""
+        return self.posterior.prior.kernel
+
+    @property
+    def trend(self) -> Trend:
+        """Of the prior."""
+        assert self.posterior.prior.trend is not None
+        return self.posterior.prior.trend
+
+    @property
+    def places(self) -> np.ndarray:
+        """Of the rows (n, 3) or (n, 6) [m]."""
+        return self.posterior.places.numpy()
+
+    def answer(self, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean [dB], variance of a measurement [dB^2], and what is unknown, in [0, 1], each (B,).
+
+        Unknown is the variance as a share of that of the known rows. What the mean law explains of them
+        counts as known near them only: its slope says nothing of places far from all data.
+        """
+        found = self.posterior.answer(queries)
+        own = 1 + self.kernel.noise
+        whole = max(self.heard, own)
+        by_law = 1 - own / whole  # share of that variance
+        unknown = found.left / whole + by_law * (1 - (-(found.nearest / self._reach).square()).exp())
+        return found.mean[:, 0], self.kernel.amplitude * found.left, unknown.clamp_max(1.0)
+
+    @cached_property
+    def _reach(self) -> float:
+        return max(self.posterior.extent * REACH, 1e-9)
+
+    def mean_at(self, queries: Tensor) -> Tensor:
+        """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
+        return self.posterior.mean_at(queries)[:, 0]
+
+    def about(self, trend: Trend) -> PowerProcess:
+        """The same with another object for its mean law."""
+        prior = replace(self.posterior.prior, trend=trend)
+        return replace(self, posterior=replace(self.posterior, prior=prior))  # type: ignore[type-var]
+
+    def exact(self) -> PowerProcess:
+        """One that has covariances between places; of many rows, given some that cover the site."""
+        nearest = self.posterior
+        if not isinstance(nearest, Nearest):
+            return self
+        few = covering(self.places, MOST_ROWS, 0)
+        places, prior = torch.from_numpy(self.places[few]), nearest.prior
+        extra = nearest.noise[few] - prior.kernel.noise
+        return replace(
+            self, posterior=Exact.given(prior, places, nearest.rest[few] + prior.mean(places), extra)
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and numbers that `read` needs."""
+        return {**self.posterior.state(), "heard": self.heard}
+
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> PowerProcess:
+        """The process whose `state()` this was."""
+        kind = Nearest if "level" in state else Exact
+        return cls(kind.read(state), float(state["heard"]))
+
+
+def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
+    """The process given all rows with settings as they are, and what must be said of the silent ones.
+
+    Args:
+        rows: at least one.
+        trend, kernel: the prior.
+        seed: of rows that are drawn where there are too many.
+    """
+    prior = Prior(kernel, trend)
+    if len(rows.places) <= MOST_ROWS or rows.silent.all():
+        return _exact(rows.drawn(MOST_ROWS, seed), prior, seed)
+    loud = rows.loud
+    values = Values.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
+    share = values.count / values.count.sum()
+    middle = (share * values.values[:, 0]).sum()
+    heard = float((share * (values.values[:, 0] - middle).square()).sum()) / kernel.amplitude
+    said = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
+    if not rows.silent.any():
+        return PowerProcess(given(prior, values, seed), heard), (said,)
+    part = rows.drawn(MOST_ROWS, seed)
+    few, notes = _exact(part, prior, seed)
+    posterior = few.posterior
+    assert isinstance(posterior, Exact)
+    quiet = posterior.extra > 0
+    stand_ins = Values(
+        posterior.rows[quiet].numpy(),
+        posterior.values()[quiet],
+        torch.ones(int(quiet.sum()), dtype=torch.float64),
+    )
+    of = f"of {int(rows.silent.sum())} silent rows {int(part.silent.sum())}, drawn evenly, are looked at"
+    nearest = given(prior, values, seed, stand_ins, posterior.extra[quiet])
+    return PowerProcess(nearest, heard), (said, of, *notes)
+
+
+def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
+    notes: list[str] = []
+    if rows.silent.any():
+        notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
+    places, decibels, extra, used = _with_pseudo_values(rows, prior, seed, notes)
+    posterior = Exact.given(prior, places, decibels[:, None], extra)
+    loud = decibels[extra <= 0]  # below: the mean of several at one place
+    heard = float(loud.var(correction=0)) / prior.kernel.amplitude if len(loud) else 0.0
+    return PowerProcess(posterior, heard), tuple(notes)
+
+
+def _with_pseudo_values(
+    rows: Rows, prior: Prior, seed: int, notes: list[str]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Places, decibels and extra variances, pseudo-values where nothing was heard, and the rows used."""
+    places, decibels = torch.from_numpy(rows.places), torch.from_numpy(rows.decibels)
+    extra, used, silent = torch.zeros_like(decibels), torch.arange(len(decibels)), torch.from_numpy(rows.silent)
+    if not rows.silent.any():
+        return places, decibels, extra, used
+    deviation, mean = math.sqrt(prior.kernel.amplitude), prior.mean(places)[:, 0]
+    gram = prior.between(places, places)
+    gram.diagonal().add_(prior.kernel.noise)
+    unit = (decibels - mean) / deviation
+    known, level = ConditionalGaussian.of(gram, unit, silent), unit[silent]
+    near = known.uncertain(level).nonzero()[:, 0]
+    if len(near) > MOST_SILENT:
+        notes.append(f"{MOST_SILENT} of {len(near)} rows near the level are used, drawn evenly")
+        near = near[np.sort(np.random.default_rng(seed).permutation(len(near))[:MOST_SILENT])]
+    at = silent.nonzero()[near, 0]
+    if len(near):
+        sites = propagate(known.at(near), level[near])
+        decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
+        extra = extra.index_put((at,), sites.variance)
+        if not sites.settled:
+            notes.append("what these rows say had not settled after all sweeps")
+    used = torch.cat([(~silent).nonzero()[:, 0], at]).sort().values
+    return places[used], decibels[used], extra[used], used

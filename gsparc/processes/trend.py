@@ -1,0 +1,95 @@
+"""The mean law of powers, and what of it is uncertain."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+TINY_M = 1e-6  # distance that has a logarithm
+
+
+@dataclass(frozen=True)
+class Law:
+    """`P [dB] = level - 10 exponent log10(max(distance, floor))`.
+
+    Attributes:
+        level: at 1 m [dB of stored units].
+        exponent: n.
+        floor: d0 [m].
+        scale: of the residuals' density [dB].
+        place: of the still end, local [m]; None where both ends move and places are (n, 6).
+    """
+
+    level: float
+    exponent: float
+    floor: float
+    scale: float
+    place: tuple[float, float, float] | None
+
+    def decades(self, places: Tensor) -> Tensor:
+        """log10 of the distance in metres, floored, (n,) at places (n, 3), or of both ends (n, 6) [m]."""
+        still = places[:, 3:] if self.place is None else places.new_tensor(self.place)
+        squared = (places[:, :3] - still).square().sum(1)
+        return 0.5 * torch.log10(squared.clamp_min(max(self.floor, TINY_M) ** 2))
+
+    def mean(self, places: Tensor) -> Tensor:
+        """Powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""
+        return self.level - 10 * self.exponent * self.decades(places)
+
+    def state(self) -> dict[str, list[float]]:
+        """Numbers that `law_of_state` needs."""
+        return {"law": [*astuple(self)[:4]], "law_place": [*(self.place or ())]}
+
+
+def law_of_state(state: dict[str, Any]) -> Law | None:
+    """The law whose `state()` this was; None of none."""
+    values, place = [float(v) for v in state["law"]], [float(v) for v in state["law_place"]]
+    at = (place[0], place[1], place[2]) if place else None
+    return Law(values[0], values[1], values[2], values[3], at) if values else None
+
+
+@dataclass(frozen=True)
+class Trend:
+    """The mean of powers, and what of it is uncertain.
+
+    Attributes:
+        level: the mean where there is no law [dB].
+        law: the distance law, or None.
+        middle, spread: mean and deviation of the rows' decades of distance: its slope is uncertain in these.
+    """
+
+    level: float
+    law: Law | None = None
+    middle: float = 0.0
+    spread: float = 1.0
+
+    @classmethod
+    def about(cls, law: Law, places: Tensor) -> Trend:
+        """About a law that was fitted to rows at places (n, 3) or (n, 6) float64 [m]."""
+        decades = law.decades(places)
+        return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), 1e-6))
+
+    def mean(self, places: Tensor) -> Tensor:
+        """Powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
+        return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
+
+    def terms(self, places: Tensor) -> Tensor:
+        """What is uncertain of the mean: (n, 1), a constant, or (n, 2), also the slope of the law."""
+        one = torch.ones_like(places[:, :1])
+        if self.law is None:
+            return one
+        return torch.cat([one, (self.law.decades(places)[:, None] - self.middle) / self.spread], 1)
+
+    def state(self) -> dict[str, Any]:
+        """Numbers that `trend_of` needs."""
+        law = {"law": [], "law_place": []} if self.law is None else self.law.state()
+        return {"trend": [self.level, self.middle, self.spread], **law}
+
+
+def trend_of(state: dict[str, Any]) -> Trend:
+    """The trend whose `state()` this was."""
+    level, middle, spread = (float(v) for v in state["trend"])
+    return Trend(level, law_of_state(state), middle, spread)
