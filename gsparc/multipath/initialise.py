@@ -21,7 +21,6 @@ from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.known.method import KnownWallsGP
 from gsparc.multipath.known.panels import panels
 from gsparc.multipath.powers import field as power_field
-from gsparc.multipath.powers.field import PowerSettings
 from gsparc.multipath.powers.together import field as joint_field
 from gsparc.multipath.source_field import RayField, SourceField
 from gsparc.multipath.waves import initial as waves
@@ -29,7 +28,6 @@ from gsparc.multipath.waves.settings import ChannelSettings
 
 log = logging.getLogger(__name__)
 
-NO_BLOCKERS = PowerSettings(most=0)
 COMPLETION_SHARE = 0.15  # of the seconds of sources, for that process
 FACTORS = 4.0  # covariances of all rows that it needs at least
 LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
@@ -89,22 +87,18 @@ def diffuse(
 def powers(
     data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
-    """What the path loses in Gaussians, or coherent waves, and a process of the rest.
-
-    Without `clutter` nothing stands in the paths' way. With `init=scene` walls of a file do.
+    """Coherent waves, or what the path loses in walls of a file (`init=scene`), and a process of the rest.
 
     Raises:
         DataError: `init=scene` without a file, or walls that cannot be.
     """
     budget = context.time_budget()
-    none = init.name == "diffuse"
-    settings = PowerSettings(most=0, fringes=False) if none else PowerSettings() if clutter else NO_BLOCKERS
     known = None
     if init.name == "scene":
         known, leaning = panels(read_walls(init.file), data.site.origin)
         if leaning:
             log.info("%d walls that lean are left out: only floors and upright walls take power", leaning)
-    field, notes = power_field.initialise(data, rows, settings, context.seed, budget, known)
+    field, notes = power_field.initialise(data, rows, init.name != "diffuse", context.seed, budget, known)
     field.condition(data, rows)
     return field, FitReport(budget.counted.wall, notes, budget.limited_by)
 

@@ -23,9 +23,9 @@ class EffectSettings(Checked):
         array: spectra arise in the static receiver's array: Gaussians emit fields, the array images them.
         moving_array: the same of a receiver that moves, in powers: sources seen through the array's lags.
         phase: carrier phase from places of sources, for channels.
-        power: distance law and extinction along the path in decibels, for received powers.
-        visibility: what hides: occluding boxes and finite mirrors of sources, Gaussians in the way of powers;
-            rasterized Gaussians always occlude each other.
+        power: distance law in decibels and known walls along the path, for received powers.
+        visibility: what hides: occluding boxes and finite mirrors of sources, known walls of powers and, of
+            several stations, Gaussians in the way; rasterized Gaussians always occlude each other.
         residual: a process in the target's own correlation on what Gaussians leave.
     """
 

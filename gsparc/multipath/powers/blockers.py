@@ -24,7 +24,7 @@ class Blockers:
         turns: (N,) angles from x to their first axes [rad].
         log_strengths: (N,) of the prior's deviation of what each takes of a path straight through it, of the
             square root of the process's amplitude.
-        most: (N,) that each takes of one path, in units of the way straight through it; or one for all, ().
+        most: () that each takes of one path, in units of the way straight through it.
     """
 
     means: Tensor
@@ -41,19 +41,6 @@ class Blockers:
 
     def __len__(self) -> int:
         return len(self.means)
-
-    def joined(self, other: Blockers) -> Blockers:
-        """These and others."""
-        parts = (torch.cat(pair) for pair in zip(self.parts(), other.parts(), strict=True))
-        return Blockers(*parts, most=torch.cat([one.most.expand(len(one)) for one in (self, other)]))
-
-    def within(self, places: Tensor, still: Place | None) -> Blockers:
-        """The same, none of which takes more of any path than it does of the one that loses most in it here.
-
-        Args:
-            places: (n, 3) or (n, 6), and `still`: see `shadows`.
-        """
-        return replace(self, most=self.shadows(places, still).amax(0))
 
     def relative_to(self, amplitude: float) -> Blockers:
         """The same, when strengths are in decibels, in units of a process's amplitude [dB^2]."""

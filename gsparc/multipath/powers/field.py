@@ -1,16 +1,13 @@
-"""The Gaussian field of received powers: what the path loses in Gaussians, and a process of the rest.
+"""The field of received powers: what the path loses in known walls, and a process of the rest.
 
-In decibels: a constant or a distance law, uncertain; Gaussians that the straight path between the ends loses
-power in, their strengths a Gaussian prior (the network shadowing of P. Agrawal and N. Patwari, "Correlated
-link shadow fading in multi-hop wireless networks", IEEE Trans. Wireless Commun. 8 (2009), whose pixels are
-here few, sought, and of any shape); one or two Matern-3/2 of place; noise. Without Gaussians it is
-`model=gp`. Where a wavelength is sampled powers interfere: there coherent waves take the Gaussians' part.
+In decibels: a constant or a distance law, uncertain; Gaussians for walls that the straight path between the
+ends loses power in, their strengths a Gaussian prior; one or two Matern-3/2 of place; noise. Without walls it
+is `model=gp`. Where a wavelength is sampled powers interfere: there coherent waves take the Gaussians' part.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,12 +15,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, setting, switch, whole
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.censored import silent
-from gsparc.methods.haste import UNHURRIED, haste
+from gsparc.methods.haste import haste
 from gsparc.methods.power_settings import LAW_NEEDS, choose_about, choose_prior, fit_powers
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
 from gsparc.methods.time_budget import TimeBudget
@@ -31,7 +27,6 @@ from gsparc.multipath.powers.blockers import Blockers, Place, ShadowedTrend
 from gsparc.multipath.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.likelihood import Covariance, left_out_losses
-from gsparc.multipath.powers.search import Seen, search
 from gsparc.ops import Pose
 from gsparc.processes.covering import covering
 from gsparc.processes.factor import Factor
@@ -42,29 +37,14 @@ from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
 from gsparc.processes.trend import Trend, trend_of
 
 QUERIES = 512  # at a time: memory
-SOUGHT_ON = 600  # rows: each look factors a matrix
+TRIED_ON = 600  # rows: each look factors a matrix
 HASTY = 0.3  # of what is left, for each of the later ones
 CHOOSING = 0.3  # of the seconds, for the settings of the plain process
-SEEK_WITHIN = 0.35  # of a budget: seeking, and trying on groups, takes several times what the process took
 FOLDS = 5
 MOST_ASKED = 4_000  # rows of a fold that are predicted
-SURE = 1.0  # standard errors that the gain of Gaussians at groups of places left out must exceed
+SURE = 1.0  # standard errors that walls may lose at groups of places left out
 RIDGE_STEPS = 5  # of the variance of what is left
-LEAST = 40  # rows that were heard, for seeking Gaussians
-LEAST_KNOWN = 12  # the same, for asking whether known ones pay
-
-
-@dataclass(frozen=True)
-class PowerSettings(Checked):
-    """How a field of powers is found.
-
-    Attributes:
-        most: Gaussians; 0 leaves the plain process.
-        fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
-    """
-
-    most: int = setting(12, whole(0))
-    fringes: bool = setting(True, switch())
+LEAST = 12  # rows that were heard, for asking whether walls pay
 
 
 class PowerField(ConditionalField):
@@ -308,23 +288,23 @@ def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
 def initialise(
     data: Measurements,
     rows: np.ndarray,
-    settings: PowerSettings,
+    fringes: bool = True,
     seed: int = 0,
     budget: TimeBudget | None = None,
     known: Blockers | None = None,
 ) -> tuple[PowerField, tuple[str, ...]]:
     """A field of powers and what must be said of it; `condition` is to follow.
 
-    Gaussians are sought by evidence, and kept where they predict groups of places that were left out better
-    than the plain process does, by more than one standard error; known ones unless they do so much worse.
+    Walls are kept unless they predict groups of places that were left out worse than the plain process does,
+    by more than one standard error.
 
     Args:
         data: powers, of one station where there are several.
         rows: (n,) to learn from, at least one.
-        settings: see there.
-        seed: of rows, candidates and groups that are drawn.
-        budget: no Gaussians are sought beyond it.
-        known: Gaussians that stand for walls, with strengths in decibels; nothing else is sought then.
+        fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
+        seed: of rows, waves and groups that are drawn.
+        budget: walls are not tried beyond it.
+        known: Gaussians that stand for walls, with strengths in decibels; no waves are sought beside them.
 
     Raises:
         ValueError: not powers, several stations, or no rows.
@@ -339,37 +319,27 @@ def initialise(
     pace = haste(budget, CHOOSING, len(rows))
     trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, pace)
     bare = PowerField(data.site, trend, kernel, Blockers.none(), None, seed)
-    if (
-        settings.fringes
-        and known is None
-        and not seen.silent.any()
-        and sampled(seen.places, data.site.wavelength)
-    ):
+    if fringes and known is None and not seen.silent.any() and sampled(seen.places, data.site.wavelength):
         order = np.argsort(rows)
         assert data.site.wavelength is not None
         bare.fringes, said = find_fringes(
             seen.at(order), rows[order], bare.prior(), data.site.wavelength, seed, budget
         )
         return bare, (*notes, said)
-    if not settings.most:
+    if known is None:
         return bare, notes
-    if known is None and int((~seen.silent).sum()) < LEAST:
-        return bare, (*notes, f"no Gaussians: fewer than {LEAST} rows were heard")
-    hurried = pace.rows < min(UNHURRIED.rows, len(rows))
-    if known is None and budget and (hurried or budget.over(SEEK_WITHIN)):
-        return bare, (*notes, "no Gaussians: no time to seek them and to try them on groups of places")
-    found = shadowed(seen, data.site, settings, seed, budget, known)
+    found = shadowed(seen, data.site, seed, budget, known)
     if found is None:
-        return bare, (*notes, "no Gaussians: no candidate in the paths' way explains enough of the powers")
-    gain = gain_of_groups(seen, data.site, settings, seed, budget, known)
-    if gain is None and (known is None or (budget is not None and budget.over())):
+        return bare, (*notes, "no Gaussians: there are no walls, or too few rows were heard")
+    gain = gain_of_groups(seen, data.site, seed, budget, known)
+    if gain is None and budget is not None and budget.over():
         return bare, (*notes, "no Gaussians: no time to try them on groups of places that are left out")
     said = "too few rows for trying them on groups of places that are left out"
     if gain is not None:
         before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
         said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"
         said += f" (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
-        if not gain.exceeds(SURE if known is None else -SURE):
+        if not gain.exceeds(-SURE):
             return bare, (*notes, f"no Gaussians; {said}")
     trend, kernel, more = found
     assert trend.blockers is not None
@@ -379,47 +349,27 @@ def initialise(
 
 
 def shadowed(
-    rows: Rows,
-    site: Site,
-    settings: PowerSettings,
-    seed: int,
-    budget: TimeBudget | None,
-    known: Blockers | None = None,
+    rows: Rows, site: Site, seed: int, budget: TimeBudget | None, known: Blockers
 ) -> tuple[ShadowedTrend, Kernel, tuple[str, ...]] | None:
-    """A prior with Gaussians beside a distance law, and notes; None where no candidate is worth its place.
-
-    Those that are known have theirs, with strengths in decibels.
-    """
+    """A prior with Gaussians of strengths in decibels beside a law, and notes; None: too few rows."""
     loud = rows.at(np.flatnonzero(~rows.silent))
-    few = loud.at(draw(loud.silent, SOUGHT_ON, seed))
-    if len(few.places) < max(LAW_NEEDS, 2) or len(np.unique(few.places[:, :3], axis=0)) < 2:
+    few = loud.at(draw(loud.silent, TRIED_ON, seed))
+    if not len(known) or len(few.places) < max(LAW_NEEDS, 2) or len(np.unique(few.places[:, :3], axis=0)) < 2:
         return None
     plain, kernel, _ = choose_prior(few, site, "distance", seed, haste(budget, HASTY, len(few.places)))
     assert plain.law is not None
-    still = plain.law.place
-    if known is None:
-        blockers, _, _ = search(Seen.of(few, plain, still), kernel, settings.most, seed, budget)
-    else:
-        blockers = known.relative_to(kernel.amplitude)
-    if not len(blockers):
-        return None
-    trend = ShadowedTrend.over(plain, blockers, still)
+    trend = ShadowedTrend.over(plain, known.relative_to(kernel.amplitude), plain.law.place)
     return trend, *choose_about(rows, trend, seed, haste(budget, HASTY, len(rows.places)))
 
 
 def gain_of_groups(
-    rows: Rows,
-    site: Site,
-    settings: PowerSettings,
-    seed: int,
-    budget: TimeBudget | None,
-    known: Blockers | None = None,
+    rows: Rows, site: Site, seed: int, budget: TimeBudget | None, known: Blockers
 ) -> Gain | None:
     """What Gaussians gain over the plain process at groups of places left out; None where time is over.
 
     Both are found without the groups, on a part of many rows.
     """
-    group, least = groups(rows.places), LEAST if known is None else LEAST_KNOWN
+    group = groups(rows.places)
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for part in folds(group, FOLDS, seed):
         if budget and budget.over():
@@ -427,13 +377,13 @@ def gain_of_groups(
         rest = np.setdiff1d(np.arange(len(group)), part)
         asked = part[~rows.silent[part]]
         asked = asked[draw(np.zeros(len(asked), bool), MOST_ASKED, seed)]
-        learned = rows.at(rest).at(draw(rows.silent[rest], SOUGHT_ON, seed))
-        if len(asked) == 0 or int((~learned.silent).sum()) < least:
+        learned = rows.at(rest).at(draw(rows.silent[rest], TRIED_ON, seed))
+        if len(asked) == 0 or int((~learned.silent).sum()) < LEAST:
             continue
         queries, measured = torch.from_numpy(rows.places[asked]), rows.decibels[asked]
         process, _ = fit_powers(learned, site, "auto", seed, haste(budget, HASTY, len(learned.places)))
         without = process.mean_at(queries).numpy() - measured
-        found = shadowed(learned, site, settings, seed, budget, known)
+        found = shadowed(learned, site, seed, budget, known)
         if found is not None:
             process, _ = conditioned(learned, found[0], found[1], seed)
         error = process.mean_at(queries).numpy() - measured

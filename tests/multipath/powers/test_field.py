@@ -1,4 +1,4 @@
-"""The field of powers: the plain process without Gaussians, blockers found, rows left out, slopes, state."""
+"""The field of powers: the plain process without Gaussians, known walls, rows left out, slopes, state."""
 
 from __future__ import annotations
 
@@ -10,33 +10,28 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.data.limits import SettingError
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.haste import haste
 from gsparc.methods.method import FitContext
 from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.power_kernel import PowerKernel
-from gsparc.methods.power_process import fit_powers
 from gsparc.methods.registry import field_initialiser
-from gsparc.processes.trend import Trend
-from gsparc.multipath.powers import field as powers
+from gsparc.multipath.known.panels import panels
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.field import (
     PowerField,
-    PowerSettings,
     initialise,
     restored,
-    rows_of,
 )
-from gsparc.multipath.powers.search import Seen, drawn, gains, search
 from gsparc.ops import Pose
 
 STATION = (5.0, 20.0, 3.0)
-PLAIN = PowerSettings(most=0)
+TOWN_WALL = "walls: [{corners_m: [[25, 18, 0], [25, 45, 0], [25, 45, 12], [25, 18, 12]]}]"
 
 
 def town(count: int, walls: bool = True, seed: int = 0) -> Measurements:
@@ -82,7 +77,7 @@ def test_without_gaussians_it_is_the_plain_process(share):
     data = town(160)
     data = weak(data, share) if share else data
     rows = np.arange(120)
-    field, notes = initialise(data, rows, PLAIN)
+    field, notes = initialise(data, rows)
     field.condition(data, rows)
     plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
     said = plain.fit(data, Fold(rows, rows[:0], np.arange(120, 160)), FitContext()).notes
@@ -95,18 +90,21 @@ def test_without_gaussians_it_is_the_plain_process(share):
 
 
 @pytest.fixture(scope="module")
-def blocked():
-    """A town of 260 rows with walls, and the field of 160 of them."""
+def blocked(tmp_path_factory):
+    """A town of 260 rows with a known wall, and the field of 160 of them."""
     data, rows = town(260), np.arange(160)
-    field, notes = initialise(data, rows, PowerSettings(), seed=0)
+    file = tmp_path_factory.mktemp("walls") / "town.yaml"
+    file.write_text(TOWN_WALL, encoding="utf-8")
+    known, _ = panels(read_walls(file), data.site.origin)
+    field, notes = initialise(data, rows, seed=0, known=known)
     field.condition(data, rows)
     return data, field, notes
 
 
-def test_walls_are_found_where_they_pay(blocked):
+def test_walls_are_kept_where_they_pay(blocked):
     data, field, notes = blocked
     batch = data.batch(np.arange(160, 260))
-    plain, _ = initialise(data, np.arange(160), PLAIN)
+    plain, _ = initialise(data, np.arange(160))
     plain.condition(data, np.arange(160))
     truth = db(batch.target)
     errors = [np.mean((db(f(batch.tx, batch.rx).mean) - truth) ** 2) for f in (field, plain)]
@@ -122,60 +120,6 @@ def test_objects_are_what_paths_lose_power_in(blocked):
     strongest = int(np.argmax(found.losses))
     x, y = (found.means[strongest] + data.site.origin)[:2]
     assert found.losses[strongest] > 4 and 15 < x < 45 and y > 12, vars(found)
-
-
-def test_no_walls_are_found_where_there_are_none():
-    data, rows = town(120, walls=False), np.arange(120)
-    field, notes = initialise(data, rows, PowerSettings(), seed=0)
-    assert field.count == 0 and any(note.startswith("no Gaussians") for note in notes)
-    assert not len(field.objects())
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_one_outlier_is_no_wall(seed):
-    """One power 30 dB too weak was taken for a wall, which took 66 dB of a path beside it."""
-    data = town(140, walls=False, seed=seed)
-    target = data.target.copy()
-    target[7] /= 1e3
-    rows = rows_of(replace(data, target=target), np.arange(140))
-    plain, _ = fit_powers(rows, data.site, "distance")
-    seen = Seen.of(rows, plain.trend, plain.trend.law.place)
-    assert len(search(seen, plain.kernel, 3, seed)[0]) == 0
-
-
-def test_no_path_loses_more_in_a_gaussian_than_measured_ones_do(blocked):
-    data, field, _ = blocked
-    near = torch.from_numpy(data.moving[:12])  # behind the first Gaussian's edge at most
-    beyond = torch.from_numpy(np.random.default_rng(0).uniform([-40, -40, -9], [40, 40, 9], (9_000, 3)))
-    invented = small_field(data)
-    bounded, still = invented.blockers.within(near, invented.still), invented.still
-    seen = bounded.shadows(near, still).amax(0)
-    assert torch.equal(seen, invented.blockers.shadows(near, still).amax(0))
-    assert (bounded.shadows(beyond, still).amax(0) <= seen).all()
-    assert (invented.blockers.shadows(beyond, still).amax(0) > 1.05 * seen).any()
-    assert field.most.shape == (field.count,) and torch.isfinite(field.most).all()
-
-
-def test_a_walls_evidence_without_its_most_telling_row_is_exact():
-    """Left out of sums alone, a row could leave next to nothing to divide by: evidence of 4e9 nats."""
-    data = town(60)
-    rows = rows_of(data, np.arange(60))
-    plain, _ = fit_powers(rows, data.site, "distance")
-    seen = Seen.of(rows, plain.trend, plain.trend.law.place)
-    gram = torch.from_numpy(plain.kernel.amplitude * plain.kernel.gram(seen.distance, seen.terms))
-    columns = drawn(seen, 400, np.random.default_rng(1)).shadows(seen.places, seen.still)
-    values = torch.from_numpy(seen.values)
-    worth, _ = gains(torch.linalg.inv(gram), values, columns)
-    assert (worth > 1).sum() > 3 and worth.max() < 100
-    for k in torch.nonzero(worth > 1)[:4, 0]:
-        without = []
-        for row in range(60):
-            kept = torch.arange(60) != row
-            inverse = torch.linalg.inv(gram[kept][:, kept])
-            column = columns[kept, k]
-            ratio = (column @ inverse @ values[kept]) ** 2 / (column @ inverse @ column)
-            without.append(0.5 * (ratio - 1 - ratio.log()))
-        assert torch.isclose(torch.stack(without), worth[k], rtol=1e-6).any()
 
 
 def test_far_away_the_variance_is_the_priors(blocked):
@@ -278,7 +222,7 @@ def test_both_ends_may_move():
     }
     data = from_arrays(arrays, {"name": "two ends"})
     assert data.site.static_end is None
-    field, _ = initialise(data, np.arange(50), PowerSettings(most=2))
+    field, _ = initialise(data, np.arange(50))
     field.condition(data, np.arange(50))
     batch = data.batch(np.arange(50, 60))
     assert torch.isfinite(field(batch.tx, batch.rx).mean).all()
@@ -287,30 +231,15 @@ def test_both_ends_may_move():
 def test_what_cannot_be_is_refused():
     data = town(20)
     with pytest.raises(ValueError, match="at least one row"):
-        initialise(data, np.arange(0), PLAIN)
+        initialise(data, np.arange(0))
     with pytest.raises(ValueError, match="rssi"):
-        initialise(replace(data, site=replace(data.site, kind="csi")), np.arange(9), PLAIN)
+        initialise(replace(data, site=replace(data.site, kind="csi")), np.arange(9))
     with pytest.raises(ValueError, match="condition it first"):
         small_field(data).left_out()
-    with pytest.raises(SettingError, match="most=-1"):
-        PowerSettings(most=-1)
-    assert initialise(data, np.arange(20), PowerSettings())[0].count == 0
 
 
-def test_time_ends_the_search(monkeypatch):
-    data = town(150)
-    budget = powers.TimeBudget(0.0)
-    field, notes = initialise(data, np.arange(150), PowerSettings(), budget=budget)
-    assert field.count == 0 and budget.limited and any("no Gaussians" in note for note in notes)
-
-
-TOWN_WALL = "walls: [{corners_m: [[25, 18, 0], [25, 45, 0], [25, 45, 12], [25, 18, 12]]}]"
-
-
-def powers_of(
-    data: Measurements, rows: np.ndarray, init: InitSettings, visibility: bool = True
-) -> PowerField:
-    field, _ = field_initialiser("powers")(data, rows, init, visibility, FitContext())
+def powers_of(data: Measurements, rows: np.ndarray, init: InitSettings) -> PowerField:
+    field, _ = field_initialiser("powers")(data, rows, init, True, FitContext())
     return field
 
 
@@ -319,11 +248,6 @@ def test_settings_of_little_time_are_chosen_on_fewer_rows():
     few, every = (haste(budget, 0.5, 9999) for budget in budgets)
     assert few.rows == 150 and few.late() and every.rows == 1000 and not every.late()
     assert [budget.limited for budget in budgets] == [True, False] and haste(None, 0.5, 9).rows == 1000
-
-
-def test_without_visibility_nothing_stands_in_the_way(blocked):
-    data, _, _ = blocked
-    assert powers_of(data, np.arange(160), InitSettings(), visibility=False).count == 0
 
 
 @pytest.mark.parametrize("rows", [20, 60])

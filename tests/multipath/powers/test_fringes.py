@@ -10,7 +10,7 @@ import torch
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
-from gsparc.multipath.powers.field import PowerSettings, initialise, restored
+from gsparc.multipath.powers.field import initialise, restored
 from gsparc.multipath.powers.fringes import Blend, sampled
 from gsparc.multipath.powers.waves import basis_of, decibels_of, fit_waves
 from gsparc.ops import Pose
@@ -39,7 +39,7 @@ def db(power: torch.Tensor) -> np.ndarray:
 @pytest.fixture(scope="module")
 def interfering():
     data, rows = plane(500), np.arange(400)
-    field, notes = initialise(data, rows, PowerSettings(), seed=0)
+    field, notes = initialise(data, rows, seed=0)
     field.condition(data, rows)
     return data, field, notes
 
@@ -65,7 +65,7 @@ def test_powers_are_fitted_by_waves():
 def test_fringes_predict_better_than_the_process_alone(interfering):
     data, field, notes = interfering
     batch = data.batch(np.arange(400, 500))
-    plain, _ = initialise(data, np.arange(400), PowerSettings(most=0, fringes=False))
+    plain, _ = initialise(data, np.arange(400), fringes=False)
     plain.condition(data, np.arange(400))
     errors = [np.mean((db(f(batch.tx, batch.rx).mean) - db(batch.target)) ** 2) for f in (field, plain)]
     assert field.terms == ("phase", "residual") and errors[0] < 0.95 * errors[1], (errors, notes)
@@ -116,7 +116,7 @@ def test_state_makes_it_again(interfering, tmp_path):
 
 def test_few_rows_have_no_fringes():
     data, rows = plane(100), np.arange(100)
-    field, notes = initialise(data, rows, PowerSettings())
+    field, notes = initialise(data, rows)
     assert field.fringes is None and "too few for" in notes[-1]
 
 
@@ -145,8 +145,8 @@ def test_a_measured_plane():
     square = np.floor(data.moving[:, :2] / 0.3).astype(int) @ [1, 100]
     test = np.isin(square, np.unique(square)[::5])
     batch, errors = data.batch(np.flatnonzero(test)), []
-    for settings in (PowerSettings(), PowerSettings(fringes=False, most=0)):
-        field, _ = initialise(data, np.flatnonzero(~test), settings)
+    for fringes in (True, False):
+        field, _ = initialise(data, np.flatnonzero(~test), fringes)
         field.condition(data, np.flatnonzero(~test))
         errors.append(np.mean((db(field(batch.tx, batch.rx).mean) - db(batch.target)) ** 2))
     assert errors[0] < errors[1], errors
