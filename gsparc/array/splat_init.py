@@ -1,8 +1,9 @@
 """A splatted field whose array vectors are the posterior of the vector process, in closed form.
 
 Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen plan.
-Emissions are linear in the features of the process (`gsparc.processes.features`), whose weights give its posterior
-mean h(x) = phi(x) W: the emissions of least norm are phi(x) W G^+. The same features tell the unknown share.
+Emissions are linear in features of the process (`gsparc.processes.features`), whose weights give its
+posterior mean h(x) = phi(x) W: the emissions of least norm are phi(x) W G^+. The same features tell the
+unknown share.
 """
 
 from __future__ import annotations

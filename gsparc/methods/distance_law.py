@@ -203,7 +203,8 @@ class DistanceLaw(Interpolator):
         self.law, notes = law_of(Rows(positions, decibels, silent), self.site)
         law = self.law
         said = (
-            f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, deviation {law_variance(law) ** 0.5:.3g} dB"
+            f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "
+            f"deviation {law_variance(law) ** 0.5:.3g} dB"
             f" ({time.perf_counter() - started:.2g} s)"
         )
         return tuple(f"distance_law: {note}" for note in (said, *notes))

@@ -144,7 +144,9 @@ def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
     return apart(places, places), trend.terms(places), values[:, None]
 
 
-def _by_left_out(starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor) -> tuple[float, Kernel]:
+def _by_left_out(
+    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor
+) -> tuple[float, Kernel]:
     bounds = bounds_of(len(starts[0].lengths), distance.numpy())
     return by_left_out(starts, distance, terms, values, bounds, LOOKS, SETTLED)
 

@@ -180,11 +180,11 @@ class DirectionalGP(FramedMethod):
         retained = coherence(phase_vectors, phase_vectors)
         for _ in range(ROUNDS):
             covariance = _covariance(waves, waves, self.power, uncertain, retained)
-            tried = [
-                (CircularFactor.with_noise(covariance * correlation[kernel], kernel.noise, rows.target), kernel)
-                for kernel in KERNELS
-            ]
-            factor, self.kernel = min(tried, key=lambda one: one[0].nll)
+            tried = {
+                kernel: CircularFactor.with_noise(covariance * each, kernel.noise, rows.target)
+                for kernel, each in correlation.items()
+            }
+            self.kernel, factor = min(tried.items(), key=lambda one: one[1].nll)
             # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
             prior = self.power * self.kernel.constant
             mean = prior[:, None] * (waves.mH @ factor.alpha)

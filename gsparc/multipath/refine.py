@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import (
     JITTER,
-    Factor,
+    CircularFactor,
     Posterior,
     Scene,
     add_covariance,
@@ -126,7 +126,7 @@ def _likelihood(
     for k in range(len(scene.sequences)):
         add_covariance(real, imag, scaled[:, k], correlation[k])
     real.diagonal().add_(noise + noise_floor)
-    factor = Factor.of(torch.complex(real, imag), rows.target)
+    factor = CircularFactor.of(torch.complex(real, imag), rows.target)
     slope_re, slope_im = factor.slope.real.contiguous(), factor.slope.imag.contiguous()
     weighted = torch.empty_like(scaled)  # (G * C_k) s_k a_k
     for k in range(len(scene.sequences)):

@@ -28,8 +28,8 @@ TINY = np.finfo(float).tiny
 class LeftOutDensity(torch.autograd.Function):
     """Negative density of rows left out one by one, and the amplitude that minimises it.
 
-    With R = K^-1 Y and q = diag(K^-1) the error of row i is R_i / q_i, its variance amplitude / q_i (Rasmussen
-    and Williams 2006, eqs. 5.10 to 5.13, over outputs that share K).
+    With R = K^-1 Y and q = diag(K^-1) the error of row i is R_i / q_i, its variance amplitude / q_i
+    (Rasmussen and Williams 2006, eqs. 5.10 to 5.13, over outputs that share K).
     """
 
     @staticmethod
@@ -141,7 +141,8 @@ def walked(
 
 def by_left_out(
     starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
-    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float, entries: int = 1, bounded: bool = True,
+    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+    entries: int = 1, bounded: bool = True,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Least negative density of rows left out [nats per output], and its kernel; see `LeftOutDensity`."""
 

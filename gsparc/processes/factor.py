@@ -50,8 +50,8 @@ class Factor:
 
         Args:
             covariance: real or complex.
-            failing: what follows where there is none: a ridge (of a single matrix), an error, or nothing: of a
-                batch of steps some may fail.
+            failing: what follows where there is none: a ridge (of a single matrix), an error, or nothing:
+                of a batch of steps some may fail.
 
         Raises:
             NotPositiveDefiniteError: it has no factor, nor with the largest ridge.
@@ -73,8 +73,8 @@ class Factor:
                 return cls(lower.to(covariance.dtype))
         most = RIDGES[-1] * ROUNDING * len(covariance)
         raise NotPositiveDefiniteError(
-            f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with {most:.1e} of its mean "
-            "variance as noise, more than rounding explains: "
+            f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with {most:.1e} of its "
+            "mean variance as noise, more than rounding explains: "
             "look for rows that are not finite (gsparc check FILE)"
         )
 

@@ -39,7 +39,9 @@ def matern52(distance: Tensor, length: Tensor | float) -> Tensor:
     return torch.addcmul(torch.sub(ONE, scaled), scaled, scaled, value=1 / 3) * scaled.exp()
 
 
-def matern_sum(distance: Tensor, lengths: Sequence[Tensor | float], shares: Sequence[Tensor | float]) -> Tensor:
+def matern_sum(
+    distance: Tensor, lengths: Sequence[Tensor | float], shares: Sequence[Tensor | float]
+) -> Tensor:
     """Sum of Matern-3/2 at distances (...) [m]."""
     if len(lengths) == 1:
         return matern32(distance, lengths[0])

@@ -122,8 +122,8 @@ class Exact(Posterior):
         return self.prior.mean(queries) + cross @ self.weights
 
     def _cross(self, queries: Tensor, distance: Tensor) -> Tensor:
-        found = self.prior.kernel.correlation(distance)
-        return found if self.prior.trend is None else found.addmm(self.prior.columns(queries), self._columns.T)
+        found, prior = self.prior.kernel.correlation(distance), self.prior
+        return found if prior.trend is None else found.addmm(prior.columns(queries), self._columns.T)
 
     @cached_property
     def _columns(self) -> Tensor:
@@ -166,5 +166,3 @@ def approximated(name: str, posterior: Posterior | None) -> str:
     """A method's name with how its process is approximated, where it is."""
     how = None if posterior is None else posterior.approximation
     return name if how is None else f"{name} ({how})"
-
-

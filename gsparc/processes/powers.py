@@ -186,7 +186,7 @@ def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str
     notes: list[str] = []
     if rows.silent.any():
         notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
-    places, decibels, extra, used = _with_pseudo_values(rows, prior, seed, notes)
+    places, decibels, extra = _with_pseudo_values(rows, prior, seed, notes)
     posterior = Exact.given(prior, places, decibels[:, None], extra)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
     heard = float(loud.var(correction=0)) / prior.kernel.amplitude if len(loud) else 0.0
@@ -195,12 +195,12 @@ def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str
 
 def _with_pseudo_values(
     rows: Rows, prior: Prior, seed: int, notes: list[str]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Places, decibels and extra variances, pseudo-values where nothing was heard, and the rows used."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Places, decibels and extra variances; pseudo-values of the silent rows that say anything."""
     places, decibels = torch.from_numpy(rows.places), torch.from_numpy(rows.decibels)
-    extra, used, silent = torch.zeros_like(decibels), torch.arange(len(decibels)), torch.from_numpy(rows.silent)
+    extra, silent = torch.zeros_like(decibels), torch.from_numpy(rows.silent)
     if not rows.silent.any():
-        return places, decibels, extra, used
+        return places, decibels, extra
     deviation, mean = math.sqrt(prior.kernel.amplitude), prior.mean(places)[:, 0]
     gram = prior.between(places, places)
     gram.diagonal().add_(prior.kernel.noise)
@@ -218,4 +218,4 @@ def _with_pseudo_values(
         if not sites.settled:
             notes.append("what these rows say had not settled after all sweeps")
     used = torch.cat([(~silent).nonzero()[:, 0], at]).sort().values
-    return places[used], decibels[used], extra[used], used
+    return places[used], decibels[used], extra[used]

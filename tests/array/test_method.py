@@ -13,7 +13,7 @@ from known_arrays import array_site, measure, spectra, walk
 from gsparc.array import splat_init
 from gsparc.array.cross_validation import tune
 from gsparc.array.method import ArrayField
-from gsparc.array.vector_gp import Kernel, aligned_by, mirror_elements, refine_alignment, twin
+from gsparc.array.vector_gp import aligned_by, mirror_elements, refine_alignment, twin
 from gsparc.data.campaigns.rfid import planar_array
 from gsparc.data.load import load, split_for
 from gsparc.data.splits import Fold, Split, indices_hash
@@ -26,6 +26,7 @@ from gsparc.methods.registry import method_class
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
 from gsparc.physics.bartlett import SpectrumRenderer
+from gsparc.processes.kernel import SmoothRough
 
 SMALL = FieldSettings(count=64)
 
@@ -84,8 +85,8 @@ def test_alignment_undoes_phases_and_twins(known_campaign):
     scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
     mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
     mixed[::3] = twin(mixed[::3], partner)
-    kernel = Kernel(0.2, 1e-3)
-    inverse = np.linalg.inv(kernel.gram(data.tx))
+    kernel = SmoothRough.of_one(0.2, 1e-3)
+    inverse = np.linalg.inv(kernel.gram(torch.from_numpy(data.tx)).numpy())
     vectors = aligned_by(mixed, data.tx, partner, kernel)
     left_out = vectors - (inverse @ vectors) / np.diag(inverse)[:, None]
     overlap = np.abs((left_out.conj() * vectors).sum(1)) / np.linalg.norm(left_out, axis=1)
@@ -99,17 +100,18 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
 
     data, truth = known_campaign
     x, v = data.tx[:30], truth[:30] / np.linalg.norm(truth[:30], axis=1, keepdims=True)
-    kernel = Kernel(0.15, 0.01)
+    kernel, at = SmoothRough.of_one(0.15, 0.01), torch.from_numpy(x)
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
     matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
     samples = cross_validation._Samples(
         np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
     )
-    unknown, predicted = samples.predictions(kernel, np.linalg.inv(kernel.gram(x)), v)
+    unknown, predicted = samples.predictions(kernel, np.linalg.inv(kernel.gram(at).numpy()), v)
     error = samples.error(predicted)
     far = distance[7] > 0.03
-    weights = np.linalg.solve(kernel.gram(x[far]), kernel.cross(x[far], x[7:8]))[:, 0]
-    assert unknown[0, 0] == pytest.approx(1 - weights @ kernel.cross(x[far], x[7:8])[:, 0], rel=1e-6)
+    cross = kernel.between(at[far], at[7:8]).numpy()
+    weights = np.linalg.solve(kernel.gram(at[far]).numpy(), cross)[:, 0]
+    assert unknown[0, 0] == pytest.approx(1 - weights @ cross[:, 0], rel=1e-6)
     assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
 
 

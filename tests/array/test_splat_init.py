@@ -51,7 +51,8 @@ def process(trained):
     found, _ = recovered(data, fold.train, platform_cache())  # the same solutions
     kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = aligned_by(found.vectors, places, partner, kernel)
-    inverse, cross = np.linalg.inv(kernel.gram(places)), kernel.cross(data.tx[fold.test], places)
+    rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])
+    inverse, cross = np.linalg.inv(kernel.gram(rows).numpy()), kernel.between(queries, rows).numpy()
     return cross @ inverse @ vectors, 1 - np.einsum("ij,ij->i", cross @ inverse, cross)
 
 

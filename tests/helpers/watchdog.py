@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from types import FrameType
 from unittest import mock
 
-from gsparc.processes import worker
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.processes import worker
 
 OFTEN_S = 0.02  # between signals, as Ctrl-C would come
 

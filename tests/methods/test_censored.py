@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import mpmath
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.distance import cdist
-from scipy.stats import multivariate_normal
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods import censored_ep
 from gsparc.methods.censored import heard, left_out_note
-from gsparc.methods.censored_ep import condition, log_evidence, propagate, truncated
-from gsparc.methods.distance_law import Rows
 from gsparc.methods.method import FitContext
-from gsparc.methods.power_process import draw, fit_powers
+from gsparc.methods.power_settings import fit_powers
 from gsparc.methods.registry import build
+from gsparc.processes.powers import Rows
 
 STATION = np.array([500.0, 500.0, 20.0])
 SHADOWING_DB, LENGTH_M, NOISE_DB = 7.0, 80.0, 1.5
@@ -116,68 +112,6 @@ def test_nothing_heard_at_all_is_finite():
         assert np.isfinite(found).all() and np.isfinite(deviation).all()
 
 
-def test_moments_of_a_truncated_normal():
-    z = np.array([-3000.0, -100.0, -31.0, -30.0, -12.0, -1.0, 0.0, 2.0, 4.0])
-    ratio, lost = truncated(z)
-    for one, mean, share in zip(z, ratio, lost, strict=True):
-        with mpmath.workdps(60):
-            exact = mpmath.npdf(one) / mpmath.ncdf(one)
-            kept = 1 - exact * (exact + one)
-        assert mean == pytest.approx(float(exact), rel=1e-7)
-        assert 1 - share == pytest.approx(float(kept), rel=1e-5)
-    assert np.isfinite(truncated(np.array([-1e8, 1e8]))).all()
-
-
-def small_vector(count: int = 8):
-    rng = np.random.default_rng(0)
-    places = rng.uniform(size=(count, 2))
-    gram = 30 * np.exp(-cdist(places, places) / 0.5) + 2 * np.eye(count)
-    values, unknown = rng.multivariate_normal(np.zeros(count), gram), np.arange(count) > 4
-    return gram, values + unknown, unknown
-
-
-def test_evidence_and_means_are_those_of_sampling():
-    gram, values, unknown = small_vector()
-    told = condition(gram, values, unknown)
-    sites = propagate(told, values[unknown])
-    normal = multivariate_normal(told.mean, told.covariance, seed=1)
-    assert sites.settled
-    assert sites.log_evidence == pytest.approx(normal.logcdf(values[unknown]), abs=0.03)
-    drawn = normal.rvs(400_000)
-    drawn = drawn[(drawn < values[unknown]).all(1)]
-    weights = np.linalg.solve(told.covariance + np.diag(sites.variance), sites.value - told.mean)
-    assert np.allclose(told.mean + told.covariance @ weights, drawn.mean(0), atol=0.05)
-
-
-def test_the_slope_of_the_evidence(monkeypatch):
-    monkeypatch.setattr(censored_ep, "SETTLED", 1e-10)
-    gram, values, unknown = small_vector()
-    slope = log_evidence(gram, values, unknown)[1]
-    change = np.random.default_rng(1).normal(size=gram.shape)
-    change = 1e-4 * (change + change.T)
-    ends = [log_evidence(gram + step * change, values, unknown)[0] for step in (-0.5, 0.5)]
-    assert np.vdot(slope, change) == pytest.approx(ends[1] - ends[0], rel=1e-4)
-
-
-def test_rows_certain_to_be_silent_change_nothing():
-    gram, values, unknown = small_vector()
-    level = values[unknown] + [0.0, 60.0, 0.0]
-    told = condition(gram, values, unknown)
-    kept = told.uncertain(level)
-    assert kept.tolist() == [True, False, True]
-    every, rest = propagate(told, level), propagate(told.of(kept), level[kept])
-    assert np.allclose(every.value[kept], rest.value, atol=1e-2)
-    assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
-
-
-def test_drawn_rows_keep_half_of_what_was_heard():
-    silent = np.arange(1000) >= 100
-    rows = draw(silent, 150, 0)
-    assert len(rows) == 150 and (~silent[rows]).sum() == 75 and (np.diff(rows) > 0).all()
-    assert (~silent[draw(silent, 300, 0)]).sum() == 100
-    assert np.array_equal(draw(silent, 1000, 0), np.arange(1000))
-
-
 def test_silent_rows_alone_do_not_make_powers_spread_beyond_any_site():
     """One row of forty heard, 20 dB above the level: the process fell to 167 dB below it."""
     data, _, _ = town(40)
@@ -186,4 +120,4 @@ def test_silent_rows_alone_do_not_make_powers_spread_beyond_any_site():
     rows = Rows(data.moving, np.where(quiet, level - 20, level), quiet)
     process, _ = fit_powers(rows, data.site)
     assert process.kernel.amplitude < 1001
-    assert process.mean_and_variance(data.moving)[0].min() > level - 100
+    assert process.answer(torch.from_numpy(data.moving))[0].min() > level - 100

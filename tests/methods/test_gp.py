@@ -11,46 +11,21 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.scores import score
-from gsparc.methods.gp import GaussianProcess, Kernel, choose_kernel, leave_one_out, principal_components
+from gsparc.methods.gp import GaussianProcess, choose_kernel, principal_components
 from gsparc.methods.method import FitContext
 from gsparc.ops import Pose
-
-
-def test_leave_one_out_equals_refitting_without_each_row():
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(size=(12, 3)), rng.normal(size=(12, 4))
-    kernel = Kernel(0.4, 0.05)
-    gram = kernel.gram(x)
-    density, amplitude = leave_one_out(gram, y, entries=4)
-    total = 0.0
-    for i in range(12):
-        rest = np.delete(np.arange(12), i)
-        weights = np.linalg.solve(gram[np.ix_(rest, rest)], gram[rest, i])
-        mean, variance = weights @ y[rest], amplitude * (gram[i, i] - weights @ gram[rest, i])
-        total += (0.5 * np.log(variance) + 0.5 * (y[i] - mean) ** 2 / variance).sum()
-    # At the best amplitude the squared errors average to one per number: a constant 1/2.
-    assert density + 0.5 == pytest.approx(total / y.size, rel=1e-9)
-
-
-def test_the_amplitude_is_the_best_one():
-    rng = np.random.default_rng(1)
-    x, y = rng.uniform(size=(10, 3)), rng.normal(size=(10, 2))
-    inverse = np.linalg.inv(Kernel(0.3, 0.1).gram(x))
-    d, r = np.diag(inverse), inverse @ y
-
-    def density(a: float) -> float:
-        return 0.5 * (np.log(a / d)[:, None] + r**2 / d[:, None] / a).sum()
-
-    best = leave_one_out(Kernel(0.3, 0.1).gram(x), y, 2)[1]
-    assert density(best) < min(density(best * 1.05), density(best / 1.05))
+from gsparc.processes.density import LeftOutDensity
+from gsparc.processes.kernel import Kernel
 
 
 def test_chosen_kernel_is_a_minimum(campaign):
     data = campaign("spectrum", 40)
-    scores = principal_components(data.target, "spectrum", 512).scores
-    kernel = choose_kernel(data.moving, scores, 288)
+    scores = torch.from_numpy(principal_components(data.target, "spectrum", 512).scores)
+    kernel, places = choose_kernel(data.moving, scores.numpy(), 288), torch.from_numpy(data.moving)
     at = {
-        step: leave_one_out(Kernel(kernel.length * step, kernel.noise).gram(data.moving), scores, 288)[0]
+        step: LeftOutDensity.apply(
+            Kernel.of_one(kernel.length * step, kernel.noise).gram(places), scores, 288, False
+        )[0]
         for step in (0.8, 1.0, 1.25)
     }
     assert at[1.0] == min(at.values())
@@ -76,7 +51,7 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     gp = GaussianProcess()
     gp.fit(data, fold, FitContext(tmp_path))
     rows = np.concatenate([fold.train, fold.val])
-    k = gp.kernel
+    k = gp.scores.prior.kernel
     target = data.target[rows].reshape(len(rows), -1).view(np.float32)
     shape = ConstantKernel(k.amplitude) * Matern(k.length, nu=1.5) + WhiteKernel(k.amplitude * k.noise)
     library = GaussianProcessRegressor(shape, optimizer=None, alpha=0).fit(

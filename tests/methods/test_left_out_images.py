@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.distance import cdist
 
 from gsparc.methods.gp import choose_kernel
@@ -21,14 +22,14 @@ def left() -> LeftOut:
 
 def test_the_process_has_not_seen_what_lies_within_the_gap(left):
     found = left.by_process()
-    mean = left.images.mean(0)
+    mean, at = left.images.mean(0), torch.from_numpy(left.positions)
     vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
     kernel = choose_kernel(left.positions, vectors * lengths, PIXELS)
     for g, c in [(0, 0), (1, 1), (1, 2)]:
         i = left.centres[c]
         far = np.linalg.norm(left.positions - left.positions[i], axis=1) > left.gaps[g]
-        weights = np.linalg.solve(kernel.gram(left.positions[far]), left.images[far] - mean)
-        wanted = mean + kernel.cross(left.positions[[i]], left.positions[far])[0] @ weights
+        weights = np.linalg.solve(kernel.gram(at[far]).numpy(), left.images[far] - mean)
+        wanted = mean + kernel.between(at[[i]], at[far])[0].numpy() @ weights
         assert np.allclose(found[g, c], wanted, atol=1e-6)
     assert np.isnan(found[2]).all()  # nothing lies beyond 5 m
     assert len(left.at(2, found)[0]) == 0 and len(left.at(0, found)[0]) == 3

@@ -10,7 +10,6 @@ import torch
 from gains import gains
 from rooms import PILLAR, WAVELENGTH, shoebox
 
-from gsparc.processes.worker import Ended, ended_by
 from gsparc.multipath.clutter import finite_mirrors, search
 from gsparc.multipath.clutter.blocking import Clutter, Obstacles, tangents, visible_share
 from gsparc.multipath.clutter.boxes import find_box
@@ -25,6 +24,7 @@ from gsparc.multipath.query import Query
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import all_sequences
+from gsparc.processes.worker import Ended, ended_by
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)

@@ -15,8 +15,8 @@ from gsparc.methods.run_factors import run_factors
 from gsparc.multipath import complex_gp
 from gsparc.multipath.complex_gp import ComplexGP
 from gsparc.multipath.gp_likelihood import CircularFactor
-from gsparc.multipath.ridge import cholesky
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.factor import Factor
 
 CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"
 
@@ -198,13 +198,13 @@ def _alike(count=300):
 def test_a_ridge_mends_what_rounding_broke():
     covariance = _alike()
     assert torch.linalg.cholesky_ex(covariance)[1] > 0
-    lower = cholesky(covariance)
+    lower = Factor.of(covariance).lower
     assert torch.allclose(lower @ lower.mH, covariance, atol=0.05 * 50)
     assert np.isfinite(CircularFactor.of(covariance, covariance[:, :1]).nll)
     sound = covariance + 10 * torch.eye(len(covariance))
-    assert torch.equal(cholesky(sound), torch.linalg.cholesky(sound))
+    assert torch.allclose(Factor.of(sound).lower, torch.linalg.cholesky(sound))
     with pytest.raises(ValueError, match="no Cholesky factor"):
-        cholesky(-torch.eye(3))
+        Factor.of(-torch.eye(3))
 
 
 def test_channels_without_noise(tmp_path):

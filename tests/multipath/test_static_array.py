@@ -12,7 +12,6 @@ from rooms import nmse
 
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.processes import worker
 from gsparc.methods.method import FitContext
 from gsparc.multipath.backprojection import quick_score, score
 from gsparc.multipath.clutter.residual import Residual, _cost
@@ -20,12 +19,13 @@ from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.refine import refine
-from gsparc.multipath.ridge import ROUNDING, cholesky
 from gsparc.multipath.rows import gather, static_array
 from gsparc.multipath.search_cache import SearchCache
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import bisector, images, orientations, reflect
 from gsparc.physics.waves import LIGHT
+from gsparc.processes import worker
+from gsparc.processes.factor import ROUNDING, Factor
 
 CARRIER = 2.4e9
 CENTRE, SIZE = np.array([1.7, 0.4, 2.0]), (3.0, 2.5)
@@ -257,11 +257,11 @@ def test_clutter_is_looked_for_without_noise():
 def test_a_ridge_is_no_larger_than_rounding_explains():
     """As many rows of one place: rank one, mended by noise under the stated bound."""
     ones = torch.ones(300, 300)
-    lower = cholesky(ones)
+    lower = Factor.of(ones).lower
     assert lower.dtype == torch.float32
     assert (lower.double() @ lower.double().T - ones).abs().max() <= 16 * ROUNDING * 300
     with pytest.raises(ValueError, match="no Cholesky factor"):
-        cholesky(ones - 1e-2 * torch.eye(300))
+        Factor.of(ones - 1e-2 * torch.eye(300))
 
 
 def test_budget_is_kept(tmp_path):
@@ -291,8 +291,8 @@ def test_an_interrupt_ends_all_searches_and_names_the_checkpoint(tmp_path, monke
 def test_a_worker_ends_when_asked():
     worker.ask()
     with worker.ended_by(lambda: True), pytest.raises(worker.Ended):
-        cholesky(torch.eye(2))
-    cholesky(torch.eye(2))
+        Factor.of(torch.eye(2))
+    Factor.of(torch.eye(2))
 
 
 def test_one_antenna_is_a_case_of_several():

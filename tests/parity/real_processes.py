@@ -42,7 +42,8 @@ def gp_of_spectra() -> Arrays:
     per_number = float(nats) / 48 - 0.5 * np.log(2 * np.pi * np.e)
     return {
         "mean": said.mean.numpy(), "variance": said.variance.numpy(), "confidence": said.confidence.numpy(),
-        "density": np.array([per_number, float(amplitude)]), "mean_at": model.mean_at(batch.tx, batch.rx).numpy(),
+        "density": np.array([per_number, float(amplitude)]),
+        "mean_at": model.mean_at(batch.tx, batch.rx).numpy(),
     }  # fmt: skip
 
 
@@ -94,7 +95,7 @@ def power_left_out_density() -> Arrays:
             gram = density.gram_of(at, distance, terms)
             nats, amplitude = density.LeftOutDensity.apply(gram, values, 1, bounded)
             (slope,) = torch.autograd.grad(nats, at)
-            found[f"{name}{bounded}"] = np.array([float(nats), float(amplitude), *slope])
+            found[f"{name}{bounded}"] = np.array([nats.item(), amplitude.item(), *slope])
     return found
 
 

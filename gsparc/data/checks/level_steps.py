@@ -6,10 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+import torch
 from scipy.spatial.distance import cdist
 
 from gsparc.data.errors import DataError
+from gsparc.processes.factor import Factor
 
 MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
 LIKELIHOOD_BLOCKS = 300  # that choose the length of correlation
@@ -104,15 +105,17 @@ def _precision(places: np.ndarray, level: np.ndarray, regressors: np.ndarray) ->
     for reach in REACHES:
         for nugget in NUGGETS:
             shape = _covariance(distance[np.ix_(some, some)], reach * extent, nugget)
-            factor = cho_factor(shape, lower=True)
-            weighed = cho_solve(factor, regressors[some])
+            factor = Factor.of(torch.from_numpy(shape))
+            weighed = factor.solved(torch.from_numpy(regressors[some])).numpy()
             mean = np.linalg.lstsq(regressors[some].T @ weighed, weighed.T @ level[some], rcond=None)[0]
             rest = level[some] - regressors[some] @ mean
-            variance = float(rest @ cho_solve(factor, rest)) / len(some)
-            likelihood = -0.5 * len(some) * math.log(variance) - np.log(np.diag(factor[0])).sum()
+            white = factor.whitened(torch.from_numpy(rest)[:, None])
+            variance = float(white.square().sum()) / len(some)
+            likelihood = -0.5 * (len(some) * math.log(variance) + float(factor.log_determinant))
             best = max(best, (float(likelihood), reach, nugget, variance))
     _, reach, nugget, variance = best
-    return np.linalg.inv(_covariance(distance, reach * extent, nugget)) / variance
+    whole = torch.from_numpy(_covariance(distance, reach * extent, nugget))
+    return Factor.of(whole).inverse.numpy() / variance
 
 
 def _covariance(distance: np.ndarray, reach: float, nugget: float) -> np.ndarray:

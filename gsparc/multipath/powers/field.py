@@ -274,7 +274,8 @@ def ridge(columns: np.ndarray, values: np.ndarray, prior: float) -> np.ndarray:
     weights, left = np.zeros(columns.shape[1]), float((values**2).mean())
     for _ in range(RIDGE_STEPS):
         gram = columns.T @ columns + left / prior * np.eye(columns.shape[1])
-        weights = Factor.of(torch.from_numpy(gram)).solved(torch.from_numpy(columns.T @ values)[:, None])[:, 0].numpy()
+        right = torch.from_numpy(columns.T @ values)[:, None]
+        weights = Factor.of(torch.from_numpy(gram)).solved(right)[:, 0].numpy()
         left = max(float(((values - columns @ weights) ** 2).mean()), 1e-12)
     return weights
 

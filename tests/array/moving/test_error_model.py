@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from gsparc.array.moving.error_model import ErrorModel, _variance, fit_error_model
-from gsparc.methods.gp import Kernel
+from gsparc.processes.kernel import Kernel
 
-KERNEL, REACH, PRIOR = Kernel(1.0, 0.1), 2.0, 0.05
+KERNEL, REACH, PRIOR = Kernel.of_one(1.0, 0.1), 2.0, 0.05
 
 
 def fit(places, errors, observed):
@@ -75,8 +75,9 @@ def test_a_variance_needs_the_nearest_rows_only():
     model = fit(places, rng.lognormal(-2, 0.3, 300), features(300))
     distance = far(queries, places)
     row = distance.argmin(1)
-    cross = KERNEL.cross(queries, places)
-    exact = 1.1 - (cross * np.linalg.solve(KERNEL.gram(places), cross.T).T).sum(1)
+    at = torch.from_numpy(places)
+    cross, gram = KERNEL.between(torch.from_numpy(queries), at).numpy(), KERNEL.gram(at).numpy()
+    exact = 1.1 - (cross * np.linalg.solve(gram, cross.T).T).sum(1)
     near = _variance(KERNEL, distance.gather(1, model.near[row]), model.precision[row]).numpy()
     assert (near > exact - 1e-6).all() and (near < 1.5 * exact).all() and near.mean() < 1.1 * exact.mean()
 

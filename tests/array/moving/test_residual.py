@@ -2,9 +2,9 @@ import numpy as np
 import torch
 
 from gsparc.array.moving.residual import fit_residual, left_out_error, principal
-from gsparc.methods.gp import Kernel
+from gsparc.processes.kernel import Kernel
 
-KERNEL = Kernel(2.0, 0.05)
+KERNEL = Kernel.of_one(2.0, 0.05)
 
 
 def rows(count=40, seed=0):
@@ -24,10 +24,10 @@ def test_left_out_predictions_are_those_of_the_others(monkeypatch):
     monkeypatch.setattr("gsparc.array.moving.residual.SPARED", 0.0)
     places, values = rows()
     predicted = fit_residual(KERNEL, places, values, 30)[1]
-    others = np.arange(1, 40)
+    others, at = np.arange(1, 40), torch.from_numpy(places)
     mean = values.mean(0)  # of all rows, as there
-    weights = np.linalg.solve(KERNEL.gram(places[others]), (values[others] - mean).numpy())
-    wanted = mean.numpy() + KERNEL.cross(places[:1], places[others]) @ weights
+    weights = np.linalg.solve(KERNEL.gram(at[1:]).numpy(), (values[others] - mean).numpy())
+    wanted = mean.numpy() + KERNEL.between(at[:1], at[1:]).numpy() @ weights
     np.testing.assert_allclose(predicted[0], wanted[0], atol=1e-3)
 
 

@@ -18,8 +18,6 @@ from gsparc.field.initial import InitSettings
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.haste import haste
 from gsparc.methods.method import FitContext
-from gsparc.methods.nearest_process import NearestProcess
-from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.registry import field_initialiser
 from gsparc.multipath.known.panels import panels
 from gsparc.multipath.powers.blockers import Blockers
@@ -29,6 +27,9 @@ from gsparc.multipath.powers.field import (
     restored,
 )
 from gsparc.ops import Pose
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import Nearest
+from gsparc.processes.trend import Trend
 
 STATION = (5.0, 20.0, 3.0)
 TOWN_WALL = "walls: [{corners_m: [[25, 18, 0], [25, 45, 0], [25, 45, 12], [25, 18, 12]]}]"
@@ -62,7 +63,7 @@ def db(power: torch.Tensor) -> np.ndarray:
 
 def small_field(data: Measurements, two: bool = True) -> PowerField:
     """Two Gaussians and invented settings."""
-    kernel = PowerKernel((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else PowerKernel((5.0,), (1.0,), 0.2, 9.0)
+    kernel = Kernel((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel((5.0,), (1.0,), 0.2, 9.0)
     blockers = Blockers(
         torch.tensor([[-5.0, 3.0, 0.0], [4.0, -6.0, 0.0]]).double(),
         torch.tensor([[0.5, 8.0, 8.0], [3.0, 2.0, 3.0]]).double().log(),
@@ -276,10 +277,10 @@ def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch
     field.condition(data, rows)
     batch = data.batch(np.arange(240, len(data)))
     whole, left = db(field(batch.tx, batch.rx).mean), field.left_out()
-    monkeypatch.setattr("gsparc.methods.power_process.MOST_ROWS", 100)
+    monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
     near = copy.deepcopy(field)
     near.condition(data, rows)
-    assert isinstance(near.process, NearestProcess) and near.count == field.count > 0
+    assert isinstance(near.process.posterior, Nearest) and near.count == field.count > 0
     assert np.sqrt(np.mean((db(near(batch.tx, batch.rx).mean) - whole) ** 2)) < 0.3
     assert np.array_equal(near.left_out().rows, left.rows)
     assert np.sqrt(np.mean((db(near.left_out().mean) - db(left.mean)) ** 2)) < 0.4
@@ -296,8 +297,8 @@ def test_left_out_rows_are_told_from_silent_ones_at_their_place(monkeypatch):
     data = from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
     silent = np.arange(300) >= 150
     data = replace(data, mask=~silent[:, None], censored=silent)
-    monkeypatch.setattr("gsparc.methods.power_process.MOST_ROWS", 100)
+    monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
     field = small_field(data, two=False)
     field.condition(data, np.arange(300))
-    assert isinstance(field.process, NearestProcess) and len(field.at) == 150
+    assert isinstance(field.process.posterior, Nearest) and len(field.at) == 150
     assert (field.process.noise[field.at] <= field.process.kernel.noise).all()

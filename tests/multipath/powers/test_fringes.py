@@ -76,7 +76,7 @@ def test_far_from_all_rows_the_process_is_left_alone(interfering):
     batch = data.batch(np.arange(3))
     far = Pose(batch.rx.position + 100.0, batch.rx.rotation)
     there = field(batch.tx, far)
-    decibels, spread, share = field.process.mean_and_variance(field._places(batch.tx, far).numpy())
+    decibels, spread, share = (v.numpy() for v in field.process.answer(field._places(batch.tx, far)))
     assert np.allclose(db(there.mean), decibels, atol=1e-4) and np.allclose(there.unknown, share)
     slope = np.log(10) / 10 * there.mean[:, 0].numpy()
     assert np.allclose(there.variance.numpy(), spread * slope**2, rtol=1e-4)

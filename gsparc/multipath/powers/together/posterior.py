@@ -239,8 +239,7 @@ def given(rows: Heard, prior: Prior) -> tuple[Posterior, tuple[str, ...], list[n
         notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
     shared, mean = weights_of(list(factored.values()))
     weights = {
-        number: one.factor.root.T @ (one.values - one.whitened @ mean)
-        for number, one in factored.items()
+        number: one.factor.root.T @ (one.values - one.whitened @ mean) for number, one in factored.items()
     }
     loud = rows.decibels[~rows.silent] if not rows.silent.all() else rows.decibels
     whole = max(float(loud.var()), float(prior.variance(NEVER)))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.distance import cdist
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
@@ -18,13 +16,11 @@ from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.kriging import Kriging
 from gsparc.methods.method import FitContext
-from gsparc.methods.power_kernel import PowerKernel, kernel_of, left_out
-from gsparc.methods.power_process import fit_powers
+from gsparc.methods.power_settings import fit_powers
 from gsparc.methods.reduced import reduced
 from gsparc.multipath.powers.field import rows_of
 from gsparc.ops import Pose
 
-KERNELS = (PowerKernel((0.3,), (1.0,), 0.1, 1.0), PowerKernel((0.1, 0.5), (0.3, 0.7), 0.1, 1.0))
 CITY = Path(__file__).parents[3] / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
 
 
@@ -50,21 +46,6 @@ def error_db(method, batch) -> float:
     return float((10 * torch.log10(found / batch.target)).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("bounded", [False, True])
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_slopes_of_the_left_out_likelihood(kernel, bounded):
-    rng = np.random.default_rng(0)
-    places, values = rng.uniform(size=(40, 3)), rng.normal(size=40)
-    terms = np.c_[np.ones(40), rng.normal(size=40)]
-    distance, at = cdist(places, places), kernel.parameters()
-    ask = partial(left_out, distance=distance, terms=terms, values=values, bounded=bounded)
-    assert ask(kernel)[1] > values.var()  # beyond the bound
-    slope = ask(kernel)[2]
-    for axis in np.eye(len(at)):
-        ends = [ask(kernel_of(at + h * axis))[0] for h in (-1e-5, 1e-5)]
-        assert slope @ axis == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-5)
-
-
 @pytest.mark.skipif(not CITY.exists(), reason=f"{CITY} is not here")
 def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
     """97 rows of a measured station chose 2 km and next to no noise: up to 63 dBm where nobody measured."""
@@ -78,31 +59,6 @@ def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
     data = from_arrays(known, {"name": "city"})
     process, _ = fit_powers(rows_of(data, np.arange(97)), data.site)
     assert process.kernel.amplitude < 3 * decibels[rows].var()  # 6.6 times without the bound
-
-
-def test_left_out_is_a_prediction_without_each_row():
-    rng = np.random.default_rng(0)
-    places, values, terms = rng.uniform(size=(12, 3)), rng.normal(size=12), np.ones((12, 1))
-    kernel = KERNELS[1]
-    gram = kernel.gram(cdist(places, places), terms)
-    density, amplitude, _ = left_out(kernel, cdist(places, places), terms, values)
-    total = 0.0
-    for i in range(12):
-        rest = np.delete(np.arange(12), i)
-        weights = np.linalg.solve(gram[np.ix_(rest, rest)], gram[rest, i])
-        variance = amplitude * (gram[i, i] - weights @ gram[rest, i])
-        total += (
-            0.5 * np.log(2 * np.pi * variance) + 0.5 * (values[i] - weights @ values[rest]) ** 2 / variance
-        )
-    assert density == pytest.approx(total, rel=1e-9)
-
-
-def test_kernels_are_their_parameters():
-    for kernel in KERNELS:
-        again = kernel_of(kernel.parameters(), kernel.amplitude)
-        assert np.allclose(
-            [*again.lengths, *again.shares, again.noise], [*kernel.lengths, *kernel.shares, 0.1]
-        )
 
 
 def test_the_mean_is_chosen_by_likelihood_and_by_name():
@@ -204,5 +160,5 @@ def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
     process, notes = fit_powers(rows_of(data, np.arange(80)), data.site)
     assert process.trend.law is not None and "a distance law" in notes[0]
     near, far = np.array([[0.0, 400.0, 1.5], [0.0, 2400.0, 1.5]]) - data.site.origin
-    mean, *_ = process.mean_and_variance(np.stack([near, far]))
+    mean, *_ = process.answer(torch.from_numpy(np.stack([near, far])))
     assert mean[0] - mean[1] > 10

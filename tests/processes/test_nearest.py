@@ -11,20 +11,22 @@ from gsparc.data.own import interpret
 from gsparc.data.raw import read_raw
 from gsparc.data.selection import keep_above
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.methods import neighbourhood, power_process
-from gsparc.processes.covering import covering
-from gsparc.methods.distance_law import Rows
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.kriging import Kriging
 from gsparc.methods.method import FitContext
-from gsparc.methods.nearest_process import Values, given
-from gsparc.methods.power_kernel import PowerKernel
-from gsparc.methods.power_process import conditioned, exact
 from gsparc.methods.reduced import reduced
+from gsparc.processes import neighbourhood, powers
+from gsparc.processes.covering import covering
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import Nearest, Values
+from gsparc.processes.nearest import given as given_places
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, Rows, conditioned
+from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
-from tests.methods.test_power_process import error_db, fit, town
+from tests.methods.test_power_settings import error_db, fit, town
 
-KERNEL = PowerKernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
+KERNEL = Kernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 
 
 def rows_of(data, count: int) -> Rows:
@@ -33,23 +35,30 @@ def rows_of(data, count: int) -> Rows:
     )
 
 
+def given(rows: Rows, level: float = -100.0) -> PowerProcess:
+    """The same process by nearest rows."""
+    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
+    heard = float(np.average((rows.decibels - rows.decibels.mean()) ** 2)) / KERNEL.amplitude
+    return PowerProcess(given_places(Prior(KERNEL, Trend(level)), values, 0), heard)
+
+
 @pytest.fixture
 def many(monkeypatch):
     """100 rows are already many."""
-    monkeypatch.setattr(power_process, "MOST_ROWS", 100)
+    monkeypatch.setattr(powers, "MOST_ROWS", 100)
     monkeypatch.setattr(neighbourhood, "FEWEST", 30)
 
 
 def test_given_all_rows_as_neighbours_it_is_the_exact_process(monkeypatch):
     monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
     data = town(140)
-    rows, trend = rows_of(data, 120), Trend(-100.0)
-    whole, _ = conditioned(rows, trend, KERNEL, 0)
-    near = given(Values.of(rows.places, rows.decibels), trend, KERNEL, None, np.zeros(0), 0)
-    queries = np.concatenate([data.moving[120:], data.moving[120:] + 3000.0])
-    for one, other in zip(near.mean_and_variance(queries), whole.mean_and_variance(queries), strict=True):
+    rows = rows_of(data, 120)
+    whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    near = given(rows)
+    queries = torch.from_numpy(np.concatenate([data.moving[120:], data.moving[120:] + 3000.0]))
+    for one, other in zip(near.answer(queries), whole.answer(queries), strict=True):
         assert np.allclose(one, other, rtol=1e-5)
-    assert np.allclose(near.mean_at(torch.from_numpy(queries)), whole.mean_at(torch.from_numpy(queries)))
+    assert np.allclose(near.mean_at(queries), whole.mean_at(queries))
 
 
 def test_the_only_place_was_its_own_neighbour():
@@ -66,10 +75,10 @@ def test_rows_of_one_place_are_its_mean_and_lose_nothing(monkeypatch):
     rows = rows_of(data, 60).at(often)
     rows = Rows(rows.places, rows.decibels + rng.normal(size=120), rows.silent)
     whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
-    near = given(Values.of(rows.places, rows.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    near = given(rows)
     assert len(near.places) == 40
     for one, other in zip(
-        near.mean_and_variance(data.moving), whole.mean_and_variance(data.moving), strict=True
+        near.answer(torch.from_numpy(data.moving)), whole.answer(torch.from_numpy(data.moving)), strict=True
     ):
         assert np.allclose(one, other, rtol=1e-4)
 
@@ -79,7 +88,7 @@ def test_thirty_neighbours_tell_nearly_all_and_the_label_says_so(many):
     near, whole = GaussianProcess(), GaussianProcess()
     batch, notes = fit(near, data, 500)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(power_process, "MOST_ROWS", 10_000)
+        patch.setattr(powers, "MOST_ROWS", 10_000)
         fit(whole, data, 500)
     assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
     assert "gp: each place is predicted from the 30 nearest of 500 (Vecchia)" in notes
@@ -94,10 +103,11 @@ def test_silent_rows_stay_known_and_are_counted(many):
     process, notes = conditioned(rows, Trend(-100.0), KERNEL, 0)
     assert any("of 90 silent rows 30, drawn evenly, are looked at" in note for note in notes), notes
     loud = rows.at(np.flatnonzero(~silent))
-    deaf = given(Values.of(loud.places, loud.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    deaf = given(loud)
     truth = 10 * np.log10(data.target[silent, 0])
     heard, unheard = (
-        np.abs(p.mean_and_variance(data.moving[silent])[0] - truth).mean() for p in (process, deaf)
+        np.abs(p.mean_at(torch.from_numpy(data.moving[silent])).numpy() - truth).mean()
+        for p in (process, deaf)
     )
     assert heard < unheard
 
@@ -117,7 +127,7 @@ def test_back_from_disk(many, tmp_path):
 def test_slopes_of_the_mean():
     data = town(120)
     rows = rows_of(data, 120)
-    near = given(Values.of(rows.places, rows.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    near = given(rows)
     at = torch.from_numpy(data.moving[:5] + 1.0).requires_grad_()
     (slope,) = torch.autograd.grad(near.mean_at(at).sum(), at)
     for axis in torch.eye(3, dtype=torch.float64)[:2]:
@@ -129,25 +139,25 @@ def test_left_out_is_a_prediction_without_each_place(monkeypatch):
     monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
     data = town(50)
     rows = rows_of(data, 50)
-    near = given(Values.of(rows.places, rows.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    near = given(rows)
     whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
-    share = np.linalg.inv(np.tril(whole.factor) @ np.tril(whole.factor).T).diagonal()
-    mean, variance = near.left_out()
+    exactly, spread = (part.numpy() for part in whole.posterior.left_out())
+    mean, variance = (part.numpy() for part in near.posterior.left_out())
     order = np.lexsort(rows.places.T[::-1])  # as unique places come
     # What the terms weigh is known from all rows, the one that is left out among them.
-    assert np.abs(mean - (rows.decibels - whole.weights / share)[order]).max() < 0.3
-    assert np.allclose(variance, (KERNEL.amplitude / share)[order], rtol=0.05)
+    assert np.abs(mean[:, 0] - exactly[order, 0]).max() < 0.3
+    assert np.allclose(variance, spread[order], rtol=0.05)
 
 
 def test_covariances_are_those_of_rows_that_cover_the_site(many):
     data = town(400)
     rows = rows_of(data, 300)
     process, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
-    few = exact(process)
-    assert len(few.places) == 100 and exact(few) is few
-    wide, _ = few.mean_and_variance(data.moving[300:])[1:]
-    narrow, _ = process.mean_and_variance(data.moving[300:])[1:]
-    assert (wide >= narrow * 0.99).mean() > 0.95
+    few = process.exact()
+    assert len(few.places) == 100 and few.exact() is few and isinstance(few.posterior, Exact)
+    queries = torch.from_numpy(data.moving[300:])
+    wide, narrow = few.answer(queries)[1], process.answer(queries)[1]
+    assert isinstance(process.posterior, Nearest) and (wide >= narrow * 0.99).float().mean() > 0.95
 
 
 def test_a_parked_car_counts_no_more_than_a_street():

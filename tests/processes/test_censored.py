@@ -1,0 +1,76 @@
+"""Expectation propagation of "below the level": moments, evidence and its slope."""
+
+from __future__ import annotations
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+from scipy.stats import multivariate_normal
+
+from gsparc.processes import censored
+from gsparc.processes.censored import ConditionalGaussian, log_evidence, propagate, truncated
+from gsparc.processes.powers import draw
+
+
+def test_moments_of_a_truncated_normal():
+    z = torch.tensor([-3000.0, -100.0, -31.0, -30.0, -12.0, -1.0, 0.0, 2.0, 4.0], dtype=torch.float64)
+    ratio, lost = truncated(z)
+    for one, mean, share in zip(z.tolist(), ratio.tolist(), lost.tolist(), strict=True):
+        with mpmath.workdps(60):
+            exact = mpmath.npdf(one) / mpmath.ncdf(one)
+            kept = 1 - exact * (exact + one)
+        assert mean == pytest.approx(float(exact), rel=1e-7)
+        assert 1 - share == pytest.approx(float(kept), rel=1e-5)
+    assert all(part.isfinite().all() for part in truncated(torch.tensor([-1e8, 1e8], dtype=torch.float64)))
+
+
+def small_vector(count: int = 8):
+    rng = np.random.default_rng(0)
+    places = rng.uniform(size=(count, 2))
+    gram = 30 * np.exp(-cdist(places, places) / 0.5) + 2 * np.eye(count)
+    values, unknown = rng.multivariate_normal(np.zeros(count), gram), np.arange(count) > 4
+    return tuple(torch.from_numpy(part) for part in (gram, values + unknown, unknown))
+
+
+def test_evidence_and_means_are_those_of_sampling():
+    gram, values, unknown = small_vector()
+    told = ConditionalGaussian.of(gram, values, unknown)
+    sites = propagate(told, values[unknown])
+    normal = multivariate_normal(told.mean, told.covariance, seed=1)
+    assert sites.settled
+    assert sites.log_evidence == pytest.approx(normal.logcdf(values[unknown]), abs=0.03)
+    drawn = normal.rvs(400_000)
+    drawn = drawn[(drawn < values[unknown].numpy()).all(1)]
+    weights = torch.linalg.solve(told.covariance + torch.diag(sites.variance), sites.value - told.mean)
+    assert np.allclose(told.mean + told.covariance @ weights, drawn.mean(0), atol=0.05)
+
+
+def test_the_slope_of_the_evidence(monkeypatch):
+    monkeypatch.setattr(censored, "SETTLED", 1e-10)
+    gram, values, unknown = small_vector()
+    slope = log_evidence(gram, values, unknown)[1]
+    change = np.random.default_rng(1).normal(size=gram.shape)
+    change = 1e-4 * torch.from_numpy(change + change.T)
+    ends = [log_evidence(gram + step * change, values, unknown)[0] for step in (-0.5, 0.5)]
+    assert np.vdot(slope, change) == pytest.approx(ends[1] - ends[0], rel=1e-4)
+
+
+def test_rows_certain_to_be_silent_change_nothing():
+    gram, values, unknown = small_vector()
+    level = values[unknown] + torch.tensor([0.0, 60.0, 0.0])
+    told = ConditionalGaussian.of(gram, values, unknown)
+    kept = told.uncertain(level)
+    assert kept.tolist() == [True, False, True]
+    every, rest = propagate(told, level), propagate(told.at(kept), level[kept])
+    assert np.allclose(every.value[kept], rest.value, atol=1e-2)
+    assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
+
+
+def test_drawn_rows_keep_half_of_what_was_heard():
+    silent = np.arange(1000) >= 100
+    rows = draw(silent, 150, 0)
+    assert len(rows) == 150 and (~silent[rows]).sum() == 75 and (np.diff(rows) > 0).all()
+    assert (~silent[draw(silent, 300, 0)]).sum() == 100
+    assert np.array_equal(draw(silent, 1000, 0), np.arange(1000))

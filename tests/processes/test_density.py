@@ -1,0 +1,68 @@
+"""Densities of rows left out against refitting, and their slopes against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.processes.density import LeftOutDensity, gram_of, walked
+from gsparc.processes.factor import NotPositiveDefiniteError
+from gsparc.processes.kernel import Kernel
+
+KERNELS = (Kernel((0.3,), (1.0,), 0.1), Kernel((0.1, 0.5), (0.3, 0.7), 0.1))
+
+
+def rows(count: int, outputs: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Distances, columns and values."""
+    rng = np.random.default_rng(0)
+    places = torch.from_numpy(rng.uniform(size=(count, 3)))
+    columns = torch.from_numpy(np.c_[np.ones(count), rng.normal(size=count)])
+    return torch.cdist(places, places), columns, torch.from_numpy(rng.normal(size=(count, outputs)))
+
+
+@pytest.mark.parametrize("outputs", [1, 4])
+@pytest.mark.parametrize("bounded", [False, True])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
+    distance, columns, values = rows(40, outputs)
+
+    def density(at: torch.Tensor) -> torch.Tensor:
+        return LeftOutDensity.apply(gram_of(at, distance, columns), values, outputs + 1, bounded)[0]
+
+    at = torch.from_numpy(kernel.parameters()).requires_grad_()
+    (slope,) = torch.autograd.grad(density(at), at)
+    for axis in torch.eye(len(at), dtype=torch.float64):
+        ends = [float(density(at.detach() + h * axis)) for h in (-1e-5, 1e-5)]
+        assert float(slope @ axis) == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-5)
+
+
+def test_it_is_that_of_refitting_without_each_row_at_the_best_amplitude():
+    distance, columns, values = rows(12, 3)
+    gram = gram_of(torch.from_numpy(KERNELS[1].parameters()), distance, columns)
+    density, amplitude = (float(part) for part in LeftOutDensity.apply(gram, values, 3, False))
+    total, g, y = 0.0, gram.numpy(), values.numpy()
+    for i in range(12):
+        rest = np.delete(np.arange(12), i)
+        weights = np.linalg.solve(g[np.ix_(rest, rest)], g[rest, i])
+        variance = amplitude * (g[i, i] - weights @ g[rest, i])
+        errors = (y[i] - weights @ y[rest]) ** 2
+        total += (0.5 * np.log(2 * np.pi * variance) + 0.5 * errors / variance).sum()
+    assert density == pytest.approx(total / 3, rel=1e-9)
+
+
+def test_kernels_are_their_parameters():
+    for kernel in KERNELS:
+        again = Kernel.of(kernel.parameters(), kernel.amplitude)
+        numbers = [*again.lengths, *again.shares, again.noise]
+        assert np.allclose(numbers, [*kernel.lengths, *kernel.shares, kernel.noise])
+
+
+def test_a_walk_starts_at_the_best_and_goes_round_what_has_no_factor():
+    def objective(at: torch.Tensor) -> torch.Tensor:
+        if at[0].item() > 2:
+            raise NotPositiveDefiniteError
+        return (at[0] - 1).square()
+
+    best, value = walked(objective, [np.array([3.0]), np.array([-1.0])], [(-5.0, 5.0)], 40, 1e-9)
+    assert best[0] == pytest.approx(1.0, abs=1e-3) and value < 1e-6
