@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "processes", "physics", "data", "simulate", "field", "methods", "training", "array"]
-ROOMS += ["multipath", "peers", "auto", "evaluation", "maps", "view", "commands", "callbacks", "conf"]
+ROOMS += ["multipath", "peers", "evaluation", "maps", "view", "commands", "callbacks", "conf"]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -30,7 +30,6 @@ ARROWS = {
     "array": "data field methods ops physics training processes",
     "multipath": "data field methods ops physics processes",
     "peers": "data field methods ops physics simulate training",
-    "auto": "data methods ops",
     "evaluation": "data methods",
     "maps": "data evaluation methods processes",
     "view": "data evaluation maps methods ops",

@@ -74,7 +74,6 @@ METHODS = {
     "nerf2_published": Look("#000000", "^", True),
     "image_source_gp": Look("#000000", "v"),
     "nearest": Look("#332288", "^"),
-    "auto": Look("#332288", "d", True),
     "gsrf": Look("#882255", "P"),
     "ngrf": Look("#882255", "s", True),
     "mean": Look(GREY, "o"),

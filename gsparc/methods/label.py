@@ -1,4 +1,4 @@
-"""One name for several fits of one method, of folds or of stations, that may have chosen differently."""
+"""One name for several fits of one method, of folds or of stations, that may approximate differently."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsparc.methods.method import Method
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:
-    """Their label where they share one, else the most frequent: `auto (gp in 3 of 5)`."""
+    """Their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
     found = Counter(method.label for method in methods)
     if not found:
         return name

@@ -146,11 +146,10 @@ class Method(ABC):
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
     takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
-    own_budget_s: float | None = None  # of all stations together, where `FitContext.budget_s` says nothing
 
     @property
     def label(self) -> str:
-        """The name as people read it, with what the fit chose where it chose between methods."""
+        """The name as people read it, with how the fit approximates."""
         return self.name
 
     @abstractmethod
@@ -193,10 +192,6 @@ class Method(ABC):
 
     def usual_s(self, site: Site) -> float | None:
         """Seconds of all stations together where `FitContext.budget_s` says nothing; None: no end [s]."""
-        return self.own_budget_s
-
-    def problem(self, data: Measurements) -> str | None:
-        """Why it cannot serve these measurements, as far as that is known before a fit; None where it may."""
         return None
 
     def facts(self) -> dict[str, float | int | str | None]:

@@ -36,7 +36,6 @@ METHODS = {
     "array": "gsparc.array.method.ArrayField",
     "moving_array": "gsparc.array.moving.method.MovingArrayField",
     "gsparc": "gsparc.training.gsparc.Gsparc",
-    "auto": "gsparc.auto.auto_method.Auto",
 }
 
 INITIALISERS = {  # of a splatted field, by the coherent term they are for

@@ -13,7 +13,6 @@ from scipy.stats import norm, t
 
 LEAST_WEIGHT = 0.05  # of a prediction in a mixture, below which it is left out
 PARTS = 5  # of the units; weights are learned on all but one, and tried on that
-CLEAR = 2.0  # standard errors of a paired difference
 
 
 def best_weights(gram: np.ndarray) -> np.ndarray:
@@ -43,21 +42,6 @@ def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
     return mean, few * float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
 
 
-def clearly_worse(own: np.ndarray, best: np.ndarray, both: np.ndarray, unit: np.ndarray) -> bool:
-    """Whether squared errors (n,) are clearly larger than the best's, and a mixture would not want them.
-
-    Args:
-        own, best: (n,) of the same rows.
-        both: (n,) products of the two errors.
-        unit: (n,) of the rows, see `paired`.
-    """
-    behind, error = paired(own - best, unit)
-    if not behind > CLEAR * error:
-        return False
-    a, b, c = (float(np.mean(part)) for part in (own, best, both))
-    return best_weights(np.array([[a, c], [c, b]]))[0] < LEAST_WEIGHT
-
-
 def choose(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """Weights (K,) of the predictions: one alone, unless a mixture is better by more than a standard error.
 
@@ -84,17 +68,6 @@ def choose(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
 def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
     """Squared errors (n,) of a mixture (K,) from products (n, K, K)."""
     return np.einsum("k,nkl,l->n", weights, gram, weights)
-
-
-def spread(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """Mean squares (n,) of the predictions about their mixture (K,), from products (n, K, K)."""
-    return np.maximum(np.einsum("k,nkk->n", weights, gram) - squared(weights, gram), 0.0)
-
-
-def variance_scale(error: np.ndarray, variance: np.ndarray) -> float:
-    """The factor by which variances (n,) are most likely those of squared errors (n,)."""
-    least = max(1e-6 * float(variance.mean()), np.finfo(float).tiny)
-    return max(float(np.mean(error / np.maximum(variance, least))), 1e-6)
 
 
 def _pruned(gram: np.ndarray) -> np.ndarray:

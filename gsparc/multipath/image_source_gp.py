@@ -117,15 +117,6 @@ class ImageSourceGP(FramedMethod):
         self.members: list[PhasedPosterior] = []
 
     # ---- fitting ----
-    def problem(self, data: Measurements) -> str | None:
-        """See `Method.problem`."""
-        try:
-            refuse(data.site, self.name)
-            refuse_turning(data)
-        except ValueError as refused:
-            return str(refused)
-        return None
-
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood.
 

@@ -73,7 +73,7 @@ class CalibratedRayTracer(Method):
         self._traced_effects()
 
     def problem(self, data: Measurements) -> str | None:
-        """See `Method.problem`."""
+        """Why it cannot serve these measurements; None where it may."""
         site = data.site
         if site.kind not in self.kinds:
             return f"{self.name}: needs received powers or channels, not {site.kind}"

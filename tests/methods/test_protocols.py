@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from invented import invent
 from rooms import shoebox
 
-from gsparc.auto.auto_method import Auto
 from gsparc.data.splits import Fold
 from gsparc.methods import method as protocols
 from gsparc.methods.checkpoint import Stored, load
@@ -32,7 +30,7 @@ FILES = {  # of methods whose name has changed since
     "nerf2": "nerf2_trunk",
 }  # fmt: skip
 DECLARED = {
-    **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink", "auto"), ""),
+    **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink"), ""),
     **dict.fromkeys(("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf"), ""),
     "calibrated_raytracer": "",
     "distance_law": "Differentiable",
@@ -45,7 +43,7 @@ DECLARED = {
     "gsparc": "Differentiable HasPaths Reducible",
 }
 VARIANCE = (
-    "kriging", "auto", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
+    "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
     "moving_array",
 )  # fmt: skip
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
@@ -65,19 +63,10 @@ def read(file: str) -> tuple[Method, Stored]:
     return load(FIXTURES / f"{file}.ckpt")
 
 
-@cache
-def chosen() -> Method:
-    """`auto` is younger than those files."""
-    data, rows = invent("csi", 48), np.arange(48)
-    method = Auto(["idw", "gp"])
-    method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
-    return method
-
-
 def fitted(name: str) -> Method:
     if name == "calibrated_raytracer":  # fitted where a scene and Sionna are: tests/peers
         return CalibratedRayTracer()
-    return chosen() if name == "auto" else read(FILES.get(name, name))[0]
+    return read(FILES.get(name, name))[0]
 
 
 def places(method: Method, count: int = 5) -> torch.Tensor:

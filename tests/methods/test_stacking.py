@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.methods.stacking import best_weights, choose, clearly_worse, paired, squared, variance_scale
+from gsparc.methods.stacking import best_weights, choose, paired, squared
 
 
 def gram_of(errors: np.ndarray) -> np.ndarray:
@@ -70,18 +70,3 @@ def test_of_one_unit_nothing_tells_whether_a_mixture_pays():
 def test_small_weights_are_left_out():
     weights = choose(gram_of(drawn([1.0, 1.0, 6.0], 4000)), np.arange(4000))
     assert weights[2] == 0 and weights.sum() == pytest.approx(1)
-
-
-@pytest.mark.parametrize(
-    "deviations,given_up", [([3.0, 1.0], False), ([9.0, 1.0], True), ([1.0, 1.0], False)]
-)
-def test_hopeless_is_what_is_clearly_worse_and_adds_nothing(deviations, given_up):
-    own, best = drawn(deviations, 100).T
-    assert clearly_worse(own**2, best**2, own * best, np.arange(100)) == given_up
-
-
-def test_variances_are_scaled_to_the_errors():
-    rng = np.random.default_rng(0)
-    variance = rng.uniform(1, 2, 5000)
-    assert variance_scale(3 * variance * rng.normal(size=5000) ** 2, variance) == pytest.approx(3, rel=0.1)
-    assert np.isfinite(variance_scale(np.ones(3), np.zeros(3)))

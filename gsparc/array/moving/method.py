@@ -127,10 +127,6 @@ class MovingArrayField(Interpolator):
         self._budget, self._lags = context.time_budget(), None
         return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
 
-    def problem(self, data: Measurements) -> str | None:
-        """See `Method.problem`."""
-        return site_problem(data)
-
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`; searches where there are several."""
         own = ("keep", "stride", "confidence")

@@ -50,7 +50,7 @@ class Row:
         to_copy: the median in units of a 16 MiB copy of the same rounds.
         load: 1-minute load per core at the end of the training, mean over seeds.
         earlier: commits of earlier program text that it was measured with; empty for today's.
-        chosen: what a method that chooses between models chose most often, ` (gp .7 + idw .3)`; else empty.
+        label: what most draws say behind the method's name, ` (Vecchia 30)`; else empty.
     """
 
     dataset: str
@@ -78,7 +78,7 @@ class Row:
     to_copy: float | None
     load: float | None
     earlier: str = ""
-    chosen: str = ""
+    label: str = ""
 
 
 def score_db(kind: Kind, facts: Mapping[str, Any]) -> float:
@@ -158,11 +158,11 @@ def _row(same: list[Filled], latency: Latency | None, best: Mapping[int | None, 
         query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,
         to_copy=latency.to_copy if latency else None, load=mean("machine/load"),
         earlier=" ".join(sorted({one.earlier for one in same if one.earlier})),
-        chosen=_chosen(facts),
+        label=_label(facts),
     )  # fmt: skip
 
 
-def _chosen(facts: Sequence[Mapping[str, Any]]) -> str:
+def _label(facts: Sequence[Mapping[str, Any]]) -> str:
     """What stands behind the name of the method in the label that most of its draws have."""
     label, _ = Counter(str(f.get("model/label") or "") for f in facts).most_common(1)[0]
     return label[label.find(" (") :] if " (" in label else ""
@@ -303,7 +303,7 @@ def _columns(block: Block) -> dict[str, Callable[[Row], str]]:
         return shown(value, form) + ("" if error is None else f" ± {error:{form}}")
 
     found: dict[str, Callable[[Row], str]] = {
-        "method": lambda r: r.method + r.chosen,
+        "method": lambda r: r.method + r.label,
         SCORE[some.figure]: lambda r: near(r.score_db, r.spread_db, ".2f"),
     }
     if drawn:

@@ -102,7 +102,7 @@ def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_
     assert short.config.budget_s == 5 and short.folder != long.folder
 
 
-@pytest.mark.parametrize("model", ["gsparc", "auto", "moving_array"])
+@pytest.mark.parametrize("model", ["gsparc", "moving_array"])
 def test_every_seed_is_a_cell_of_its_own(model, tmp_path):
     """The first seed of gsparc stood for all three: a spread of 0.00."""
     problem = Problem("own", "random", "spectrum", ("d", "s", "i"))

@@ -145,11 +145,11 @@ def test_page_sheet_and_picture_show_every_method(tmp_path):
     assert (tmp_path / "compare.png").stat().st_size > 10_000
 
 
-def test_what_a_method_chose_stands_behind_its_name():
-    chose = ["auto (gp)", "auto (gp .7 + idw .3)", "auto (gp)"]
-    found = [filled("auto", 30.0 + i, i, 60.0) for i in range(3)]
-    for one, label in zip(found, chose, strict=True):
+def test_how_a_method_approximates_stands_behind_its_name():
+    labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
+    found = [filled("gp", 30.0 + i, i, 60.0) for i in range(3)]
+    for one, label in zip(found, labels, strict=True):
         one.facts["model/label"] = label
     (row,) = rows([*found], {})
-    assert (row.method, row.chosen) == ("auto", " (gp)")
-    assert "auto (gp)" in markdown(blocks([row]), "gsparc")
+    assert (row.method, row.label) == ("gp", " (Vecchia 30)")
+    assert "gp (Vecchia 30)" in markdown(blocks([row]), "gsparc")
