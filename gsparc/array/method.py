@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from gsparc.data.schema import Site
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings
 from gsparc.field.response import ResponseSettings
@@ -39,13 +36,3 @@ class ArrayField(LearnedField):
     def trainer_options(self) -> bool:
         """See `TrainsByGradient`: it is solved in closed form."""
         return False
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`.
-
-        Raises:
-            ValueError: the state is of an earlier version's wave packets.
-        """
-        if "packets" in state:
-            raise ValueError("it is made of wave packets, as earlier versions were; train it again")
-        super().restore(site, state)

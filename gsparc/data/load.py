@@ -37,8 +37,8 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     """The data module that a config of the group `dataset` describes; nothing is read yet.
 
     Args:
-        config: `_target_` and its arguments; without `_target_`, as in checkpoints of earlier versions,
-            what conf/dataset holds under `name`, with these settings.
+        config: `_target_` and its arguments; without `_target_`, what conf/dataset holds under
+            `name`, with these settings.
         trusted: False for text out of a file: then every `_target_` must be a class of gsparc.
 
     Raises:

@@ -100,7 +100,7 @@ class Site:
         stations: the static ends where there are several; `Measurements.station` says which a row is of.
         georeference: where on Earth the world's origin lies; None when unknown.
         moving_box: (2, 3) float64 [m], lower and upper corner of where the moving end was, *local*; (2, 6)
-            of both as in `Measurements.moving`; None in models of earlier versions.
+            of both as in `Measurements.moving`.
         level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
     """
 
@@ -113,6 +113,7 @@ class Site:
     subcarriers_hz: np.ndarray | None
     origin: np.ndarray
     box: np.ndarray
+    moving_box: np.ndarray
     sha256: str
     normalisation: str = "none"
     target_scale: float = 1.0
@@ -125,7 +126,6 @@ class Site:
     antennas: np.ndarray | None = None
     stations: Stations | None = None
     georeference: Georeference | None = None
-    moving_box: np.ndarray | None = None
     level_unit: str = "dB"
 
     @property

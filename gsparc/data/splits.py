@@ -20,7 +20,6 @@ from gsparc.data.files import whole_file
 log = logging.getLogger(__name__)
 
 NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs")
-OLD_NAMES = {"block": "corner"}  # in configurations of earlier runs
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
@@ -106,7 +105,6 @@ class SplitSettings:
     leave_out: Sequence[int] | Literal["outliers"] | int = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", OLD_NAMES.get(self.name, self.name))
         if self.name not in NAMES:
             close = difflib.get_close_matches(self.name, [*NAMES, "file"], n=1)
             hint = f"; did you mean {close[0]!r}?" if close else ""

@@ -130,8 +130,6 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
         return corners.min(axis=0), corners.max(axis=0), Outline(corners).contains_points
     if site is None:
         raise DataError("area: nothing says where; give ckpt=FILE, area=[x0,y0,x1,y1] or plan=IMAGE")
-    if site.moving_box is None:
-        raise DataError("area: this model, of an earlier version, does not say where was measured; give it")
     low, high = site.moving_box[:, -3:][:, :2] + site.origin[:2]
     margin = 0.02 * max(float((high - low).max()), 1e-6)
     return low - margin, high + margin, None
@@ -166,8 +164,6 @@ def _height(site: Site | None, given: float | None) -> float:
     known = usual_heights(site).get(site.moving_end)
     if known is not None:
         return known
-    if site.moving_box is None:
-        raise DataError("height_m: this model does not say at which height was measured; give it")
     low, high = site.moving_box[:, -1] + site.origin[2]
     return float((low + high) / 2)
 

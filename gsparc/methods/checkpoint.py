@@ -19,12 +19,11 @@ from gsparc.data.files import whole_file
 from gsparc.data.raw import stored_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.methods.method import Method
-from gsparc.methods.old_names import OLD_NAMES, renamed
 from gsparc.methods.per_station import PerStation
 from gsparc.methods.registry import build, known, method_class
 from gsparc.ops import SphereGrid
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2  # of what a checkpoint holds; a file of another is refused
 FORMAT = "gsparc-checkpoint"
 DEEPEST = 50  # of containers in containers
 MODEL = "model.ckpt"  # of a run's folder
@@ -76,7 +75,7 @@ class Stored:
         except (yaml.YAMLError, RecursionError, ValueError):
             damaged = f"{self.path}: its configuration is not YAML; the file is damaged"
             raise CheckpointError(damaged) from None
-        return renamed(loaded) if isinstance(loaded, dict) else {}
+        return loaded if isinstance(loaded, dict) else {}
 
 
 def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str, Any] | None = None) -> None:
@@ -140,8 +139,8 @@ def read(path: str | Path) -> Stored:
     """Read a checkpoint onto the CPU; runs no code from the file.
 
     Raises:
-        CheckpointError: missing, not a checkpoint, damaged, hostile, of a newer gsparc, or holding numbers
-            that are NaN or infinite.
+        CheckpointError: missing, not a checkpoint, damaged, hostile, of another schema version, or holding
+            numbers that are NaN or infinite.
     """
     path = Path(path)
     return _stored(_content(path), path)
@@ -176,9 +175,11 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
     version = content.get("schema_version")
-    if not isinstance(version, int) or version > SCHEMA_VERSION:
+    if type(version) is not int or version != SCHEMA_VERSION:
+        found = "without a schema version" if version is None else f"in schema {version!r}"
         raise CheckpointError(
-            f"{path}: written in schema {version}, this gsparc reads up to {SCHEMA_VERSION}; update gsparc"
+            f"{path}: written {found}, this gsparc reads {SCHEMA_VERSION} alone; "
+            "train again with this version"
         )
     if _overgrown(content):  # what walks over it would not end
         raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")
@@ -203,7 +204,7 @@ def _stored(content: Mapping[str, Any], path: Path) -> Stored:
     try:
         return Stored(
             method=str(content["method"]),
-            target=OLD_NAMES.get(str(content["target"]), str(content["target"])),
+            target=str(content["target"]),
             config=str(content["config"]),
             site=_site_from(content["site"]),
             state=dict(content["state"]),

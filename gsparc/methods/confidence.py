@@ -84,7 +84,7 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
 
 def keep(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    checkpoint.amend(path, {KEY: {**asdict(trusted), "unclipped": True}})
+    checkpoint.amend(path, {KEY: asdict(trusted)})
 
 
 def kept(extra: Mapping[str, Any]) -> Trusted:
@@ -95,11 +95,7 @@ def kept(extra: Mapping[str, Any]) -> Trusted:
     promise = None if found["promise"] is None else Promise(**found["promise"])
     kernel = None if found["kernel"] is None else Kernel(**found["kernel"])
     known = np.asarray(found["known"], np.float64)
-    kind, threshold = found["kind"], float(found["threshold"])
-    if kind == "gp_variance" and not found.get("unclipped") and threshold <= 1:
-        # Earlier versions kept 1 - variance, cut off at 0: there every place was accepted, now none is.
-        threshold = float(as_confidence(kind, np.array(threshold - 1))) if threshold > 0 else float("inf")
-    return Trusted(kind, threshold, promise, known, kernel)
+    return Trusted(found["kind"], float(found["threshold"]), promise, known, kernel)
 
 
 def threshold_of(kind: str, found: Threshold) -> float:

@@ -12,7 +12,7 @@ import yaml
 
 from gsparc.data.assemble import content_hash
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold, SplitSettings, indices_hash
+from gsparc.data.splits import Fold, indices_hash
 from gsparc.methods.checkpoint import Stored
 from gsparc.methods.method import FitContext
 
@@ -77,16 +77,15 @@ class Origin:
         before, now = stored.configuration, yaml.safe_load(self.config) or {}
         own, found = self._hashes(), []
         kept = stored.extra.get("origin")
-        if kept is None:  # earlier versions kept less
-            kept = {"data": stored.site.sha256, "seed": before.get("seed", self.seed)}
-            found += _differences(_with_split(before), _with_split(now), ("split",))
+        if kept is None:
+            raise ValueError(f"ckpt_path={stored.path}: does not say what it learned from; start without it")
         for name, group, what in _HASHED:
-            if kept.get(name, own[name]) != own[name]:
+            if kept[name] != own[name]:
                 found.append(", ".join(_differences(before, now, (group,))) or f"other {what}")
         if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
             facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}
             found += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
-        if kept.get("seed", self.seed) != self.seed:
+        if kept["seed"] != self.seed:
             found.append(f"seed={kept['seed']} (here {self.seed})")
         found += _differences(before, now, DECIDING)
         if found:
@@ -107,14 +106,6 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
     under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
-
-
-def _with_split(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with every setting of its split; settings that came later have their defaults."""
-    split = config.get("split")
-    return (
-        {"split": {**vars(SplitSettings()), "leave_out": [], **split}} if isinstance(split, Mapping) else {}
-    )
 
 
 def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

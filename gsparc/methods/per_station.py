@@ -272,7 +272,7 @@ class PerStation(Method):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self._shared = site, bool(state.get("shared", False))
+        self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
             self._copies[int(number)] = copy = self._make()
             copy.restore(self._site_of(site, int(number)), part)

@@ -390,8 +390,6 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
 
 def usual_heights(site: Site) -> dict[End, float]:
     """World height [m] of each end that moved and was always at the same height."""
-    if site.moving_box is None:
-        return {}
     moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
     low, high = site.moving_box[:, 2::3]
     # Rounded: the origin was taken away from it.

@@ -291,15 +291,11 @@ class ComplexGP(Method):
         if "level" in state:
             self.near = Neighbourhood(self.places.numpy(), state["level"].numpy())
             self.targets = state["targets"].numpy()
-            once = torch.ones(len(self.places), dtype=torch.float64)  # earlier versions took every row
-            self.count = state.get("count", once).numpy()
-            self.first = state["first"].numpy() if "first" in state else np.arange(len(self.places))
+            self.count, self.first = state["count"].numpy(), state["first"].numpy()
             self.runs = RunFactors.none()
             return
         self.weights, self.factor = state["weights"], Factor(state["factor"])
-        ones = torch.ones(len(self.places), dtype=torch.complex128)  # earlier versions knew no runs
-        self.turned = state.get("turned", ones)
-        self.runs = RunFactors.read(state if "runs" in state else None)
+        self.turned, self.runs = state["turned"], RunFactors.read(state)
 
     def size(self) -> int:
         """Training samples kept."""

@@ -344,10 +344,7 @@ class DirectionalGP(FramedMethod):
         """See `Method.restore`."""
         self.rows = self._restore_frame(site, state)
         self.observer, self.power, points = state["observer"], state["power"], state["sources"]
-        # older checkpoints have exact directions and no covariances
-        self.positions = UncertainPositions(
-            points, state.get("open", torch.zeros(len(points), 3, 3, dtype=torch.float64))
-        )
+        self.positions = UncertainPositions(points, state["open"])
         self.kernel, self.visibility = GainKernel(*state["law"]), VisibilityGP(*state["sightings"])
         self._prepare()
 

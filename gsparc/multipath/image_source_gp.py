@@ -443,9 +443,7 @@ class ImageSourceGP(FramedMethod):
         """See `Method.restore`."""
         rows = self._restore_frame(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
-        ones = torch.ones(self.antennas, dtype=torch.complex64)  # models of earlier versions have none
-        self.factors = state.get("factors", ones)
-        self.edges = Edges(*state["edges"]) if "edges" in state else Edges.none()
+        self.factors, self.edges = state["factors"], Edges(*state["edges"])
         scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
         self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]
         self.query = Query(self.members)

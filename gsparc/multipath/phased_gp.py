@@ -71,10 +71,7 @@ class PhasedScene:
     @staticmethod
     def from_state(state: dict[str, Any]) -> PhasedScene:
         """Inverse of `state`."""
-        sequences, kernel = (
-            tuple(map(tuple, state.get("sequences") or state["words"])),
-            KernelVisibility(*state["visibility"]),
-        )
+        sequences, kernel = tuple(map(tuple, state["sequences"])), KernelVisibility(*state["visibility"])
         clutter = Clutter(state["boxes"], state["patches"], tuple(state["patched"]))
         sources = (sequences, state["log_amplitude"], float(state["log_noise"]))
         scene = Scene(state["transmitter"], state["planes"], *sources, kernel, clutter)

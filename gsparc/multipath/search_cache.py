@@ -71,7 +71,7 @@ class SearchCache:
         try:
             stored = torch.load(stored_archive(file), weights_only=True)
             before, kept, wall = dict(stored["depends_on"]), dict(stored[SEARCHES]), float(stored["spent_s"])
-            spent = Spent(wall, float(stored.get("processor_s", wall)))  # older files know one clock
+            spent = Spent(wall, float(stored["processor_s"]))
         except Exception as error:  # any error of a damaged or foreign file
             raise ValueError(
                 f"ckpt_path={file}: holds no finished searches ({type(error).__name__}); start without it"

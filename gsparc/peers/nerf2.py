@@ -16,12 +16,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Batch, Kind, Site
+from gsparc.data.schema import Batch, Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.ops import Pose
 from gsparc.peers.deformation import perceptron
@@ -59,12 +59,6 @@ class NeRF2(TrainedPeer):
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
         return MarchedField(scene, self)
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`; `ValueError` of networks of another form."""
-        if "radiance.0.weight" in state["network"]:
-            raise ValueError("its networks are of an earlier form than the published one; train it again")
-        super().restore(site, state)
 
 
 class MarchedField(Network):

@@ -42,7 +42,7 @@ from gsparc.training.lightning_module import GaussianModule
 from gsparc.training.process_average import Summed, averaged, mean_alone
 from gsparc.training.solution_weights import comparable
 from gsparc.training.splatting import QUERY_CHUNK, LearnedField
-from gsparc.training.stored_field import as_today, restored, stored
+from gsparc.training.stored_field import restored, stored
 from gsparc.training.terms import EffectSettings, Plan, plan
 from gsparc.training.time_budget import Pace
 
@@ -411,7 +411,7 @@ class Gsparc(LearnedField):
             twin = copy.copy(self)
             twin._average = None
             found = LearnedField.reduced(twin, own, measured)
-            share = float(settings.get("beside", 1.0)) if keep else 0.0  # earlier fronts say hybrid=false
+            share = float(settings.get("beside", 1.0)) if keep else 0.0
             return averaged(found, *self._average, share) if share and self._average is not None else found
         if method is None or isinstance(self.field, StackedField):
             return self
@@ -437,29 +437,20 @@ class Gsparc(LearnedField):
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`.
-
-        Raises:
-            ValueError: an earlier version's, in which another method had been chosen.
-        """
-        state = as_today(state)
+        """See `Method.restore`."""
         self.site, self.field, self._average, self._average_mean = site, None, None, None
-        response = replace(
-            self.settings.response, array=bool(state.get("array", self.switches.array is True))
-        )
+        response = replace(self.settings.response, array=bool(state["array"]))
         self.settings = replace(self.settings, response=response)
-        if state.get("field") is not None:
+        if state["field"] is not None:
             self.field = restored(site, state["field"])
         else:
             super().restore(site, state["inner"])
-        if state.get("beside") is not None:
+        if state["beside"] is not None:
             method = method_class(state["beside"]["name"])()
             method.restore(site, state["beside"]["state"])
             self._average = method, float(state["beside"]["weight"])
-        facts = state.get("facts", {})
-        self.explained, self.steps = facts.get("explained"), int(facts.get("steps", 0))
-        self.started = str(state.get("init", ""))
-        self.runs = RunFactors.read(state.get("runs"))
+        self.explained, self.steps = state["facts"]["explained"], int(state["facts"]["steps"])
+        self.started, self.runs = str(state["init"]), RunFactors.read(state["runs"])
 
     def size(self) -> int:
         """Number of Gaussians."""

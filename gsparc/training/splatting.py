@@ -132,7 +132,7 @@ class LearnedField(Method):
             origin.refuse_other(resumed)
         marks = {} if resumed is None else resumed.extra
         stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
-        budget = context.time_budget(before=Spent(*marks.get("spent", (seconds, seconds))))
+        budget = context.time_budget(before=Spent(*marks.get("spent", ())))
         now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self.spent, self._apart = {}, _apart(data, fold)
@@ -381,7 +381,7 @@ class LearnedField(Method):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the field whose `state()` this was."""
         self.site = site
-        self.choices = _choices(state["choices"])
+        self.choices = Choices(**state["choices"])
         self._ends = dict(state["ends"])
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
@@ -393,14 +393,6 @@ class LearnedField(Method):
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.fitted().gaussians)
-
-
-def _choices(stored: dict[str, Any]) -> Choices:
-    """Choices of a checkpoint; earlier versions had another key for the closed-form start."""
-    known = dict(stored)
-    if known.pop("warm_start", False):
-        known["init"] = "images"
-    return Choices(**known)
 
 
 def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:

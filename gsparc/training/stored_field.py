@@ -1,4 +1,4 @@
-"""What `model=gsparc` keeps in a checkpoint: fields made of fields, and states of earlier versions."""
+"""What `model=gsparc` keeps in a checkpoint: fields made of fields."""
 
 from __future__ import annotations
 
@@ -7,28 +7,6 @@ from typing import Any
 from gsparc.data.schema import Site
 from gsparc.field.conditional import CompletedField, ConditionalField, StackedField
 from gsparc.methods.registry import field_restored
-
-
-def as_today(state: dict[str, Any]) -> dict[str, Any]:
-    """A state of today's keys, of one from when `model=gsparc` chose among other methods.
-
-    Raises:
-        ValueError: it had chosen what is no longer there.
-    """
-    if "chosen" not in state:
-        return state
-    chosen = {"bearings": "moving_array"}.get(state["chosen"], state["chosen"])
-    if chosen == "array":
-        raise ValueError("it is made of wave packets, as earlier versions were; train it again")
-    if state.get("rest") is not None:
-        raise ValueError("it has a companion of an earlier version; train it again")
-    if chosen is None:
-        parameters = state["inner"]["model"]
-        if "response.steering" in parameters and "response.delays" not in parameters:
-            raise ValueError("its carrier phase is of splatted Gaussians, as in earlier versions; train anew")
-        return {"inner": state["inner"], "init": state["inner"]["choices"]["init"]}
-    kind = {"phase": "sources", "directions": "rays", "moving_array": "bearings"}[chosen]
-    return {"inner": None, "field": {"kind": kind, "method": state["inner"]}, "init": kind}
 
 
 def stored(field: ConditionalField) -> dict[str, Any]:

@@ -105,9 +105,8 @@ class Budget(L.Callback):
         return {"seconds": self._learned.wall, "processor_s": self._learned.processor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there; older files know one clock."""
-        wall = float(state["seconds"])
-        self._resumed = Spent(wall, float(state.get("processor_s", wall)))
+        """Go on from there."""
+        self._resumed = Spent(float(state["seconds"]), float(state["processor_s"]))
         self.budget.charge(self._resumed)
 
 

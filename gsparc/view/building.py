@@ -198,7 +198,7 @@ def _moved(cloud: GaussianCloud, by: np.ndarray) -> GaussianCloud:
 
 def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]:
     """Local places of both ends at which emissions are asked."""
-    box = site.box if site.moving_box is None else site.moving_box[:, -3:]
+    box = site.moving_box[:, -3:]
     places = np.random.default_rng(0).uniform(box[0], box[1], (QUERIES, 3))
     if measured is not None:
         places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)] - site.origin

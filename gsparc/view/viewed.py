@@ -125,9 +125,7 @@ class Viewed:
 
     def box(self) -> np.ndarray:
         """(2, 3) world corners of where the moving end was [m]."""
-        site = self.site
-        box = site.box if site.moving_box is None else site.moving_box[:, -3:]
-        return np.asarray(box + site.origin)
+        return np.asarray(self.site.moving_box[:, -3:] + self.site.origin)
 
     def heights(self) -> tuple[float, float]:
         """Between which a plane can be lifted [m], to the centimetre."""

@@ -196,11 +196,6 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
         ArrayField().predict(torch.zeros(1, 3), None)
 
 
-def test_a_field_of_wave_packets_is_not_read_any_more():
-    with pytest.raises(ValueError, match="made of wave packets, as earlier versions were; train it again"):
-        ArrayField().restore(array_site(SphereGrid.hemisphere(4, 6), planar_array()), {"packets": {}})
-
-
 @pytest.mark.parametrize("rows", [1, 3])
 def test_very_few_rows(known_campaign, tmp_path, rows):
     data, _ = known_campaign

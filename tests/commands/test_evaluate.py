@@ -134,12 +134,12 @@ def test_another_subset_and_split(trained, caplog):
 
 
 def test_a_checkpoint_that_names_no_rows_is_marked_unless_its_settings_do(trained, tmp_path):
-    """Written from Python, or by an earlier version: any split was taken for its own."""
+    """Written from Python: any split was taken for its own."""
     method, stored = checkpoint.load(trained)
     bare = tmp_path / "bare.ckpt"
     checkpoint.save(bare, method, stored.config)
     assert evaluate_files([bare])[0].facts["split/foreign"] is None
-    said = evaluate_files([bare], split={"name": "block"})[0].facts["split/foreign"]
+    said = evaluate_files([bare], split={"name": "corner"})[0].facts["split/foreign"]
     assert re.match(r"another split \(random\): [1-9]\d* of these \d+ test rows were TRAINED on", said)
     checkpoint.save(bare, method)
     said = evaluate_files([bare], stored.configuration["dataset"], {"name": "random"})[0].facts[

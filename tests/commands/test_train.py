@@ -257,28 +257,6 @@ def test_facts_beside_the_content_hash_are_of_an_origin(interrupted, what, chang
         now.refuse_other(stored)
 
 
-@pytest.mark.parametrize(
-    "change, said",
-    [("split.seed=9", r"split\.seed=0 \(here 9\)"), ("seed=4", r"seed=0 \(here 4\)"), (None, None)],
-)
-def test_old_checkpoints_go_on_with_the_split_of_their_configuration(interrupted, tmp_path, change, said):
-    """Without `origin` another split or seed passed; settings that came later have their defaults."""
-    file, last = interrupted
-
-    def age(content: dict) -> None:
-        del content["extra"]["origin"]
-        content["config"] = content["config"].replace("  leave_out: []\n", "")
-
-    old = altered(last, tmp_path / "old.ckpt", age)
-    assert "leave_out" not in checkpoint.read(old).config
-    settings = brief(file, "model.refit=false", f"ckpt_path={old}", *([change] if change else []))
-    if said is None:
-        assert np.isfinite(train(compose(*settings), tmp_path / "run")[0]["test/psnr_db"])
-        return
-    with pytest.raises(ValueError, match=rf"old\.ckpt: was trained with {said}"):
-        train(compose(*settings), tmp_path / "run")
-
-
 def test_weights_to_start_from_beside_a_run_to_go_on_from_are_refused(interrupted, tmp_path):
     """`init_from=` was ignored; a run that began with it goes on with it, in its coordinates."""
     file, last = interrupted

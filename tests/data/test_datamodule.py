@@ -122,8 +122,8 @@ def test_every_config_names_a_data_module_of_its_own(name):
     module = datamodule(compose(f"dataset={name}", *(f"dataset.{k}={v}" for k, v in stored.items())).dataset)
     assert isinstance(module, DataModule) and type(module).__module__.startswith("gsparc.")
     assert (module.name, module.batch_size) == (name, 16)
-    earlier = datamodule(stored, trusted=False)  # as checkpoints of earlier versions store it
-    assert type(earlier) is type(module) and vars(earlier).keys() == vars(module).keys()
+    short = datamodule(stored, trusted=False)
+    assert type(short) is type(module) and vars(short).keys() == vars(module).keys()
     for key in (
         "root",
         "gateway",
@@ -134,7 +134,7 @@ def test_every_config_names_a_data_module_of_its_own(name):
         "positions",
         "align",
     ):
-        assert getattr(earlier, key, None) == getattr(module, key, None)
+        assert getattr(short, key, None) == getattr(module, key, None)
 
 
 def test_data_modules_are_of_different_classes():

@@ -278,10 +278,6 @@ def test_whole_runs_are_held_out():
         make_split(positions, SplitSettings("runs"))
 
 
-def test_block_is_called_corner_now():
-    assert SplitSettings("block").name == "corner"
-
-
 @pytest.mark.parametrize("text", ["[" * 50_000, '{"folds": [{"train": [' + "1" * 5000 + "]}]}"])
 def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path, text):
     file = tmp_path / "split.json"

@@ -16,12 +16,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from outdated import GONE
+from campaigns import RENDERED, channels, compose, powers, spectra
+from contexts import short
+from omegaconf import OmegaConf
 
 import gsparc
+from gsparc.data.load import load, split_for
+from gsparc.methods import checkpoint
 from gsparc.methods.checkpoint import CheckpointError
+from gsparc.methods.registry import build
 
-STORED = Path(__file__).parents[1] / "methods" / "old_checkpoints"
+MODELS = {  # what is loaded and asked: a method and the file it learns from
+    "gp": spectra, "idw": spectra, "kriging": powers, "gp_power": powers, "complex_gp": channels,
+    "gsparc": spectra,
+}  # fmt: skip
 THREADS = 4
 HEADROOM_MB = 24  # an allocator keeps what it once held: 4 threads, up to 6 MB each
 
@@ -32,11 +40,19 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def questions() -> dict[str, dict[str, np.ndarray]]:
-    """Where each checkpoint is asked, in world coordinates."""
-    with np.load(STORED / "expected.npz") as stored:
-        asked = {key.partition("/")[0]: key for key in stored.files if key.endswith("/asked_at")}
-        return {name: {"asked_at": stored[key]} for name, key in asked.items() if name not in GONE}
+def trained(folder: Path) -> dict[str, np.ndarray]:
+    """Writes a checkpoint of each model; returns where it is asked, in world coordinates."""
+    asked = {}
+    for name, make in MODELS.items():
+        data = load({"name": "own", "file": str(make(folder / f"{name}.npz"))})
+        more = (*RENDERED, "model.field.count=40") if name == "gsparc" else ()
+        config = compose(f"model={name.removesuffix('_power')}", *more)
+        method = build(config.model)
+        method.fit(data, split_for({"name": "random"}, data).folds[0], short(folder / name, 10))
+        settings = OmegaConf.to_container(config.model, resolve=True)
+        checkpoint.save(folder / f"{name}.ckpt", method, OmegaConf.to_yaml({"model": settings}))
+        asked[name] = data.moving[:12] + data.site.origin
+    return asked
 
 
 def ask(predictor: gsparc.Predictor, places: np.ndarray) -> np.ndarray:
@@ -46,10 +62,10 @@ def ask(predictor: gsparc.Predictor, places: np.ndarray) -> np.ndarray:
 class Worker(threading.Thread):
     """Draws what to do until told to stop; keeps the first exception."""
 
-    def __init__(self, number: int, shared: dict, expected: dict, damaged: Path, stop: threading.Event):
+    def __init__(self, number: int, shared: dict, expected: dict, folder: Path, stop: threading.Event):
         super().__init__(daemon=True)
         self.draw, self.shared, self.expected = random.Random(number), shared, expected
-        self.damaged, self.stop, self.done, self.error = damaged, stop, 0, None
+        self.folder, self.stop, self.done, self.error = folder, stop, 0, None
 
     def run(self) -> None:
         try:
@@ -73,11 +89,11 @@ class Worker(threading.Thread):
 
     def load(self) -> None:
         name = self.draw.choice(sorted(self.shared))
-        self.check(name, gsparc.load(STORED / f"{name}.ckpt"))
+        self.check(name, gsparc.load(self.folder / f"{name}.ckpt"))
 
     def reject(self) -> None:
         with pytest.raises(CheckpointError):
-            gsparc.load(self.damaged)
+            gsparc.load(self.folder / "damaged.ckpt")
 
 
 @pytest.mark.slow
@@ -86,14 +102,13 @@ def test_loads_and_queries_from_threads_leave_answers_and_memory_alone(tmp_path,
     minutes = request.config.getoption("--soak-minutes", None) or 40 / 60
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    asked = questions()
-    shared = {name: gsparc.load(STORED / f"{name}.ckpt") for name in asked}
-    expected = {name: (k["asked_at"], ask(shared[name], k["asked_at"])) for name, k in asked.items()}
-    sound = (STORED / "gp.ckpt").read_bytes()
-    damaged = tmp_path / "damaged.ckpt"
-    damaged.write_bytes(sound[: len(sound) // 2])
+    asked = trained(tmp_path)
+    shared = {name: gsparc.load(tmp_path / f"{name}.ckpt") for name in asked}
+    expected = {name: (places, ask(shared[name], places)) for name, places in asked.items()}
+    sound = (tmp_path / "gp.ckpt").read_bytes()
+    (tmp_path / "damaged.ckpt").write_bytes(sound[: len(sound) // 2])
     stop, end = threading.Event(), time.monotonic() + 60 * minutes
-    workers = [Worker(number, shared, expected, damaged, stop) for number in range(THREADS)]
+    workers = [Worker(number, shared, expected, tmp_path, stop) for number in range(THREADS)]
     sizes = []
     try:
         for worker in workers:

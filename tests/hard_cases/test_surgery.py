@@ -42,6 +42,7 @@ SITE = Site(
     subcarriers_hz=None,
     origin=np.zeros(3),
     box=np.array([[-1.0] * 3, [1.0] * 3]),
+    moving_box=np.array([[-1.0] * 3, [1.0] * 3]),
     sha256="",
 )
 RECEIVER = Pose.identity(torch.tensor([0.0, 0.0, -2.0]))

@@ -34,6 +34,7 @@ def invent(kind: str = "spectrum", rows: int = 48, static_end: str = "rx", seed:
         subcarriers_hz=None,
         origin=np.array([100.0, -50.0, 3.0]),
         box=np.array([[-0.5] * 3, [0.5] * 3]),
+        moving_box=np.array([[-0.5] * 3, [0.5] * 3]),
         sha256=f"{kind}-{rows}-{static_end}-{seed}",
         target_scale=2.0 if kind == "csi" else 1.0,
         static_position=still[0],

@@ -20,9 +20,10 @@ TURN = np.array(
 
 
 def array_site(grid: SphereGrid, array: np.ndarray, **changes) -> Site:
+    box = np.array([[1.0, 1.0, 0.8], [1.6, 2.2, 1.2]])
     site = Site(
         name="known", kind="spectrum", static_end="rx", grid=grid, array=array, carrier_hz=LIGHT / WAVELENGTH,
-        subcarriers_hz=None, origin=np.zeros(3), box=np.array([[1.0, 1.0, 0.8], [1.6, 2.2, 1.2]]),
+        subcarriers_hz=None, origin=np.zeros(3), box=box, moving_box=box,
         sha256="known", normalisation="max", static_position=RECEIVER, rx_rotation=TURN,
     )  # fmt: skip
     return replace(site, **changes)

@@ -153,7 +153,9 @@ def test_hostile_config_is_refused_and_not_run(fitted, tmp_path):
     ("changes", "words"),
     [
         ({"schema_version": 99}, "schema 99"),
-        ({"schema_version": "1"}, "schema 1"),
+        ({"schema_version": "2"}, "schema '2', this gsparc reads 2 alone; train again"),
+        ({"schema_version": 1}, "schema 1, this gsparc reads 2 alone; train again"),
+        ({"schema_version": None}, "without a schema version, this gsparc reads 2 alone; train again"),
         ({"format": "other"}, "not a gsparc checkpoint"),
         ({"site": {}}, "incomplete"),
         ({"state": 3}, "incomplete"),

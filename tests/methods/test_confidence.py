@@ -65,14 +65,3 @@ def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None
     keep(file, Trusted(kind, float(laxest), Promise(), known, kernel))
     near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
     assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()
-
-
-def test_a_threshold_that_was_cut_off_accepts_nobody(site) -> None:
-    data, fold, file = site
-    known, kernel = known_positions(data, fold), position_kernel(data, fold)
-    for stored, meant in ((0.75, 1 / 1.25), (0.0, np.inf)):
-        keep(file, Trusted("gp_variance", stored, Promise(), known, kernel))
-        extra = checkpoint.read(file).extra["confidence"]
-        del extra["unclipped"]
-        checkpoint.amend(file, {"confidence": extra})
-        assert gsparc.load(file).trusted.threshold == pytest.approx(meant)

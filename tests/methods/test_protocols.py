@@ -1,34 +1,36 @@
 """What a method declares by the protocols of `gsparc.methods.method`, and that it keeps to it.
 
-Every method was fitted once, on tiny data: the checkpoints of `old_checkpoints`.
+Methods are fitted once, on tiny data.
 """
 
 from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import kinds
 import numpy as np
 import pytest
 import torch
-from rooms import shoebox
+from campaigns import RENDERED, channels, compose, powers, spectra
+from contexts import short
+from rooms import directed, shoebox
 
-from gsparc.data.splits import Fold
+from gsparc.array.method import ArrayField
+from gsparc.array.moving.method import MovingArrayField
+from gsparc.array.moving.triangulate import SearchSettings
+from gsparc.data.load import load
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.field.gaussians import FieldSettings
 from gsparc.methods import method as protocols
-from gsparc.methods.checkpoint import Stored, load
 from gsparc.methods.method import Differentiable, FitContext, Method, Reducible
-from gsparc.methods.registry import METHODS
-from gsparc.methods.stored_front import kept
+from gsparc.methods.registry import METHODS, build, method_class
 from gsparc.multipath import complex_gp
+from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.ops import Pose
-from gsparc.peers.calibrated_raytracer import CalibratedRayTracer
 
-FIXTURES = Path(__file__).parent / "old_checkpoints"
-FILES = {  # of methods whose name has changed since
-    "moving_array": "bearings", "image_source_gp": "vsgp", "directional_gp": "directed",
-    "gsparc": "gsparc_field", "array": "traded_array_field",
-    "nerf2": "nerf2_trunk",
-}  # fmt: skip
 DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink"), ""),
     **dict.fromkeys(("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf"), ""),
@@ -47,10 +49,11 @@ VARIANCE = (
     "moving_array",
 )  # fmt: skip
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
-SMOOTH = {
-    "gsparc": ["gsparc_field"],
-    "gp": ["gp", "gp_power_process"],
-    "array": ["traded_array_field"],
+FILES = {  # of rendered Gaussians, by what they render
+    "gsparc": spectra,
+    "gsparc of a moving array": lambda path: spectra(path, moving="rx"),
+    "gsparc of channels": lambda path: channels(path, shape="S"),
+    "gsparc of powers": powers,
 }
 
 
@@ -58,15 +61,44 @@ def having(protocol: str) -> list[str]:
     return [name for name, words in DECLARED.items() if protocol in words.split()]
 
 
+def data_of(name: str, folder: Path) -> Measurements:
+    if name in FILES:
+        return load({"name": "own", "file": str(FILES[name](folder / "own.npz"))})
+    if name == "directional_gp":
+        return directed(60)[0]
+    if name in ("image_source_gp", "gsparc of sources"):
+        return shoebox(60)[1]
+    if name == "array":
+        return kinds.static_array(folder)
+    if name == "moving_array":
+        return kinds.moving_array(folder)
+    make = {"gp": kinds.images, "complex_gp": kinds.gains}.get(name, kinds.received)
+    return make(folder)
+
+
+def unfitted(name: str) -> Method:
+    few = ("model.field.count=40", "model.keep_best=false")
+    if name in FILES:
+        return build(compose("model=gsparc", *RENDERED, *few).model)
+    if name == "gsparc of sources":
+        return build(compose("model=gsparc", "init.searches=1", "init.search_rows=60").model)
+    if name == "image_source_gp":
+        return ImageSourceGP(searches=1, search_rows=60, clutter=False)
+    if name == "array":
+        return ArrayField(FieldSettings(count=64))
+    if name == "moving_array":
+        search = SearchSettings(sources=8, rows=30, candidates=1000, steps=20)
+        return MovingArrayField(search=search, components=32)
+    return method_class(name.removesuffix(" of powers"))()
+
+
 @cache
-def read(file: str) -> tuple[Method, Stored]:
-    return load(FIXTURES / f"{file}.ckpt")
-
-
-def fitted(name: str) -> Method:
-    if name == "calibrated_raytracer":  # fitted where a scene and Sionna are: tests/peers
-        return CalibratedRayTracer()
-    return read(FILES.get(name, name))[0]
+def fitted(name: str) -> tuple[Method, Measurements, Fold]:
+    with TemporaryDirectory() as folder:
+        data, method = data_of(name, Path(folder)), unfitted(name)
+        fold = make_split(data.moving, SplitSettings()).folds[0]
+        method.fit(data, fold, short(Path(folder), 10, budget_s=3.0 if method.takes_budget else None))
+    return method, data, fold
 
 
 def places(method: Method, count: int = 5) -> torch.Tensor:
@@ -90,27 +122,26 @@ def ends(method: Method, moving: torch.Tensor) -> tuple[torch.Tensor, Pose]:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_method_is_what_the_table_says(name):
-    kept_to = {word for word in PROTOCOLS if isinstance(fitted(name), getattr(protocols, word))}
+    method = method_class(name)()
+    kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
-    assert fitted(name).resumable == (name in ("image_source_gp", "gsparc"))
+    assert method.resumable == (name in ("image_source_gp", "gsparc"))
 
 
 @pytest.mark.parametrize("name", VARIANCE)
 def test_predictions_have_a_variance(name):
-    method = fitted(name)
+    method = fitted(name)[0]
     variance = method.predict(*ends(method, places(method).float())).variance
     assert variance is not None and variance.shape == (5,)
     assert variance.dtype == torch.float32 and (variance > 0).all()
 
 
-@pytest.mark.parametrize(
-    "file", [file for name in having("Differentiable") for file in SMOOTH.get(name, [name])]
-)
-def test_gradients_are_those_of_the_predicted_mean(file):
-    method = read(FILES.get(file, file))[0]
+@pytest.mark.parametrize("name", [*having("Differentiable"), "gp of powers"])
+def test_gradients_are_those_of_the_predicted_mean(name):
+    method = fitted(name)[0]
     assert isinstance(method, Differentiable)
     # What is computed in float32 is asked in float32, with steps that rounding does not hide.
-    exact = not file.startswith(("gsparc", "traded"))
+    exact = name not in ("gsparc", "array")
     where = places(method).to(torch.float64 if exact else torch.float32)
     with torch.no_grad():
         said, mean = method.predict(*ends(method, where)).mean, method.mean_at(*ends(method, where))
@@ -136,12 +167,10 @@ def test_gradients_are_those_of_the_predicted_mean(file):
     assert slope.abs().max() > 0
 
 
-@pytest.mark.parametrize(
-    "file", ["gsparc_phase", "gsparc_field_channels", "gsparc_field_moving", "gsparc_field_power"]
-)
-def test_what_has_no_gradients_says_so(file):
+@pytest.mark.parametrize("name", [*list(FILES)[1:], "gsparc of sources"])
+def test_what_has_no_gradients_says_so(name):
     """Footprints are projected without any: a moving receiver's would lack most of what changes."""
-    method = read(file)[0]
+    method = fitted(name)[0]
     assert isinstance(method, Differentiable)
     with pytest.raises(ValueError, match="no gradients"):
         method.mean_at(*ends(method, places(method).float().requires_grad_()))
@@ -167,20 +196,20 @@ def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("file", "settings"),
+    ("name", "settings"),
     [
-        ("traded_gp", {"keep": 0.5, "confidence": False}),
-        ("traded_array_field", {"anchors": 0.5}),
-        ("traded_bearings", {"keep": 0.5}),
-        ("traded", {"keep": 0.5, "confidence": False}),
+        ("gp", {"keep": 0.5, "confidence": False}),
+        ("array", {"anchors": 0.5}),
+        ("moving_array", {"keep": 0.5}),
+        ("gsparc", {"keep": 0.5, "confidence": False}),
     ],
 )
-def test_a_reduction_leaves_the_method_as_it_was(file, settings):
-    method, stored = read(file)
+def test_a_reduction_leaves_the_method_as_it_was(name, settings):
+    method, data, fold = fitted(name)
     assert isinstance(method, Reducible) and set(settings) <= set(method.knobs())
     query = ends(method, places(method).float())
     before = method.predict(*query)
-    less = method.reduced(settings, kept(stored.extra)[1])
+    less = method.reduced(settings, method.contributions(data, fold.train))
     assert not torch.equal(less.predict(*query).mean, before.mean)
     after = method.predict(*query)
     for part in ("mean", "confidence", "variance"):

@@ -171,16 +171,6 @@ def test_a_channel_restores_a_missed_ray():
     assert not bool(quiet[rays == 0].any())
 
 
-def test_checkpoints_without_position_covariance_load(pillar):
-    data, fold, _, method = pillar
-    state = method.state()
-    del state["open"]
-    other = DirectionalGP()
-    other.restore(data.site, state)
-    batch = data.batch(fold.test[:5])
-    torch.testing.assert_close(other.mean_at(batch.tx, batch.rx), method.mean_at(batch.tx, batch.rx))
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

@@ -115,6 +115,6 @@ def restored(site: Site, state: dict[str, Any]) -> BearingField:
     method = MovingArrayField()
     method.restore(site, state["method"])
     field = BearingField(method, np.zeros(0, np.int64))
-    for place, stored in zip(field.places, state.get("places", field.places), strict=True):
+    for place, stored in zip(field.places, state["places"], strict=True):
         place.data.copy_(stored)
     return field

@@ -20,7 +20,6 @@ from torch import Tensor
 from gsparc.array.moving import reduce
 from gsparc.array.moving.checks import MAX_UNEXPLAINED, site_problem, unexplained_energy
 from gsparc.array.moving.error_model import ErrorModel, fit_error_model, image_features
-from gsparc.array.moving.old_state import renewed
 from gsparc.array.moving.power_gp import Trend, TrendSettings, fit_trend
 from gsparc.array.moving.query import Array, Query
 from gsparc.array.moving.residual import Residual, fit_residual, left_out_error
@@ -377,17 +376,7 @@ class MovingArrayField(Interpolator):
         }
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        self._lags = None
-        self._take(renewed(state, self.lags().image, self._images_of))
-
-    def _images_of(self, state: dict[str, Any]) -> Tensor:
-        """Answers at some training places of the field with this state."""
-        self._take(state)
-        where = torch.from_numpy(self.positions[_spread(len(self.positions), BLOCK)])
-        return self.query()(where).image.clamp_(0, 1)
-
-    def _take(self, state: dict[str, Any]) -> None:
-        self._query = None
+        self._lags = self._query = None
         self.trends = [Trend.from_state(trend) for trend in state["trends"]]
         self.exponent, self.basis = int(state["exponent"]), Separable(**state["basis"])
         self.residual, self.positions = Residual.from_state(state["residual"]), state["positions"].numpy()

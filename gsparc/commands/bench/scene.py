@@ -115,5 +115,6 @@ def _site() -> Site:
         subcarriers_hz=None,
         origin=np.zeros(3),
         box=ROOM,
+        moving_box=ROOM,
         sha256="",
     )

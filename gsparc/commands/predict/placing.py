@@ -40,8 +40,6 @@ def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
 
 
 def _heights(site: Site, end: End) -> str:
-    if site.moving_box is None:
-        return "has none in this model, which an earlier version trained"
     low, high = site.moving_box[:, 2::3][:, -1 if end == "rx" else 0] + site.origin[2]
     return f"was measured at heights from {low:g} to {high:g} m"
 
@@ -75,7 +73,7 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
     """Which places (n,) bool lie outside the box of the training places by more than a margin, and it [m]."""
     moving = [end for end in ("tx", "rx") if end in world]
     place = np.hstack([world[end] - site.origin for end in moving])  # type: ignore[index]
-    low, high = np.tile(site.box, len(moving)) if site.moving_box is None else site.moving_box
+    low, high = site.moving_box
     margin = MARGIN * float((high - low).max())
     return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
 
@@ -83,7 +81,7 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
 def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
     """In words that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
     given = [world[end] for end, where in queries.ends.items() if not where.degrees]
-    low, high = site.box if site.moving_box is None else site.moving_box
+    low, high = site.moving_box
     wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in given), default=0.0)
     side = float((high - low).max())
     if not 0 < wide <= SPECK * side:

@@ -401,7 +401,7 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
     names = ("means", "log_scales", "turns", "log_strengths")
     two = len(state["log_lengths"]) == 2
     kernel = Kernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
-    most = torch.as_tensor(state.get("most", math.inf)).double()
+    most = torch.as_tensor(state["most"]).double()
     field = PowerField(
         site, trend_of(state), kernel, Blockers(*(state[name] for name in names), most=most),
         _place(still), int(state["seed"]), fringes_of(state["fringes"]) if "fringes" in state else None,
@@ -410,8 +410,7 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
         for name, parameter in field.named_parameters():
             parameter.copy_(state[name])
     field.known, field.decibels = state["known"].numpy(), state["decibels"].numpy()
-    field.alone = state["alone"].numpy()
-    field.at = state["at"].numpy() if "at" in state else field.at  # earlier versions had no such processes
+    field.alone, field.at = state["alone"].numpy(), state["at"].numpy()
     if "process" in state:
         field.process = PowerProcess.read(state["process"]).about(field.prior()[0])
     return field

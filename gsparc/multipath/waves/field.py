@@ -386,12 +386,9 @@ class ChannelField(ConditionalField):
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
     shape, kept = dict(state["shape"]), state["values"]
-    sequences = shape.pop("words", shape.get("sequences", ()))  # `words` in earlier versions, if at all
-    shape["sequences"] = tuple(tuple(int(index) for index in sequence) for sequence in sequences)
+    shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
     lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
-    shape.pop("sources", 0)  # of given places, in earlier versions: always none
-    # Earlier versions knew no angles to ends, and no mirrors.
-    some = {name: kept[name] for name in ("towards", "planes") if name in kept}
+    some = {name: kept[name] for name in ("towards", "planes") if name in kept}  # what is learned
     values = Values(kept["log_power"].exp(), *lengths, kept["offset"], **some)
     antennas, tones = (int(n) for n in state["channel"])
     field = ChannelField(site, Shape(**shape), values, (antennas, tones))

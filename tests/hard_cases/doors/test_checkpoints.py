@@ -152,7 +152,7 @@ def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
     "changes,says",
     [
         ({"schema_version": 99}, "schema 99"),
-        ({"schema_version": None}, "schema None"),
+        ({"schema_version": None}, "without a schema version, this gsparc reads 2 alone; train again"),
         ({"format": "other"}, "not a gsparc checkpoint"),
         ({"site": {}}, "incomplete"),
         ({"site": None}, "incomplete"),
