@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -19,14 +18,12 @@ from gsparc.methods.time_budget import TimeBudget, less_repeatable
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.known.method import KnownWallsGP
-from gsparc.multipath.known.panels import panels
+from gsparc.multipath.known.mirrors import counted
 from gsparc.multipath.powers import field as power_field
 from gsparc.multipath.powers.together import field as joint_field
 from gsparc.multipath.source_field import RayField, SourceField
 from gsparc.multipath.waves import initial as waves
 from gsparc.multipath.waves.settings import ChannelSettings
-
-log = logging.getLogger(__name__)
 
 COMPLETION_SHARE = 0.15  # of the seconds of sources, for that process
 FACTORS = 4.0  # covariances of all rows that it needs at least
@@ -93,11 +90,9 @@ def powers(
         DataError: `init=scene` without a file, or walls that cannot be.
     """
     budget = context.time_budget()
-    known = None
+    known, site = None, data.site
     if init.name == "scene":
-        known, leaning = panels(read_walls(init.file), data.site.origin)
-        if leaning:
-            log.info("%d walls that lean are left out: only floors and upright walls take power", leaning)
+        known = counted(read_walls(init.file), site.origin, site.static_position)
     field, notes = power_field.initialise(data, rows, init.name != "diffuse", context.seed, budget, known)
     field.condition(data, rows)
     return field, FitReport(budget.counted.wall, notes, budget.limited_by)

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsparc.processes.wall_count import Walls
+
 TINY_M = 1e-6  # distance that has a logarithm
 
 
@@ -59,12 +61,14 @@ class Trend:
         level: the mean where there is no law [dB].
         law: the distance law, or None.
         middle, spread: mean and deviation of the rows' decades of distance: its slope is uncertain in these.
+        walls: that are known; what one takes is uncertain, and what one floor takes.
     """
 
     level: float
     law: Law | None = None
     middle: float = 0.0
     spread: float = 1.0
+    walls: Walls | None = None
 
     @classmethod
     def about(cls, law: Law, places: Tensor) -> Trend:
@@ -77,19 +81,21 @@ class Trend:
         return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
 
     def terms(self, places: Tensor) -> Tensor:
-        """What is uncertain of the mean: (n, 1), a constant, or (n, 2), also the slope of the law."""
-        one = torch.ones_like(places[:, :1])
-        if self.law is None:
-            return one
-        return torch.cat([one, (self.law.decades(places)[:, None] - self.middle) / self.spread], 1)
+        """What is uncertain of the mean (n, P): a constant, a law's slope, losses in walls and floors."""
+        parts = [torch.ones_like(places[:, :1])]
+        if self.law is not None:
+            parts.append((self.law.decades(places)[:, None] - self.middle) / self.spread)
+        return torch.cat(parts if self.walls is None else [*parts, self.walls.crossed(places)], 1)
 
     def state(self) -> dict[str, Any]:
         """Numbers that `trend_of` needs."""
         law = {"law": [], "law_place": []} if self.law is None else self.law.state()
-        return {"trend": [self.level, self.middle, self.spread], **law}
+        walls = {} if self.walls is None else {"walls": vars(self.walls)}
+        return {"trend": [self.level, self.middle, self.spread], **law, **walls}
 
 
 def trend_of(state: dict[str, Any]) -> Trend:
     """The trend whose `state()` this was."""
     level, middle, spread = (float(v) for v in state["trend"])
-    return Trend(level, law_of_state(state), middle, spread)
+    walls = Walls(**state["walls"]) if "walls" in state else None
+    return Trend(level, law_of_state(state), middle, spread, walls)

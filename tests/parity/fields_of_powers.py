@@ -11,8 +11,7 @@ from small_worlds import LAW, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
 from gsparc.multipath.powers import waves
-from gsparc.multipath.powers.blockers import Blockers
-from gsparc.multipath.powers.field import PowerField, ridge
+from gsparc.multipath.powers.field import PowerField
 from gsparc.multipath.powers.likelihood import Covariance, left_out_losses
 from gsparc.multipath.powers.together.field import JointPowerField
 from gsparc.multipath.powers.together.law import fit_site_law
@@ -37,7 +36,7 @@ def field_of_one_station() -> Arrays:
     told = rows(places)
     arrays = {"rx_position": places, "tx_position": np.array(LAW.place), "rssi_db": told.decibels}
     data = from_arrays(arrays)
-    field = PowerField(data.site, trend(data.moving), TWO, Blockers.none(), None)
+    field = PowerField(data.site, trend(data.moving), TWO)
     field.condition(data, np.arange(50))
     batch = data.batch(np.arange(50, 60))
     left = field.left_out()
@@ -58,11 +57,7 @@ def density_of_powers() -> Arrays:
     kernel = Covariance.of(TWO)
     gram = kernel.gram(torch.cdist(at, at), about.terms(at))
     values = torch.from_numpy(told.decibels) - about.mean(at)
-    columns = np.c_[np.ones(40), places]
-    return {
-        "density": left_out_losses(gram, values, kernel.log_amplitude).numpy(),
-        "ridge": ridge(columns, told.decibels, 20.0),
-    }
+    return {"density": left_out_losses(gram, values, kernel.log_amplitude).numpy()}
 
 
 def _stations(quiet: bool) -> object:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.walls import SceneWalls, area, normal_of
+from gsparc.data.walls import SceneWalls, area, box_faces, normal_of
 from gsparc.multipath.clutter.blocking import Clutter, tangents
+from gsparc.processes.wall_count import Walls
 
 PARALLEL = 0.99995  # cosine of normals of faces of one plane: half a degree
 SAME_PLANE_M = 0.01  # [m], of a face's corners from the plane it is joined to
@@ -68,6 +69,21 @@ class Mirrors:
             if min(one, other) >= smallest:
                 size[plane] = size.get(plane, 0.0) + one * other
         return sorted(size, key=lambda plane: -size[plane])
+
+
+def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
+    """Walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
+    faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
+    known = Mirrors.of(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
+    planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()
+    axes = torch.stack([torch.cat([plane[None, :3], tangents(plane).double()]) for plane in planes])
+    corners = torch.cat([planes[:, 3:], patches[:, :2]], 1)
+    return Walls(
+        axes,
+        corners,
+        patches[:, 2:] - patches[:, :2],
+        torch.from_numpy(np.zeros(0) if still is None else still).double(),
+    )
 
 
 def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:

@@ -3,11 +3,36 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 POINT = 1e-6  # lengths of a path, in standard deviations, below which it is a point
+
+
+@dataclass(frozen=True)
+class Blockers:
+    """N Gaussians that paths lose power in.
+
+    Attributes:
+        means: (N, 3) float64 [m].
+        log_scales: (N, 3) of their standard deviations along their own axes, the third upwards [m].
+        turns: (N,) angles from x to their first axes [rad].
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    turns: Tensor
+
+    @classmethod
+    def none(cls) -> Blockers:
+        """No Gaussians."""
+        flat = torch.zeros(0, dtype=torch.float64)
+        return cls(flat.view(0, 3), flat.view(0, 3), flat)
+
+    def __len__(self) -> int:
+        return len(self.means)
 
 
 def line_integrals(start: Tensor, end: Tensor, means: Tensor, scales: Tensor, turns: Tensor) -> Tensor:

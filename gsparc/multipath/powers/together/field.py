@@ -92,7 +92,7 @@ class JointPowerField(ConditionalField):
     def objects(self) -> SiteObjects:
         """Gaussians that all stations are seen through, else those that stations never heard would be."""
         for posterior in (one for one in (self.posterior, self.elsewhere) if one is not None):
-            means, scales, turns, _ = (part.numpy() for part in posterior.prior.blockers.parts())
+            means, scales, turns = (part.numpy() for part in vars(posterior.prior.blockers).values())
             if len(means):
                 first = len(posterior.prior.inducing)
                 deviation = math.exp(0.5 * posterior.prior.log_cloud.item())

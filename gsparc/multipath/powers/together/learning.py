@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.methods.time_budget import TimeBudget
-from gsparc.multipath.powers.blockers import Blockers
+from gsparc.multipath.powers.extinction import Blockers
 from gsparc.multipath.powers.together.law import SiteLaw
 from gsparc.multipath.powers.together.posterior import End, Factored, left_out_of, weights_of
 from gsparc.multipath.powers.together.prior import LENGTHS, OWN, Prior

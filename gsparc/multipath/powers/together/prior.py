@@ -16,8 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.multipath.powers.blockers import Blockers
-from gsparc.multipath.powers.extinction import extinctions
+from gsparc.multipath.powers.extinction import Blockers, extinctions
 from gsparc.multipath.powers.together.law import SiteLaw
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart, matern32, matern_sum
@@ -41,7 +40,7 @@ class Prior:
         log_length, log_shared: () length [m] and variance of g.
         log_cloud: () variance of what one Gaussian takes straight through it.
         inducing: (M, 3) places that g is known at [m]; M = 0: there is no g.
-        blockers: of the grid; none: nothing stands in the way. Their strengths are not read.
+        blockers: of the grid; none: nothing stands in the way.
         bend_db: deviation of what a bend of the law takes a decade from the middle [dB]; 0: it is straight.
     """
 
@@ -113,8 +112,7 @@ class Prior:
         """(n, N) of the grid's Gaussians on paths between ends (n, 3) [m]; straight through one is 1."""
         if not len(self.blockers):
             return moving.new_zeros(len(moving), 0)
-        means, scales, turns, _ = self.blockers.parts()
-        return extinctions(moving, still, means, scales, turns)
+        return extinctions(moving, still, **vars(self.blockers))
 
     def _place(self, one: Tensor, other: Tensor) -> Tensor:
         return matern32(apart(one, other), self.log_length.exp())
@@ -122,14 +120,11 @@ class Prior:
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `restored_prior` needs."""
         law = [*vars(self.law).values()]
-        blockers = dict(
-            zip(("means", "log_scales", "turns", "log_strengths"), self.blockers.parts(), strict=True)
-        )
         return {
             **self.settings(),
             "inducing": self.inducing,
             "law": law,
-            "blockers": blockers,
+            "blockers": vars(self.blockers),
             "bend_db": self.bend_db,
         }
 
@@ -164,5 +159,4 @@ def grid(low: Tensor, high: Tensor, most: int) -> Blockers:
     means = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), float(low[2] + high[2]) / 2)], 1)
     width = torch.full_like(means, spacing / 2)
     width[:, 2] *= TALL
-    flat = torch.zeros(len(means), dtype=torch.float64)
-    return Blockers(means.double(), width.double().log(), flat, flat)
+    return Blockers(means.double(), width.double().log(), torch.zeros(len(means), dtype=torch.float64))
