@@ -40,7 +40,6 @@ class InitSettings(Checked):
         margin: around the scene box in which sources are sought [m].
         max_sources: of a search.
         order: largest number of reflections.
-        edges: search for diffracting edges.
         snapshot: what every channel snapshot has of its own, to be estimated; see `LossSettings`.
     """
 
@@ -52,7 +51,6 @@ class InitSettings(Checked):
     margin: float = setting(8.0, POSITIVE)
     max_sources: int = setting(60, whole(1))
     order: int = setting(3, whole(0))
-    edges: bool = True
     snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 

@@ -1,1 +1,1 @@
-"""Multipath models with carrier phase: image sources, diffraction, clutter and uplink extrapolation."""
+"""Multipath models with carrier phase: image sources, clutter and uplink extrapolation."""

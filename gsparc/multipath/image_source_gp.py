@@ -7,7 +7,6 @@ import logging
 import math
 from collections import Counter
 from dataclasses import replace
-from functools import partial
 from hashlib import sha256
 from typing import Any
 
@@ -23,14 +22,6 @@ from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Predic
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
 from gsparc.methods.time_budget import TimeBudget, less_repeatable
-from gsparc.multipath.diffraction import (
-    Edges,
-    diffracted,
-    edge_wave,
-    find_edges,
-    fit_edge_gains,
-    subtract_edges,
-)
 from gsparc.multipath.element_factors import direct_path, element_factors
 from gsparc.multipath.ensemble import (
     affordable_rows,
@@ -56,8 +47,6 @@ log = logging.getLogger(__name__)
 
 SECONDS_PER_ROW = 0.02  # [s], times measurements^1.5: 130 s for 350 in a conference room, 370 s for 700
 MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
-MAX_EDGE_ERROR = 0.8  # leave-one-out error with edges over that without, above which edges are dropped
-EDGE_BUDGET = 0.1  # share of the budget kept for edges and the search beside them
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
 ALIGNMENT_SHARE = 0.25  # of the budget, for each of these searches
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
@@ -74,7 +63,6 @@ class ImageSourceGP(FramedMethod):
         margin, max_sources, order: see `SearchSettings`.
         offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or `phase_timing`.
         clutter: search for occluding boxes and finite mirrors, shared by all sources.
-        edges: search for diffracting edges; kept when the likelihood gains.
         seed: of everything random.
 
     Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
@@ -100,7 +88,6 @@ class ImageSourceGP(FramedMethod):
         order: int = 3,
         offsets: Offsets = "none",
         clutter: bool = True,
-        edges: bool = True,
         seed: int = 0,
     ) -> None:
         if offsets not in KINDS:
@@ -110,8 +97,7 @@ class ImageSourceGP(FramedMethod):
         if search_rows < 8 or rows < 8:
             raise ValueError(f"{self.name}: search_rows={search_rows}, rows={rows}: at least 8 are needed")
         self.searches, self.budget_s, self.seed = searches, budget_s, seed
-        self.offsets, self.clutter, self.look_for_edges = offsets, clutter, edges
-        self.edges = Edges.none()
+        self.offsets, self.clutter = offsets, clutter
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
         self.members: list[PhasedPosterior] = []
@@ -138,9 +124,6 @@ class ImageSourceGP(FramedMethod):
         self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
     ) -> FitReport:
         budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
-        searching = budget
-        if self.look_for_edges:
-            searching = context.time_budget((1 - EDGE_BUDGET) * budget.seconds, cache.spent)
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
@@ -154,22 +137,19 @@ class ImageSourceGP(FramedMethod):
             data = self._calibrated(data, start, direct_path(start, self._transmitter()))
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
         if self.offsets != "none":
-            data = self._without_offsets(data, known, searching)
+            data = self._without_offsets(data, known, budget)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
             notes.append(
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
         row_sets = self._row_sets(data, known, self.searches)
-        found = self._search(row_sets, self.settings, searching, self.clutter, cache)
-        budget.limited |= searching.limited
+        found = self._search(row_sets, self.settings, budget, self.clutter, cache)
         if held.array is not None and self.offsets == "none":
             again = self._calibrated(data, row_sets[found[0].number], found[0].phased.scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known, self.searches)
                 held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
                 found = [refined(row_sets[one.number], one, self.noise_floor) for one in found]
-        if self.look_for_edges and not at_noise_floor([found[0].left_out], self.noise_floor, least=1):
-            found, held = self._search_with_edges(row_sets, found, held, cache, budget)
         self.weights = ensemble_weights(found)
         affordable = affordable_rows(row_sets[0], found, self.noise_floor, budget)
         if affordable < len(held):
@@ -192,7 +172,6 @@ class ImageSourceGP(FramedMethod):
         ended += ", ended by the time budget" if budget.limited else ""
         notes.append(f"{len(found)} of {self.searches} searches ({ended}), {counts} sources")
         counted = Counter(kinds(scene.sources, box_of(self.members[0].rows, scene.transmitter)))
-        counted[SourceKind.EDGE] = len(self.edges)
         notes.append("the best search has " + ", ".join(f"{counted[k]} {k}s" for k in SourceKind))
         clutter = scene.clutter
         if len(clutter):
@@ -234,30 +213,6 @@ class ImageSourceGP(FramedMethod):
         transmitter, floor = self._transmitter(), self.noise_floor
         return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, stage)
 
-    def _search_with_edges(
-        self, row_sets: list[Rows], found: list[Member], held: Rows, cache: SearchCache, budget: TimeBudget
-    ) -> tuple[list[Member], Rows]:
-        """Searches and rows after subtracting accepted edges; unchanged when none is accepted."""
-        scene, rows = found[0].phased.scene, row_sets[found[0].number]
-        transmitter, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
-        late = partial(budget.over, 1 - EDGE_BUDGET / 2)
-        edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor, late)
-        if not len(edges):
-            return found, held
-        log.info("%d edges; searching again on the residual", len(edges))
-        more = TimeBudget(max(budget.seconds - budget.spent, 0.0), budget.clock)
-        row_sets = [subtract_edges(part, edges, transmitter) for part in row_sets]
-        with_edges = self._search(row_sets, self.settings, more, self.clutter, cache, "beside edges")
-        budget.limited |= more.limited
-        # leave-one-out errors are relative to the power
-        power = float(row_sets[with_edges[0].number].target.abs().square().mean())
-        # the edges' gains were fitted to every row: ask for a clear margin
-        if with_edges[0].left_out * power > MAX_EDGE_ERROR * found[0].left_out:
-            return found, held
-        scene = with_edges[0].phased.scene
-        self.edges = fit_edge_gains(held, edges.point, edges.axis, scene, self.noise_floor)
-        return with_edges, subtract_edges(held, self.edges, scene.transmitter)
-
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
         """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""
         parts = [gather(data, self._seen(known, i), self.search_rows, self.seed + i) for i in range(count)]
@@ -280,8 +235,6 @@ class ImageSourceGP(FramedMethod):
             if not members:
                 continue
             apart = self.frame.inside(gather(data, self._seen(known, turn), most, self.seed))
-            if len(self.edges):
-                apart = subtract_edges(apart, self.edges, self._transmitter())
             twin = copy.copy(self)
             twin.members = [PhasedPosterior(apart, member.phased, self.noise_floor) for member in members]
             twin.weights, twin.query = ensemble_weights(members), Query(twin.members)
@@ -345,14 +298,12 @@ class ImageSourceGP(FramedMethod):
         tones = torch.from_numpy(self._fitted().tones())
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
-        if len(self.edges):
-            stack = stack + self.edges.over_band(flat[:, :3], tones, self._static_ends(flat))
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
         return self._prediction(self._stored(mean, tones) / self.factors[:, None], variance, prior)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
-        """The paths that `predict` sums: one per source of every search, with the search's weight, and edges.
+        """The paths that `predict` sums: one per source of every search, with the search's weight.
 
         Returns:
             Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
@@ -366,23 +317,8 @@ class ImageSourceGP(FramedMethod):
         away = self.query.pack.ranges(flat)
         gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
         towards = self.query.pack.sources - middle[:, None]
-        if len(self.edges):
-            places, transmitter = flat[:, :3], self._static_ends(flat)
-            length, met = diffracted(places, self.edges, transmitter)
-            hertz = torch.full((len(flat),), carrier, dtype=torch.float64)
-            waves = edge_wave(places, self.edges.point, self.edges.axis, transmitter, hertz)
-            gain = torch.cat([gain, waves.T[..., None] * self.edges.gain[:, None]])
-            away = torch.cat([away, length], 1)
-            # elements differ in diffraction points: their mean
-            met = met.view(count, -1, len(self.edges), 3).mean(1)
-            towards = torch.cat([towards, met - middle[:, None]], 1)
         gains, delay, unit, carrier = self._stored_paths(gain.movedim(0, -1), away, towards)
         return gains / self.factors[:, None], delay, unit, carrier
-
-    def _static_ends(self, flat: Tensor) -> Tensor:
-        """The static end (3,), or the antenna (m, 3) of each of queries (m, 6)."""
-        transmitter = self.members[0].scene.transmitter
-        return transmitter if flat.shape[1] == 3 else transmitter + flat[:, 3:]
 
     def leave_one_out(self) -> LeftOut:
         """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""
@@ -435,7 +371,6 @@ class ImageSourceGP(FramedMethod):
             "weights": self.weights,
             "noise_floor": self.noise_floor,
             "factors": self.factors,
-            "edges": [*vars(self.edges).values()],
             "scenes": [member.phased.state() for member in self.members],
         }
 
@@ -443,14 +378,14 @@ class ImageSourceGP(FramedMethod):
         """See `Method.restore`."""
         rows = self._restore_frame(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
-        self.factors, self.edges = state["factors"], Edges(*state["edges"])
+        self.factors = state["factors"]
         scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
         self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]
         self.query = Query(self.members)
 
     def size(self) -> int:
         """Sources of the largest scene."""
-        return max((len(member.scene.sequences) for member in self.members), default=0) + len(self.edges)
+        return max((len(member.scene.sequences) for member in self.members), default=0)
 
 
 def _loudest(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:

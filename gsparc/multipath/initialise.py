@@ -37,7 +37,7 @@ def sources(
     budget = context.time_budget()
     method = ImageSourceGP(
         searches=init.searches, search_rows=init.search_rows, rows=init.rows, margin=init.margin,
-        max_sources=init.max_sources, order=init.order, clutter=clutter, edges=init.edges,
+        max_sources=init.max_sources, order=init.order, clutter=clutter,
         offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))

@@ -53,11 +53,6 @@ class Rows:
         """The static end (3,) [m], or its antennas (E, 3), given its position (3,)."""
         return static if self.array is None else static + self.array
 
-    def static_end_of_each(self, static: Tensor) -> Tensor:
-        """The static end (3,) [m], or the antenna (n, 3) of each row."""
-        ends = self.static_ends(static)
-        return ends if self.element is None else ends[self.element]
-
 
 def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
     """Places (S, E, 3) float64 [m] of the antennas; E = 1 when the array's geometry is not known."""

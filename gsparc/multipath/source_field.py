@@ -19,7 +19,6 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
 from gsparc.methods.method import FitContext
-from gsparc.multipath.diffraction import subtract_edges
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.gp_likelihood import correlations
 from gsparc.multipath.image_source_gp import ImageSourceGP
@@ -130,8 +129,6 @@ class SourceField(MethodField):
         ]
         data = replace(data, target=data.target * method.factors.numpy()[:, None])
         held = method.frame.inside(gather(data, rows, method.row_limit, method.seed))
-        if len(method.edges):
-            held = subtract_edges(held, method.edges, scenes[0].scene.transmitter)
         method.members = [PhasedPosterior(held, scene, method.noise_floor) for scene in scenes]
         method.query = Query(method.members)
 

@@ -3,11 +3,8 @@
 * `IMAGE`: a mirror image of the transmitter; the path is the straight line to it.
 * `SCATTERER`: a small object; the leg transmitter-to-object is the same for every receiver and folds into the
   complex gain, what remains is again a spherical wave about a point.
-* `EDGE`: a straight edge; the diffraction point slides along it so that both legs make the same angle with
-  the edge (J. B. Keller, "Geometrical theory of diffraction", J. Opt. Soc. Am. 52 (1962)), hence the
-  path is the straight line after unfolding both half planes about the edge.
 
-To a receiver the first two are both fixed points; they differ when the transmitter moves.
+To a receiver both are fixed points; they differ when the transmitter moves.
 """
 
 from __future__ import annotations
@@ -25,7 +22,6 @@ class SourceKind(StrEnum):
 
     IMAGE = "image"
     SCATTERER = "scatterer"
-    EDGE = "edge"
 
 
 def kinds(points: Tensor, box: Tensor, margin: float = 0.05) -> list[SourceKind]:

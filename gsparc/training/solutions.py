@@ -28,7 +28,7 @@ from gsparc.training.terms import EffectSettings
 log = logging.getLogger(__name__)
 
 GROUPS = 3  # of training rows, that solutions are weighed by
-FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8, "edges": False}
+FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
 CLOSED_SHARE = 0.3  # of the seconds, for what takes no more than it needs beside what does
 FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 SEARCH_LOOKS = 60  # at a search's rows, that the shortest takes

@@ -96,7 +96,7 @@ def test_hardly_any_noise_does_not_end_a_short_fit(tmp_path):
     }  # fmt: skip
     data = from_arrays(arrays, {"name": "band"})
     split = cut(data, 0)
-    few = ("init.searches=1", "init.search_rows=120", "init.edges=false")
+    few = ("init.searches=1", "init.search_rows=120")
     field = fitted(gsparc(*few), data, split, tmp_path, 3.0)
     figures = score([field], data, split).figures()
     assert np.isfinite(figures["nmse"]) and figures["nmse"] < 1.1

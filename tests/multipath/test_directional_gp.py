@@ -239,6 +239,6 @@ def test_the_conference_room_from_43_receivers():
     method.fit(data, fold, FitContext(Path()))
     assert len(fold.train) + len(fold.val) == 43
     assert error(method, data, fold.test) < 0.08
-    searched = ImageSourceGP(searches=1, budget_s=5, clutter=False, edges=False)
+    searched = ImageSourceGP(searches=1, budget_s=5, clutter=False)
     searched.fit(data, fold, FitContext(Path()))
     assert error(searched, data, fold.test) > 0.5

@@ -144,7 +144,7 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
 
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
-    method = ImageSourceGP(searches=8, search_rows=60, margin=1.0, edges=False)
+    method = ImageSourceGP(searches=8, search_rows=60, margin=1.0)
     report = method.fit(data, fold, FitContext(tmp_path))
     assert "of 8 searches (noise floor reached)" in report.notes[0]  # not the budget
     # both threads may have started one more when the second ended
@@ -158,7 +158,7 @@ def test_a_moving_transmitter_is_a_moving_receiver(tmp_path):
     arrays["rx_position"], arrays["tx_position"] = arrays["tx_position"], arrays["rx_position"]
     swapped = from_arrays(arrays)
     assert swapped.site.moving_end == "tx" and np.array_equal(swapped.moving, data.moving)
-    method = ImageSourceGP(**QUICK, clutter=False, edges=False)
+    method = ImageSourceGP(**QUICK, clutter=False)
     method.fit(swapped, fold, FitContext(tmp_path))
     predicted = _predicted(method, swapped, fold.test).mean.numpy()
     assert nmse(predicted, swapped.targets(fold.test).numpy()) < 0.01

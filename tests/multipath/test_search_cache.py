@@ -11,7 +11,7 @@ from gsparc.methods.method import FitContext
 from gsparc.multipath import ensemble
 from gsparc.multipath.image_source_gp import ImageSourceGP
 
-QUICK = {"searches": 2, "search_rows": 100, "margin": 2.0, "clutter": False, "edges": False}
+QUICK = {"searches": 2, "search_rows": 100, "margin": 2.0, "clutter": False}
 
 
 def _fit(data, fold, folder, resume=None, clock="wall", **more):

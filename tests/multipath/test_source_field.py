@@ -15,7 +15,7 @@ from gsparc.multipath.source_field import SourceField
 from gsparc.physics.mirror_planes import reflect
 
 ROWS = np.arange(60)
-INIT = InitSettings(searches=1, search_rows=60, max_sources=6, edges=False)
+INIT = InitSettings(searches=1, search_rows=60, max_sources=6)
 
 
 @pytest.fixture(scope="module")

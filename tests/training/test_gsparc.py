@@ -32,7 +32,7 @@ from gsparc.training import solution_weights, solutions
 from gsparc.training.gsparc import Gsparc
 
 SMALL = (
-    "model.field.count=40", "init.searches=1", "init.search_rows=60", "init.max_sources=9", "init.edges=false"
+    "model.field.count=40", "init.searches=1", "init.search_rows=60", "init.max_sources=9"
 )  # fmt: skip
 BUDGET_S = {"moving array": 2.5}  # of others BRIEF_S
 BRIEF_S = 1.0

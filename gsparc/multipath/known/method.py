@@ -44,7 +44,7 @@ class KnownWallsGP(ImageSourceGP):
 
     Args:
         walls: in the coordinates of the measurements.
-        **rest: of `ImageSourceGP`; `clutter` says whether walls end and hide, edges are not looked for.
+        **rest: of `ImageSourceGP`; `clutter` says whether walls end and hide.
 
     Raises:
         ValueError: the data are not channels, or their phase means nothing.
@@ -53,7 +53,7 @@ class KnownWallsGP(ImageSourceGP):
     name = "known_walls"
 
     def __init__(self, walls: SceneWalls, **rest: Any) -> None:
-        super().__init__(**{**rest, "searches": 1, "edges": False})
+        super().__init__(**{**rest, "searches": 1})
         self.walls = walls
         if self.clutter:
             self.settings = replace(self.settings, visibility=KERNEL)

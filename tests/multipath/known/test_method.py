@@ -30,7 +30,7 @@ def room(tmp_path_factory):
 
 
 def fitted(name: str, data, rows: np.ndarray, **init):
-    settings = InitSettings(name, searches=1, edges=False, **init)
+    settings = InitSettings(name, searches=1, **init)
     return field_initialiser(name)(data, np.sort(rows), settings, True, FitContext(budget_s=60.0))
 
 
