@@ -1,10 +1,9 @@
-"""Seconds, memory and errors against the number of rows, and of what else a site has many.
+"""Seconds, memory and errors against the number of rows.
 
 python bench/scale.py powers town 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
 python bench/scale.py powers city 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
 python bench/scale.py channels hall.h5 10000 100000 >> docs/results/scale/channels.csv
 python bench/scale.py spectra FOLDER 6000 12000 25000 50000 >> docs/results/scale/spectra.csv
-python bench/scale.py axes antennas 4 16 64 >> docs/results/scale/axes.csv    # tones, stations, ...
 python bench/scale.py draw docs/results/scale docs/images
 
 Methods may be named behind the numbers. Each is fitted in a process of its own. Seconds are of the processor,
@@ -196,10 +195,6 @@ def main(kind: str, *rest: str) -> None:
         channels(Path(rest[0]), counts, methods or CHANNELS)
     elif kind == "spectra":
         spectra(Path(rest[0]), counts, methods or SPECTRA)
-    elif kind == "axes":
-        from scale_axes import axes
-
-        axes(rest[0], counts)
     elif kind == "head":
         csv.writer(sys.stdout).writerow(HEAD)
     else:

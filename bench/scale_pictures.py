@@ -19,17 +19,12 @@ PANELS = {
         ("rmse", "rmse [dB], bars of two standard errors"),
     ),
 }  # fmt: skip
-AXES = {  # what the seconds are of, and the amount
-    "antennas": ("a fit", "antennas (16 tones)"), "tones": ("a fit", "tones (4 antennas)"),
-    "stations": ("a fit", "stations, learned together"), "gaussians": ("a step", "rendered Gaussians"),
-    "receivers": ("a simulation", "receivers"), "processes": ("a step, first process", "processes"),
-}  # fmt: skip
 Line = dict[str, str]
 
 
-def slope(lines: Sequence[Line], figure: str, least: float = MANY, amount: str = "rows") -> float:
-    """Of a figure against an amount, both as logarithms, least squares from `least` on; NaN of one point."""
-    points = [(float(one[amount]), float(one[figure])) for one in lines if float(one[amount]) >= least]
+def slope(lines: Sequence[Line], figure: str) -> float:
+    """Of a figure against rows, both as logarithms, least squares from `MANY` rows on; NaN of one point."""
+    points = [(float(one["rows"]), float(one[figure])) for one in lines if float(one["rows"]) >= MANY]
     if len(points) < 2:
         return float("nan")
     rows, values = np.log10(np.array(points)).T
@@ -37,35 +32,20 @@ def slope(lines: Sequence[Line], figure: str, least: float = MANY, amount: str =
 
 
 def draw(tables: Path, pictures: Path) -> None:
-    """A picture for each source that was measured, and one of what a site has many of besides rows."""
+    """A picture for each source that was measured."""
     for kind, shown in PANELS.items():
         lines = _read(tables / f"{kind}.csv")
         for source in dict.fromkeys(one["source"] for one in lines):
             own = [one for one in lines if one["source"] == source]
             figure, places = panels(9.0, 6.4, 2, 2)
             for place, (quantity, title) in zip(places.flat, shown, strict=True):
-                _curves(place, own, quantity, "rows", MANY)
+                _curves(place, own, quantity)
                 place.set_title(title)
                 place.set_xlabel("rows")
                 place.set_yscale("linear" if quantity.endswith("gb") else "log")
                 logarithmic(place, fine=False)
             figure.legend(*places[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
             save(figure, pictures / f"scale-{source}.png")
-    lines = _read(tables / "axes.csv")
-    if lines:
-        figure, places = panels(11.0, 6.4, 2, 3)
-        for place, (axis, (what, amount)) in zip(places.flat, AXES.items(), strict=True):
-            own = [one for one in lines if one["axis"] == axis]
-            _curves(place, own, "fit_cpu_s", "amount", 0)
-            place.set_title(f"processor seconds of {what}")
-            place.set_xlabel(amount)
-            place.set_yscale("log")
-            logarithmic(place, fine=False)
-            counts = sorted({int(one["amount"]) for one in own})
-            place.set_xticks(counts, [f"{count:,}" for count in counts])
-            place.set_xticks([], minor=True)
-            place.legend()
-        save(figure, pictures / "scale-axes.png")
 
 
 def _read(path: Path) -> list[Line]:
@@ -75,12 +55,12 @@ def _read(path: Path) -> list[Line]:
         return list(csv.DictReader(file))
 
 
-def _curves(place: Axes, lines: Sequence[Line], quantity: str, amount: str, least: float) -> None:
-    """A figure of every method against an amount; slopes of seconds stand in the legend."""
+def _curves(place: Axes, lines: Sequence[Line], quantity: str) -> None:
+    """A figure of every method against rows; slopes of seconds stand in the legend."""
     for name in dict.fromkeys(one["method"] for one in lines):
-        own = sorted((one for one in lines if one["method"] == name), key=lambda one: int(one[amount]))
-        counts, values = (np.array([float(one[key]) for one in own]) for key in (amount, quantity))
+        own = sorted((one for one in lines if one["method"] == name), key=lambda one: int(one["rows"]))
+        counts, values = (np.array([float(one[key]) for one in own]) for key in ("rows", quantity))
         errors = [2 * float(one["rmse_error"]) for one in own] if quantity == "rmse" else None
-        found = slope(own, quantity, least, amount) if quantity == "fit_cpu_s" else float("nan")
+        found = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
         label = name if np.isnan(found) else f"{name}, slope {found:.2f}"
         place.errorbar(counts, values, errors, label=label, capsize=2, **look(name).marked)

@@ -44,19 +44,6 @@ def town(count: int, seed: int = 0) -> Measurements:
     return from_arrays(arrays, {"name": "town"})
 
 
-def stations(count: int, rows: int, seed: int = 0) -> Measurements:
-    """Powers of so many stations of the town at the same `rows` places; the last tenth is for the test."""
-    rng = np.random.default_rng([seed, count])
-    places, masts = (rng.uniform(0, SIDE_M, (number, 2)) for number in (rows, count))
-    masts = np.c_[masts, np.full(count, STATION[2])]
-    heard = [shadowed(places, mast, np.random.default_rng([1, t])) for t, mast in enumerate(masts)]
-    arrays = {
-        "rx_position": np.c_[places, np.full(rows, HEIGHT_M)], "station_position": masts,
-        "rssi_db": np.stack(heard, 1) + NOISE_DB * rng.standard_normal((rows, count)),
-    }  # fmt: skip
-    return from_arrays(arrays, {"name": "town"})
-
-
 def shadowed(places: np.ndarray, station: np.ndarray, shadows: np.random.Generator) -> np.ndarray:
     """Powers (n,) [dB] without noise at places (n, 2) [m]: a distance law and shadowing."""
     distance = np.hypot(np.linalg.norm(places - station[:2], axis=1), station[2] - HEIGHT_M)
