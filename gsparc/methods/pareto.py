@@ -12,14 +12,9 @@ Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as t
 
 WORDS = {
     "keep": lambda value: f"{value:.0%} kept",
-    "anchors": lambda value: f"{value:.0%} of the places",
     "stride": lambda value: f"1 of {value} x {value} pixels",
-    "cutoff": lambda value: f"cut-off x{value:g}",
     "projection": lambda value: f"{value} projection",
-    "frozen": lambda value: "frozen plan" if value else "live plan",
     "confidence": lambda value: "" if value else "no confidence",
-    "hybrid": lambda value: "" if value else "no residual",
-    "beside": lambda value: f"{value:.0%} of the averaged process" if value else "no averaged process",
     "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
 }
 

@@ -18,10 +18,7 @@ from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
 
-AS_TRAINED = {  # else: None
-    "keep": 1.0, "anchors": 1.0, "stride": 1, "cutoff": 1, "confidence": True, "frozen": True, "hybrid": True,
-    "beside": 1.0,
-}  # fmt: skip
+AS_TRAINED = {"keep": 1.0, "stride": 1, "confidence": True}  # else: None
 Measured = dict[str, Tensor]
 
 

@@ -388,13 +388,11 @@ class Gsparc(LearnedField):
     # -- reductions --------------------------------------------------------------------------------
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`; `hybrid=false` and `beside=0` are the Gaussians alone."""
+        """See `Reducible`."""
         if self.field is None:
-            own = super().knobs()
-            return own if self._average is None else (*own, "beside")
+            return super().knobs()
         method = self._method()
-        own = () if method is None or isinstance(self.field, StackedField) else knobs(method)
-        return (*own, "hybrid") if isinstance(self.field, CompletedField) else own
+        return () if method is None or isinstance(self.field, StackedField) else knobs(method)
 
     def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
         """See `Reducible`."""
@@ -405,18 +403,16 @@ class Gsparc(LearnedField):
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
-        own = {knob: value for knob, value in settings.items() if knob not in ("hybrid", "beside")}
-        keep, method = settings.get("hybrid", True), self._method()
+        method = self._method()
         if self.field is None:
             twin = copy.copy(self)
             twin._average = None
-            found = LearnedField.reduced(twin, own, measured)
-            share = float(settings.get("beside", 1.0)) if keep else 0.0
-            return averaged(found, *self._average, share) if share and self._average is not None else found
+            found = LearnedField.reduced(twin, settings, measured)
+            return found if self._average is None else averaged(found, *self._average)
         if method is None or isinstance(self.field, StackedField):
             return self
-        found = reduced(method, own, measured)
-        return Summed(found, self.field) if keep and isinstance(self.field, CompletedField) else found
+        found = reduced(method, settings, measured)
+        return Summed(found, self.field) if isinstance(self.field, CompletedField) else found
 
     # -- storing -----------------------------------------------------------------------------------
 

@@ -109,8 +109,8 @@ def mean_alone(process: Method, settings: Settings | None = None) -> Method:
     return process.reduced(spared, {}) if isinstance(process, GaussianProcess) else process
 
 
-def averaged(own: Method, process: Method, weight: float, share: float) -> Method:
-    """A reduced field averaged with as many pixels of `share` of the process's components.
+def averaged(own: Method, process: Method, weight: float) -> Method:
+    """A reduced field averaged with as many pixels of the process.
 
     Interpolation is linear: the mean is taken on the coarse grid, and filled in once.
 
@@ -118,11 +118,10 @@ def averaged(own: Method, process: Method, weight: float, share: float) -> Metho
         own: the field, reduced; `Filled` where it answers on a coarser grid.
         process: fitted.
         weight: of the process.
-        share: of its components, the strongest, in (0, 1].
     """
     if not isinstance(own, Filled):
-        return Averaged(own, mean_alone(process, {"keep": share}), weight)
-    lean = mean_alone(process, {"keep": share, "stride": own.stride})
+        return Averaged(own, mean_alone(process), weight)
+    lean = mean_alone(process, {"stride": own.stride})
     if isinstance(lean, Filled):
         return Filled(Averaged(own.inner, lean.inner, weight), own.grid, own.stride)
     return Averaged(own, lean, weight)

@@ -1,4 +1,4 @@
-"""What a splatted field can spare: Gaussians, pixels, faint edges, the frozen plan, the confidence."""
+"""What a splatted field can spare: Gaussians or places, pixels, the exact footprint, the confidence."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ from gsparc.field.frozen import FrozenArray, frozen_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.methods.coarse_grid import Filled, coarser
-from gsparc.methods.method import Method, Prediction
+from gsparc.methods.method import Method
 from gsparc.methods.pareto import Settings
-from gsparc.methods.reduced import View
 from gsparc.ops import Pose, SphereGrid, mean_weights
 
 if TYPE_CHECKING:
@@ -40,13 +39,11 @@ def knobs(model: GaussianModel) -> tuple[str, ...]:
     """See `Reducible`.
 
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
-    places that the features are told by, and pixels.
+    places that the features are told by, which `keep` is a share of, and pixels.
     """
-    if through_array(model) and model.tells_unknown:
-        return ("anchors", "stride", "confidence", "frozen")
-    stride = () if through_array(model) else ("stride",)
-    static = model.site.kind == "spectrum" and model.site.static_end == "rx"
-    return ("keep", "cutoff", "projection", "confidence", *stride, *(("frozen",) if static else ()))
+    if through_array(model):
+        return ("keep", "stride" if model.tells_unknown else "projection", "confidence")
+    return ("keep", "projection", "confidence", "stride")
 
 
 @torch.no_grad()
@@ -80,23 +77,23 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
 
     Args:
         method: fitted.
-        settings: `keep` share of Gaussians in (0, 1]; `anchors` share of the places that features are told
-            by; `stride` in pixels; `cutoff` factor on the smallest alpha that counts; `projection`; `frozen`
-            plan or not; `confidence` or not.
+        settings: `keep` share of Gaussians, or of places, in (0, 1]; `stride` in pixels; `projection`;
+            `confidence` or not.
         measured: from `measure`.
     """
     twin = copy.copy(method)
     twin.model = model = copy.deepcopy(method.fitted())
     site, stride = model.site, int(settings.get("stride", 1))
     raster = model.settings.raster
-    factor = float(settings.get("cutoff", 1))
     raster = replace(
         raster, projection=settings.get("projection", raster.projection),
         low_pass=raster.low_pass / stride**2,  # as wide as before on the sky
-        alpha_cutoff=raster.alpha_cutoff * factor, relative_cutoff=raster.relative_cutoff * factor,
     )  # fmt: skip
     model.settings = replace(model.settings, raster=raster)
-    if "keep" in settings:
+    by_places = through_array(model) and model.tells_unknown
+    if "keep" in settings and by_places:
+        tell_with_fewer(model, float(settings["keep"]))
+    elif "keep" in settings:
         share, total = float(settings["keep"]), len(model.gaussians)
         if _linear(model):
             _keep(model, spread(model, measured)[: math.ceil(share * total)])
@@ -105,29 +102,21 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
             teach(model, method.fitted(), measured["receiver"])
         else:
             _keep(model, measured["contribution"].topk(math.ceil(share * total)).indices)
-    if "anchors" in settings:
-        tell_with_fewer(model, float(settings["anchors"]))
     if not settings.get("confidence", True):
         model.confidence = model.error = None
     model.gaussians.version += 1  # a plan frozen before is stale
-    found: Method = twin if settings.get("frozen", True) else Live(twin)
-    if (
-        through_array(model)
-        and model.tells_unknown
-        and found is twin
-        and not {"keep", "cutoff", "projection"} & set(settings)
-    ):
+    if by_places:
         twin.frozen, grid = _frozen_again(method, model, measured["receiver"], stride)
-        return Filled(found, grid, stride) if stride > 1 else found
+        return Filled(twin, grid, stride) if stride > 1 else twin
     if stride == 1:
-        return found
+        return twin
     if site.kind != "spectrum":  # visibility is measured on fewer directions, nothing to fill in
         rows = FULL_SPHERE_ROWS // stride
         model.site = replace(site, grid=SphereGrid.full_sphere(rows, 2 * rows))
-        return found
+        return twin
     assert site.grid is not None
     model.site = replace(site, grid=coarser(site.grid, stride))
-    return Filled(found, site.grid, stride)
+    return Filled(twin, site.grid, stride)
 
 
 def _frozen_again(
@@ -142,20 +131,6 @@ def _frozen_again(
     assert isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
     renderer = response.every(stride, coarser(grid, stride)) if stride > 1 else None
     return frozen_array(model, view.view, renderer), grid
-
-
-class Live(View):
-    """A static receiver's plan made anew for every query, as a moving one's must be."""
-
-    def __init__(self, inner: LearnedField) -> None:
-        super().__init__(inner)
-        self._model = inner.fitted()
-
-    @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; the mean alone."""
-        mean = self._model(tx, rx).mean
-        return Prediction(mean.clamp(0, 1) if self._model.site.kind == "spectrum" else mean)
 
 
 def _keep(model: GaussianModel, rows: Tensor) -> None:

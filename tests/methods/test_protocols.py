@@ -199,7 +199,7 @@ def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):
     ("name", "settings"),
     [
         ("gp", {"keep": 0.5, "confidence": False}),
-        ("array", {"anchors": 0.5}),
+        ("array", {"keep": 0.5}),
         ("moving_array", {"keep": 0.5}),
         ("gsparc", {"keep": 0.5, "confidence": False}),
     ],

@@ -32,7 +32,7 @@ def swept(field, tmp_path_factory):
     shutil.copy(field.checkpoints[0], ckpt)
     config = compose(
         f"ckpt='{ckpt}'", "threads=[1]", "rounds=5",
-        "grid.keep=[1.0,0.3]", "grid.stride=[1,2]", "grid.cutoff=[1]",
+        "grid.keep=[1.0,0.3]", "grid.stride=[1,2]",
         "baselines=[mean]", f"peers=['{field.checkpoints[0]}']", f"cache='{folder}/cache'", config="tradeoff",
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
@@ -66,7 +66,7 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     facts, folder, *_ = swept
     with (folder / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == facts["tradeoff/points"] == 7  # as trained, 2 alone, 2 x 2 without confidence
+    assert len(rows) == facts["tradeoff/points"] == 6  # as trained, 1 alone, 2 x 2 without confidence
     times = [float(row["render_ms_p50"]) for row in rows]
     assert times == sorted(times) and all(
         float(row["render_ms_p95"]) >= t for row, t in zip(rows, times, strict=True)

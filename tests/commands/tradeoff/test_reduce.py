@@ -68,8 +68,6 @@ def test_the_order_of_keeping_is_spread_over_the_sky(field):
     ("settings", "near"),
     [
         ({"stride": 2}, 0.1),
-        ({"cutoff": 4}, 0.1),
-        ({"frozen": False}, 1e-8),
         ({"projection": "equirect"}, 0.5),
     ],
 )
@@ -101,17 +99,15 @@ def through_array(tmp_path_factory):
 
 def test_fewer_places_say_what_all_of_them_said(through_array):
     method, data, fold = through_array
-    assert reduced.knobs(method) == ("anchors", "stride", "confidence", "frozen")
+    assert reduced.knobs(method) == ("keep", "stride", "confidence")
     measured = reduced.contributions(method, data, fold.train)
-    ways = [reduced.reduced(method, {"anchors": share}, measured) for share in (1.0, 0.75, 0.1)]
+    ways = [reduced.reduced(method, {"keep": share}, measured) for share in (1.0, 0.75, 0.1)]
     assert [way.fitted().emission.encoding.width for way in ways] == [36, 27, 4]
     assert method.fitted().emission.encoding.width == 36
     error = [away(method, way, data, fold.test) for way in ways]
     assert error[0] < 1e-5 < error[1] < error[2]
     unsure = [float(answer(way, data, fold.train).confidence.mean()) for way in ways]
     assert unsure[0] > unsure[1] > unsure[2]
-    live = reduced.reduced(method, {"anchors": 0.75, "frozen": False}, measured)
-    assert away(ways[1], live, data, fold.test) < 1e-4
 
 
 def test_an_array_spares_pixels_and_its_confidence(through_array):
@@ -204,7 +200,7 @@ def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.split.folds[0], FitContext(Path()))
-    assert list(reduced.combinations(method, {"keep": [1.0, 0.5]}, {"frozen": [False]})) == [{}]
+    assert list(reduced.combinations(method, {"keep": [1.0, 0.5]}, {"projection": ["equirect"]})) == [{}]
     assert reduced.reduced(method, {"keep": 0.5}, {}) is method
 
 
@@ -212,7 +208,6 @@ def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
     found = train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1]
     method, data, fold = found.methods[0], found.data, found.split.folds[0]
     measured = reduced.contributions(method, data, fold.train)
-    assert "frozen" not in reduced.knobs(method)
     strongest = reduced.reduced(method, {"keep": 0.5}, measured)
     weakest = reduced.reduced(method, {"keep": 0.5}, {"contribution": -measured["contribution"]})
     assert strongest.size() == weakest.size() == 20
@@ -220,24 +215,19 @@ def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
     assert away(method, reduced.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
 
 
-def test_what_a_process_beside_adds_stays_unless_it_is_spared(field):
+def test_what_a_process_beside_adds_stays(field):
     data, fold = field.data, field.split.folds[0]
     method = copy.copy(field.methods[0])
     measured = reduced.contributions(method, data, fold.train)
-    assert "beside" not in reduced.knobs(method)
-    mean = answer(method, data, fold.test).mean
-    beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(mean)))
+    plain = answer(reduced.reduced(method, {"stride": 2}, measured), data, fold.test).mean
+    beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(plain)))
     method._average = (beside, 0.25)
-    assert "beside" in reduced.knobs(method)
-    plain, added, earlier = (
-        answer(reduced.reduced(method, {"stride": 2, **spared}, measured), data, fold.test).mean
-        for spared in ({"beside": 0}, {}, {"hybrid": False})  # the last as in fronts stored before
-    )
-    assert torch.allclose(0.75 * plain + 0.25, added) and torch.equal(plain, earlier)
+    added = answer(reduced.reduced(method, {"stride": 2}, measured), data, fold.test).mean
+    assert torch.allclose(0.75 * plain + 0.25, added)
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_a_process_beside_spares_components_and_pixels_with_the_field(field, stride):
+def test_a_process_beside_spares_pixels_with_the_field(field, stride):
     data, fold = field.data, field.split.folds[0]
     method = copy.copy(field.methods[0])
     measured = reduced.contributions(method, data, fold.train)
@@ -245,10 +235,10 @@ def test_a_process_beside_spares_components_and_pixels_with_the_field(field, str
     process.fit(data, fold, FitContext())
     method._average, method._average_mean = (process, 0.5), None
     alone = reduced.reduced(field.methods[0], {"stride": stride}, measured)
-    spared = {"confidence": False, "keep": 0.5, "stride": stride}
+    spared = {"confidence": False, "stride": stride}
     wanted = 0.5 * answer(alone, data, fold.test).mean
     wanted += 0.5 * answer(process.reduced(spared, {}), data, fold.test).mean
-    lean = reduced.reduced(method, {"stride": stride, "beside": 0.5}, measured)
+    lean = reduced.reduced(method, {"stride": stride, "confidence": True}, measured)
     assert torch.allclose(answer(lean, data, fold.test).mean, wanted, atol=1e-4)
     whole = answer(process, data, fold.test).mean
     own = answer(field.methods[0], data, fold.test)
