@@ -6,11 +6,13 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import torch
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT, Measurements
-from gsparc.methods.nearest_process import Values, given
-from gsparc.methods.power_kernel import PowerKernel
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import Values, given
+from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 
 SIDE_M = 3_000.0
@@ -72,10 +74,10 @@ def city(count: int, seed: int = 0) -> Measurements:
         place[:, :2] += JITTER_M * part.normal(size=(number, 2))
         parts.append(place)
     places = np.concatenate(parts)
-    kernel = PowerKernel((80.0, 500.0), (0.3, 0.7), 0.2, 60.0)
-    process = given(Values.of(known, powers), Trend(float(powers.mean())), kernel, None, np.zeros(0), 0)
-    blocks = np.array_split(places, 1 + len(places) // 4000)
-    decibels = np.concatenate([process.mean_and_variance(block)[0] for block in blocks])
+    prior = Prior(Kernel((80.0, 500.0), (0.3, 0.7), 0.2, 60.0), Trend(float(powers.mean())))
+    posterior = given(prior, Values.of(known, torch.from_numpy(powers)[:, None]), 0)
+    with torch.no_grad():
+        decibels = posterior.mean_at(torch.from_numpy(places))[:, 0].numpy()
     decibels += CITY_NOISE_DB * rng.standard_normal(len(places))
     arrays = {"tx_position": places, "rx_position": station, "rssi_db": decibels}
     return from_arrays(arrays, {"name": "city"})

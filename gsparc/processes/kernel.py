@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -71,7 +71,7 @@ class Kernel:
     amplitude: float = 1.0
 
     @classmethod
-    def of_one(cls, length: float, noise: float, amplitude: float = 1.0) -> Kernel:
+    def of_one(cls, length: float, noise: float, amplitude: float = 1.0) -> Self:
         """With one length [m]."""
         return cls((length,), (1.0,), noise, amplitude)
 
@@ -101,7 +101,7 @@ class Kernel:
         }  # fmt: skip
 
     @classmethod
-    def read(cls, state: Mapping[str, Any]) -> Kernel:
+    def read(cls, state: Mapping[str, Any]) -> Self:
         """The kernel whose `state()` this was."""
         lengths, shares = (tuple(float(v) for v in state[name]) for name in ("lengths", "shares"))
         return cls(lengths, shares, *(float(v) for v in state["kernel"]))
@@ -112,7 +112,7 @@ class Kernel:
         return np.array([*np.log(self.lengths), *logit, math.log(self.noise)])
 
     @classmethod
-    def of(cls, parameters: np.ndarray, amplitude: float = 1.0) -> Kernel:
+    def of(cls, parameters: np.ndarray, amplitude: float = 1.0) -> Self:
         """The kernel whose `parameters()` these are."""
         lengths, shares, noise = unpacked(torch.from_numpy(np.asarray(parameters, np.float64)))
         return cls(tuple(map(float, lengths)), tuple(map(float, shares)), float(noise), amplitude)

@@ -431,10 +431,10 @@ def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:
     return whole[rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(rows), -1)
 
 
-def _factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) -> Tensor:
+def _factors(groups: tuple[Group, ...], solved: list[Factor], runs: int) -> Tensor:
     """Factors of runs (runs,), as measured over the largest one's."""
     quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
-    for group, factor in zip(groups, factors, strict=True):
+    for group, factor in zip(groups, solved, strict=True):
         inverse, run = factor.inverse.numpy(), group.run.numpy()
         level = float(group.target.abs().square().mean())
         own = run_quadratic(inverse, group.target.numpy(), run) / max(level, 1e-300)
