@@ -19,8 +19,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.ops import Pose
-from gsparc.processes.factor import Factor
-from gsparc.processes.left_out import left_out
+from gsparc.processes.conditioned import Conditioned
 
 
 @dataclass(frozen=True)
@@ -270,6 +269,5 @@ def leave_one_out_density(covariance: Tensor, target: Tensor) -> Tensor:
         covariance: (n, n) real or complex, noise included.
         target: (n, R).
     """
-    inverse = Factor.of(covariance).inverse
-    residual, variance = left_out(inverse, inverse @ target)
+    residual, variance = Conditioned.of(covariance, target).left_out()
     return (residual.abs().square() / variance[:, None] + variance.log()[:, None]).mean(1) / 2

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.multipath.gp_likelihood import CircularFactor, steering
+from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import LIGHT, NEAR_M
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.worker import ask
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
@@ -39,20 +40,20 @@ class Detections:
 Spread = Callable[[Tensor], Tensor]
 
 
-def score(rows: Rows, candidates: Tensor, factor: CircularFactor) -> tuple[Tensor, Tensor]:
+def score(rows: Rows, candidates: Tensor, conditioned: Conditioned) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
 
     Where the static end has E antennas, candidates are the images of each, (E, m, 3).
     """
-    return score_waves(steering(rows, candidates), factor)
+    return score_waves(steering(rows, candidates), conditioned)
 
 
-def score_waves(waves: Tensor, factor: CircularFactor) -> tuple[Tensor, Tensor]:
+def score_waves(waves: Tensor, conditioned: Conditioned) -> tuple[Tensor, Tensor]:
     """The same of any waves (n, m) complex64."""
-    matched = (waves.mH @ factor.alpha).abs().square().sum(1)
-    power = (factor.root @ waves).abs().square().sum(0)
+    matched = (waves.mH @ conditioned.weights).abs().square().sum(1)
+    power = (conditioned.factor.root @ waves).abs().square().sum(0)
     gained = matched / power
-    return gained / factor.alpha.shape[1], (gained / power / factor.alpha.shape[1]).sqrt()
+    return gained / conditioned.weights.shape[1], (gained / power / conditioned.weights.shape[1]).sqrt()
 
 
 def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
@@ -90,7 +91,7 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
 
 def search_box(
     rows: Rows,
-    factor: CircularFactor,
+    conditioned: Conditioned,
     box: Tensor,
     min_distance: float,
     limit: int,
@@ -103,13 +104,13 @@ def search_box(
     """
     drawn = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
     candidates = box[0] + (box[1] - box[0]) * drawn
-    rough = quick_score(rows, spread(candidates), factor.alpha)
+    rough = quick_score(rows, spread(candidates), conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
-    exact = torch.cat([score(rows, spread(part), factor)[0] for part in candidates.split(512)])
+    exact = torch.cat([score(rows, spread(part), conditioned)[0] for part in candidates.split(512)])
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
     rates = [STEP_M * (1 - 0.8 * step / STEPS) for step in range(STEPS)]
-    (polished,) = ascend([best], lambda position: score(rows, spread(position), factor)[0], rates)
-    scores, amplitude = score(rows, spread(polished), factor)
+    (polished,) = ascend([best], lambda position: score(rows, spread(position), conditioned)[0], rates)
+    scores, amplitude = score(rows, spread(polished), conditioned)
     chosen = pick_apart(polished, scores, min_distance, limit)
     return Detections(polished[chosen], scores[chosen], amplitude[chosen])
 

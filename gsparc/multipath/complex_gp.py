@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,13 +25,15 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.run_factors import RunFactors, run_factors
-from gsparc.multipath.waves.kernels import plain
 from gsparc.ops import Pose
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.covering import covering
 from gsparc.processes.factor import Factor
-from gsparc.processes.left_out import left_out
-from gsparc.processes.nearest import solved
+from gsparc.processes.kernel import WaveKernel
+from gsparc.processes.nearest import Nearest, Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood
+from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.prior import Prior
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
@@ -39,18 +42,7 @@ MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is
 NEAREST = 100  # rows that tell of a query: waves from all around are not screened as shadows are
 TRIED_ON = 300  # of these, rows whose density given their neighbours chooses the settings
 ENTRIES = 64  # of their channels
-QUERIES = 32  # at a time, each with the channels of its neighbours: memory
 NAMED = 6  # factors of runs that a note gives
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """Negative log likelihood, factor of m rows, weights (m, R), factors that align rows (m,)."""
-
-    nll: float
-    factor: Factor
-    weights: Tensor
-    aligning: Tensor
 
 
 class ComplexGP(Method):
@@ -64,12 +56,19 @@ class ComplexGP(Method):
 
     def __init__(self) -> None:
         self.site: Site | None = None
-        self.near: Neighbourhood | None = None  # of rows too many for one factor
+        self.posterior: Posterior | None = None
 
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return self.name if self.near is None else f"{self.name} (Vecchia {NEAREST})"
+        return approximated(self.name, self.posterior)
+
+    @property
+    def kernel(self) -> WaveKernel:
+        """Its length, noise and power."""
+        kernel = self._fitted().prior.kernel
+        assert isinstance(kernel, WaveKernel)
+        return kernel
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
@@ -77,148 +76,92 @@ class ComplexGP(Method):
         if data.site.kind != "csi" or data.site.wavelength is None:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = np.concatenate([fold.train, fold.val])
-        self.site = data.site
-        self.shape = tuple(data.target.shape[1:])
-        self.places, self.near = torch.from_numpy(data.moving[known]), None
+        self.site, self.shape = data.site, tuple(data.target.shape[1:])
+        self.first = torch.arange(len(known))
         one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
-        if len(known) > MOST_ROWS and one_run:
-            said = tuple(f"complex_gp: {note}" for note in self._fit_many(data, known))
-            return FitReport(time.monotonic() - started, said)
+        many = len(known) > MOST_ROWS and one_run
+        notes = self._fit_many(data, known) if many else self._fit_whole(data, known)
+        length, noise = float(self.kernel.length), self.kernel.noise
+        envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
+        return FitReport(time.monotonic() - started, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
+
+    def _kernels(self) -> Iterator[WaveKernel]:
+        assert self.site is not None and self.site.wavelength is not None
+        for length in LENGTHS:
+            for noise in NOISES:
+                yield WaveKernel(2 * math.pi / self.site.wavelength, length * self.site.wavelength, noise)
+
+    def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
+        """Rows (n,) with one factor, settings chosen on some; factors of runs."""
+        places, notes = torch.from_numpy(data.moving[known]), []
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
-        looked_at = torch.arange(len(known))
-        if len(known) > CHOSEN_ON:
-            drawn = np.random.default_rng(0).permutation(len(known))[:CHOSEN_ON]
-            looked_at = torch.from_numpy(np.sort(drawn))
         names, run = np.unique(
             np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
         )
-        lengths = [length * data.site.wavelength for length in LENGTHS]
-        tried = [
-            (self._solve(target, length, noise, looked_at, run).nll, length, noise)
-            for length in lengths
-            for noise in NOISES
-        ]
-        _, self.length, self.noise = min(tried, key=lambda t: t[0])
-        solved = self._solve(target, self.length, self.noise, torch.arange(len(known)), run)
-        self.factor, self.weights, self.turned = solved.factor, solved.weights, 1 / solved.aligning
-        self.power = max(float((target * solved.aligning[:, None]).abs().square().mean()), 1e-30)
-        notes = [f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"]
+        some = torch.arange(len(known))
         if len(known) > CHOSEN_ON:
-            notes.append(f"complex_gp: settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
+            some = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(known))[:CHOSEN_ON]))
+            notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
+        looked_at = places[some], target[some], run[some.numpy()]
+        kernel = min(self._kernels(), key=lambda one: _aligned(one, *looked_at)[0])
+        _, conditioned, aligning = _aligned(kernel, places, target, run)
+        power = max(float((target * aligning[:, None]).abs().square().mean()), 1e-30)
+        none = torch.zeros(len(known), dtype=torch.float64)
+        prior = Prior(replace(kernel, amplitude=power))
+        self.posterior = Exact(prior, places, conditioned.weights, none).with_factor(conditioned.factor)
+        self.turned = 1 / aligning
         first = torch.from_numpy(np.unique(run, return_index=True)[1])
         self.runs = RunFactors(names.astype(np.int64), self.turned[first])
         if len(names) > 1:
             notes.append(self._factors_note(names, run))
-        return FitReport(time.monotonic() - started, tuple(notes))
+        return notes
 
-    def _fit_many(self, data: Measurements, known: np.ndarray) -> tuple[str, ...]:
-        """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours."""
-        assert self.site is not None and self.site.wavelength is not None
-        scatter = self._places_once(data, known)
-        near = self.near = Neighbourhood.of(self.places.numpy(), 0)
-        row = covering(near.places, TRIED_ON, 0)
-        others, _ = near.nearest(near.places[row], row, NEAREST)
-        rows = np.c_[row, others]
-        at = torch.from_numpy(near.places[rows])
-        entries = np.random.default_rng(0).permutation(self.targets.shape[1])[:ENTRIES]
-        values = torch.from_numpy(self.targets[rows[..., None], entries])
-        share = 1 / torch.from_numpy(self.count[rows])  # of the noise, in a mean
-        again, around = float((1 / share[:, 0] - 1).sum()), float(scatter[row].sum())
-        tried = []
-        for length in (length * self.site.wavelength for length in LENGTHS):
-            covariance = self._correlation(at, at, length)
-            for noise in NOISES:
-                gram = covariance[:, 1:, 1:] + torch.diag_embed(noise * share[:, 1:])
-                weights, told = solved(gram, covariance[:, 0, 1:])
-                missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
-                variance = 1 + noise * share[:, 0] - told
-                power = float((missed.abs().square().mean(1) / variance).sum()) + around / noise
-                power, unsure = (
-                    power / (len(row) + again),
-                    float(variance.log().sum()) + again * np.log(noise),
-                )
-                tried.append((np.log(max(power, 1e-300)) + unsure / (len(row) + again), length, noise))
-        _, self.length, self.noise = min(tried, key=lambda t: t[0])
-        self.power = max(float(values[:, 0].abs().square().mean()), 1e-30)
-        self.runs = RunFactors.none()
-        said = f"envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
-        of = f"of {len(self.places)} places, of" if len(self.places) < len(known) else "of"
-        told_by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
-        return said, told_by, f"settings chosen on {len(row)} of them, each given its nearest"
+    def _fit_many(self, data: Measurements, known: np.ndarray) -> list[str]:
+        """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours.
 
-    def _places_once(self, data: Measurements, known: np.ndarray) -> np.ndarray:
-        """Take each place of rows (n,) once, with the mean of its channels; what was spread about it (m,).
-
-        A hundred nearest rows of one place, where a robot waited, tell of no other.
+        A hundred nearest rows of one place, where a robot waited, tell of no other: its mean is taken once.
         """
-        place = numbered(self.places.numpy())
-        _, self.first, count = np.unique(place, return_index=True, return_counts=True)
-        self.count, self.targets = count.astype(np.float64), taken(data.target, known).reshape(len(known), -1)
-        if len(count) == len(known):
-            return np.zeros(len(known))
-        order = np.argsort(place, kind="stable")
-        starts = np.cumsum(count) - count
-        sums, squares = (
-            np.add.reduceat(part[order], starts)
-            for part in (self.targets, (np.abs(self.targets) ** 2).mean(1))
-        )
-        self.places, self.targets = self.places[self.first], sums / count[:, None].astype(np.float32)
-        return np.maximum(squares - count * (np.abs(self.targets) ** 2).mean(1), 0)
+        targets = torch.from_numpy(taken(data.target, known).reshape(len(known), -1))
+        place = torch.from_numpy(numbered(data.moving[known]))
+        _, first, count = np.unique(place.numpy(), return_index=True, return_counts=True)
+        self.first, counts = torch.from_numpy(first), torch.from_numpy(count).double()
+        means = torch.zeros(len(count), targets.shape[1], dtype=targets.dtype).index_add_(0, place, targets)
+        means /= counts[:, None].float()
+        squares = torch.zeros(len(count), dtype=torch.float64)
+        squares.index_add_(0, place, targets.abs().square().mean(1).double())
+        scatter = (squares - counts * means.abs().square().mean(1)).clamp_min(0)
+        values = Values(data.moving[known][first], means, counts)
+        near = Neighbourhood.of(values.places, 0)
+        row = covering(values.places, TRIED_ON, 0)
+        rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
+        entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
+        sample = torch.from_numpy(values.places[rows]), means[rows][..., entries], counts[rows], scatter[row]
+        kernel = min(self._kernels(), key=lambda one: _density(one, *sample))
+        power = max(float(sample[1][:, 0].abs().square().mean()), 1e-30)
+        prior = Prior(replace(kernel, amplitude=power))
+        self.posterior = given(prior, values, 0, most=NEAREST)
+        self.turned, self.runs = torch.ones(1, dtype=torch.complex128), RunFactors.none()
+        of = f"of {len(count)} places, of" if len(count) < len(known) else "of"
+        by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
+        return [by, f"settings chosen on {len(row)} of them, each given its nearest"]
 
     def _factors_note(self, names: np.ndarray, run: np.ndarray) -> str:
         """A note of the factors of runs (n,), numbers into `names` (runs,)."""
-        first = [int(np.flatnonzero(run == number)[0]) for number in range(len(names))][:NAMED]
-        factors = self.turned.numpy()[first]
+        factors = self.runs.factors.numpy()[:NAMED]
         listed = ", ".join(
             f"{name:g}: {abs(factor):.3g} at {np.degrees(np.angle(factor)):.0f} degrees"
             for name, factor in zip(names, factors, strict=False)
         )
         more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        largest = names[np.bincount(run).argmax()]
-        return f"complex_gp: factors of runs, relative to run {largest:g}: {listed}{more}"
+        return f"factors of runs, relative to run {names[np.bincount(run).argmax()]:g}: {listed}{more}"
 
-    def _solve(self, target: Tensor, length: float, noise: float, rows: Tensor, run: np.ndarray) -> _Solved:
-        """Weights of `rows` (m,) for an envelope's length [m]; the best power and runs' factors are taken."""
-        places, target, number = self.places[rows], target[rows], run[rows.numpy()]
-        gram = self._correlation(places, places, length)
-        gram.diagonal().add_(noise)
-        factor = Factor.of(gram)
-        aligning = torch.ones(len(rows), dtype=torch.complex128)
-        if len(np.unique(number)) > 1:
-            inverse = factor.inverse.numpy()
-            _, number = np.unique(number, return_inverse=True)
-            aligning = torch.from_numpy(run_factors(inverse, target.numpy(), number)[number])
-            target = target * aligning[:, None]
-        weights = factor.solved(target)
-        fit = float((target.conj() * weights).real.sum()) / (2 * target.numel())
-        determinant = 0.5 * float(factor.log_determinant) / len(target)
-        nll = 0.5 * np.log(max(fit, 1e-300)) + determinant - float(aligning.abs().log().mean())
-        return _Solved(nll, factor, weights, aligning)
-
-    def _correlation(self, a: Tensor, b: Tensor, length: float) -> Tensor:
-        """Between places (..., n, 3) and (..., m, 3) [m], or (..., 6) of both ends."""
-        assert self.site is not None and self.site.wavelength is not None
-        return plain(a, b, 2 * math.pi / self.site.wavelength, length)
-
+    @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
-        if self.site is None:
-            raise ValueError("complex_gp: not fitted yet; call fit or restore first")
-        if self.near is not None:
-            with torch.no_grad():
-                mean, left = self._nearest_posterior(self.near, self._moving(tx, rx))
-            variance = left / (1 + self.noise)
-            sure = (1 - variance).float().clamp(0, 1)
-            return Prediction(mean, sure, (self.power * variance).float())
-        with torch.no_grad():
-            cross = self._cross(tx, rx)
-        known = self.factor.whitened(cross.T).square().sum(0)
-        variance = (1 + self.noise - known).clamp_min(0) / (1 + self.noise)
-        return Prediction(
-            self._mean(cross),
-            confidence=(1 - variance).float().clamp(0, 1),
-            variance=(self.power * variance).float(),
-        )
+        found, kernel = self._fitted().answer(self._moving(tx, rx)), self.kernel
+        share = found.left / (1 + kernel.noise)
+        mean = found.mean.to(torch.complex64).reshape(-1, *self.shape)
+        return Prediction(mean, (1 - share).float().clamp(0, 1), (kernel.amplitude * share).float())
 
     def answer(self, batch: Batch) -> Prediction:
         """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
@@ -226,77 +169,80 @@ class ComplexGP(Method):
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64; see `Differentiable`."""
-        if self.near is not None:
-            return self._nearest_posterior(self.near, self._moving(tx, rx))[0]
-        return self._mean(self._cross(tx, rx))
-
-    def _nearest_posterior(
-        self, near: Neighbourhood, queries: Tensor, without: np.ndarray | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Mean (B, A, K) complex64 and variance of a measurement (B,), of the power, by the nearest rows."""
-        means, left = [], []
-        for start in range(0, len(queries), QUERIES):
-            part = queries[start : start + QUERIES]
-            own = None if without is None else without[start : start + QUERIES]
-            row, _ = near.nearest(part.detach().numpy(), own, NEAREST)
-            places = torch.from_numpy(near.places[row])
-            gram = self._correlation(places, places, self.length)
-            gram.diagonal(dim1=-2, dim2=-1).add_(self.noise / torch.from_numpy(self.count[row]))
-            weights, told = solved(gram, self._correlation(part[:, None], places, self.length)[:, 0])
-            values = torch.from_numpy(self.targets[row])
-            means.append(torch.einsum("bk,bkr->br", weights.to(values.dtype), values))
-            left.append((1 + self.noise - told).clamp_min(0))
-        return torch.cat(means).reshape(-1, *self.shape), torch.cat(left)
+        mean = self._fitted().mean_at(self._moving(tx, rx))
+        return mean.to(torch.complex64).reshape(-1, *self.shape)
 
     def leave_one_out(self) -> LeftOut:
         """See `LeaveOneOut`; rows are those of the fit, counted from 0; of visits to a place, the first."""
-        if self.near is not None:
-            every = np.arange(len(self.places))
-            mean = self._nearest_posterior(self.near, self.places, every)[0].flatten(1)
-            return LeftOut(self.first, (torch.from_numpy(self.targets) - mean).to(torch.complex128))
-        residual, _ = left_out(self.factor.precision, self.weights)
-        return LeftOut(np.arange(len(self.places)), self.turned[:, None] * residual)
+        posterior = self._fitted()
+        if isinstance(posterior, Exact):
+            residual, _ = posterior.residual()
+        else:
+            assert isinstance(posterior, Nearest)
+            residual = (posterior.rest - posterior.left_out()[0]).to(torch.complex128)
+        return LeftOut(self.first.numpy(), self.turned[:, None] * residual)
 
     def _moving(self, tx: Tensor, rx: Pose) -> Tensor:
         """Places (B, 3) float64 [m] of the moving end, (B, 6) of both."""
         assert self.site is not None
         return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
-    def _cross(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Covariance (B, n) of the moving end's places with those learned from."""
-        return self._correlation(self._moving(tx, rx), self.places, self.length)
-
-    def _mean(self, cross: Tensor) -> Tensor:
-        mean = torch.complex(cross @ self.weights.real, cross @ self.weights.imag)
-        return mean.to(torch.complex64).reshape(len(cross), *self.shape)
+    def _fitted(self) -> Posterior:
+        if self.posterior is None:
+            raise ValueError("complex_gp: not fitted yet; call fit or restore first")
+        return self.posterior
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        if self.site is None:
-            raise ValueError("complex_gp: not fitted yet; call fit or restore first")
-        if self.near is not None:
-            arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
-            arrays |= {name: torch.from_numpy(getattr(self, name)) for name in ("targets", "count", "first")}
-            stored = {**arrays, "shape": list(self.shape)}
-            return {**stored, "length": self.length, "noise": self.noise, "power": self.power}
-        names = ("places", "weights", "length", "noise", "power", "turned")
-        own = {"factor": self.factor.lower, **{name: getattr(self, name) for name in names}}
+        own = {"posterior": self._fitted().state(), "turned": self.turned, "first": self.first}
         return {**own, **self.runs.state(), "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
-        self.length, self.noise, self.power = (float(state[k]) for k in ("length", "noise", "power"))
-        self.places, self.near = state["places"], None
-        if "level" in state:
-            self.near = Neighbourhood(self.places.numpy(), state["level"].numpy())
-            self.targets = state["targets"].numpy()
-            self.count, self.first = state["count"].numpy(), state["first"].numpy()
-            self.runs = RunFactors.none()
-            return
-        self.weights, self.factor = state["weights"], Factor(state["factor"])
-        self.turned, self.runs = state["turned"], RunFactors.read(state)
+        self.posterior = (Nearest if "level" in state["posterior"] else Exact).read(state["posterior"])
+        self.turned, self.first, self.runs = state["turned"], state["first"], RunFactors.read(state)
 
     def size(self) -> int:
         """Training samples kept."""
-        return len(self.places) if self.site is not None else 0
+        return 0 if self.posterior is None else len(self.posterior.places)
+
+
+def _aligned(
+    kernel: WaveKernel, places: Tensor, target: Tensor, run: np.ndarray
+) -> tuple[float, Conditioned, Tensor]:
+    """Negative log likelihood of the best power and runs' factors, channels given these, what aligns rows.
+
+    Args:
+        kernel: of unit power.
+        places, target, run: (n, D) [m], (n, R) complex128 and (n,) numbers.
+    """
+    gram = kernel.between(places, places)
+    gram.diagonal().add_(kernel.noise)
+    factor, aligning = Factor.of(gram), torch.ones(len(places), dtype=torch.complex128)
+    if len(np.unique(run)) > 1:
+        number = np.unique(run, return_inverse=True)[1]
+        aligning = torch.from_numpy(run_factors(factor.inverse.numpy(), target.numpy(), number)[number])
+        target = target * aligning[:, None]
+    conditioned = Conditioned(factor, target, factor.solved(target))
+    nll = math.log(max(conditioned.scale / 2, 1e-300)) + float(factor.log_determinant) / len(places)
+    return 0.5 * nll - float(aligning.abs().log().mean()), conditioned, aligning
+
+
+def _density(kernel: WaveKernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
+    """Negative log density of rows given their neighbours at the best power, visits to one place included.
+
+    Args:
+        kernel: of unit power.
+        at, values, counts: (T, 1 + k, D) [m], (T, 1 + k, R) and (T, 1 + k): rows first, then neighbours.
+        scatter: (T,) squares of visits about their mean.
+    """
+    covariance, noise = kernel.between(at, at), kernel.noise / counts
+    gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:])
+    weights, known = solved(gram, covariance[:, 0, 1:])
+    missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
+    variance, again = 1 + noise[:, 0] - known, float((counts[:, 0] - 1).sum())
+    power = float((missed.abs().square().mean(1) / variance).sum()) + float(scatter.sum()) / kernel.noise
+    unsure = float(variance.log().sum()) + again * math.log(kernel.noise)
+    count = len(at) + again
+    return math.log(max(power / count, 1e-300)) + unsure / count

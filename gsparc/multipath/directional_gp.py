@@ -25,7 +25,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction
 from gsparc.multipath.frame import FramedMethod, frame_of, refuse
-from gsparc.multipath.gp_likelihood import CircularFactor, steering
+from gsparc.multipath.gp_likelihood import steering, with_noise
 from gsparc.multipath.position_refine import PositionRefinement, UncertainPositions, coherence
 from gsparc.multipath.rows import Rows, gather
 from gsparc.multipath.triangulation import Rays, triangulate
@@ -33,7 +33,7 @@ from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.multipath.visibility_kernel import matern32
 from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
-from gsparc.processes.left_out import left_out, left_out_group
+from gsparc.processes.left_out import left_out_group
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.
 MIN_SEEN, MAX_SOURCES = 2, 60
@@ -181,14 +181,14 @@ class DirectionalGP(FramedMethod):
         for _ in range(ROUNDS):
             covariance = _covariance(waves, waves, self.power, uncertain, retained)
             tried = {
-                kernel: CircularFactor.with_noise(covariance * each, kernel.noise, rows.target)
+                kernel: with_noise(covariance * each, kernel.noise, rows.target)
                 for kernel, each in correlation.items()
             }
-            self.kernel, factor = min(tried.items(), key=lambda one: one[1].nll)
+            self.kernel, conditioned = min(tried.items(), key=lambda one: one[1].nll)
             # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
             prior = self.power * self.kernel.constant
-            mean = prior[:, None] * (waves.mH @ factor.alpha)
-            known = (factor.root @ waves).abs().square().sum(0)
+            mean = prior[:, None] * (waves.mH @ conditioned.weights)
+            known = (conditioned.factor.root @ waves).abs().square().sum(0)
             self.power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
         self._prepare()
 
@@ -201,10 +201,10 @@ class DirectionalGP(FramedMethod):
         correlation = self.kernel.correlation(rows.position, rows.position)
         retained = coherence(self.phase_vectors, self.phase_vectors)
         covariance = _covariance(self.waves, self.waves, self.power, self.uncertain, retained)
-        self.factor = CircularFactor.with_noise(covariance * correlation, self.kernel.noise, rows.target)
+        self.conditioned = with_noise(covariance * correlation, self.kernel.noise, rows.target)
 
         # (n, K, R, 2), real and imaginary: what each row adds to each source's gain
-        dual_weights = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
+        dual_weights = (self.power * self.waves.conj())[:, :, None] * self.conditioned.weights[:, None]
         self.dual_weights = torch.view_as_real(dual_weights).contiguous()
 
     def _update_visibility(self) -> int:
@@ -231,7 +231,7 @@ class DirectionalGP(FramedMethod):
             )
             one = self._gains(query) * steering(self.rows, self.sources)[:, :, None]
             seen, odds = self.visibility.seen.float(), rates.odds(rays, probability)
-            flip = flips(seen[rows], odds[rows], *left_out(self.factor.inverse, self.factor.alpha), one)
+            flip = flips(seen[rows], odds[rows], *self.conditioned.left_out(), one)
             if not bool(flip.any()):
                 break
             seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])
@@ -303,7 +303,7 @@ class DirectionalGP(FramedMethod):
         powers = arriving.abs().square() * self.power
         cross = _covariance(arriving * probability, self.waves, self.power, self.uncertain, query.retained)
         cross = cross * query.correlation
-        gains = (powers * probability.square()).sum(1) - (self.factor.root @ cross.mH).abs().square().sum(0)
+        gains = (powers * probability.square()).sum(1) - self.conditioned.known(cross)
         visibility_variance = (powers * probability * (1 - probability)).sum(1)
         power = (powers * probability).sum(1)
         return gains.clamp_min(0) + visibility_variance + self.kernel.noise, power + self.kernel.noise
@@ -319,11 +319,12 @@ class DirectionalGP(FramedMethod):
         retained = coherence(self.phase_vectors, self.phase_vectors)
         cross = _covariance(expected, self.waves, self.power, self.uncertain, retained)
         cross = cross * self.kernel.correlation(self.rows.position, self.rows.position)
-        predicted = cross @ self.factor.alpha
+        predicted = self.conditioned.mean(cross)
+        inverse = self.conditioned.factor.inverse
         for one in self.observer.unique():
             group = torch.nonzero(self.observer == one).flatten()
-            own, _ = left_out_group(self.factor.inverse, self.factor.alpha, group)
-            predicted[group] -= cross[group] @ (self.factor.inverse[:, group] @ own)
+            own, _ = left_out_group(inverse, self.conditioned.weights, group)
+            predicted[group] -= cross[group] @ (inverse[:, group] @ own)
         return self._left_out(self.rows, predicted)
 
     # ---- state ----

@@ -44,9 +44,9 @@ def element_factors(rows: Rows, scene: Scene, noise_floor: float) -> Tensor | No
         noise_floor: known variance of the noise, in units of the rows' power.
     """
     assert rows.array is not None and rows.element is not None
-    factor = Posterior(rows, scene, noise_floor).factor
+    conditioned = Posterior(rows, scene, noise_floor).conditioned
     known, run = np.unique(rows.element.numpy(), return_inverse=True)
-    inverse = factor.inverse.to(torch.complex128).numpy()
+    inverse = conditioned.factor.inverse.to(torch.complex128).numpy()
     found = run_factors(inverse, rows.target.to(torch.complex128).numpy(), run)
     each = np.ones(len(rows.array), np.complex128)
     each[known] = found / found[0]
@@ -55,6 +55,6 @@ def element_factors(rows: Rows, scene: Scene, noise_floor: float) -> Tensor | No
     scale = turned.target.abs().square().mean().sqrt()  # a common factor is the sources' to have
     nll = Posterior(replace(turned, target=turned.target / scale), scene, noise_floor).nll
     jacobian = 2 * float((factors.abs().log()[rows.element] - scale.log()).double().sum())
-    gain = factor.nll - (nll - jacobian)
+    gain = conditioned.nll - (nll - jacobian)
     cost = (len(known) - 1) * math.log(len(rows))
     return factors if gain > cost else None

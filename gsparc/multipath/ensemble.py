@@ -174,7 +174,7 @@ def affordable_rows(rows: Rows, found: list[Member], noise_floor: float, budget:
     A covariance of n rows takes n^3; that of a search's rows is timed.
     """
     started = budget.spent
-    assert PhasedPosterior(rows, found[0].phased, noise_floor).factor
+    assert PhasedPosterior(rows, found[0].phased, noise_floor).conditioned
     each = max(budget.spent - started, 1e-6)
     rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
     return max(int(len(rows) * (rest / (each * len(found))) ** (1 / 3)), len(rows))

@@ -20,7 +20,7 @@ from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, images
 from gsparc.physics.waves import ranges, wave
-from gsparc.processes.factor import Factor
+from gsparc.processes.conditioned import Conditioned
 
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
 
@@ -125,53 +125,11 @@ def add_covariance(real: Tensor, imag: Tensor, scaled: Tensor, correlation: Tens
     imag.addcmul_(correlation, turned @ pair.T)
 
 
-@dataclass(frozen=True)
-class Factored:
-    """A factored covariance of n numbers with R outputs.
-
-    Attributes:
-        factor: of the covariance (n, n), complex64 or float32.
-        alpha: (n, R), K^-1 y.
-        nll: negative log marginal likelihood up to a constant.
-    """
-
-    factor: Factor
-    alpha: Tensor
-    nll: float
-
-    @property
-    def root(self) -> Tensor:
-        """See `Factor.root`."""
-        return self.factor.root
-
-    @property
-    def inverse(self) -> Tensor:
-        """K^-1 (n, n)."""
-        return self.factor.inverse
-
-
-class CircularFactor(Factored):
-    """A factored covariance of n complex rows."""
-
-    @staticmethod
-    def of(covariance: Tensor, target: Tensor) -> CircularFactor:
-        """From a positive definite covariance, noise included."""
-        factor = Factor.of(covariance)
-        alpha = factor.solved(target)
-        fit = (target.conj() * alpha).real.double().sum()
-        return CircularFactor(factor, alpha, float(fit + target.shape[1] * factor.log_determinant))
-
-    @staticmethod
-    def with_noise(covariance: Tensor, noise: float, target: Tensor) -> CircularFactor:
-        """From a covariance to whose diagonal noise and jitter are added in place."""
-        level = max(1.0, float(covariance.diagonal().real.mean()))
-        covariance.diagonal().add_(noise + JITTER * level)
-        return CircularFactor.of(covariance, target)
-
-    @cached_property
-    def slope(self) -> Tensor:
-        """G = R K^-1 - alpha alpha^H (n, n): d nll = trace(G dK)."""
-        return self.alpha.shape[1] * self.inverse - self.alpha @ self.alpha.mH
+def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
+    """Targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
+    level = max(1.0, float(covariance.diagonal().real.mean()))
+    covariance.diagonal().add_(noise + JITTER * level)
+    return Conditioned.of(covariance, target)
 
 
 class Posterior:
@@ -198,14 +156,14 @@ class Posterior:
         return torch.complex(real, imag)
 
     @cached_property
-    def factor(self) -> CircularFactor:
-        """Of the covariance and the rows' targets."""
-        return CircularFactor.of(self.covariance, self.rows.target)
+    def conditioned(self) -> Conditioned:
+        """The rows' targets given their covariance."""
+        return Conditioned.of(self.covariance, self.rows.target)
 
     @property
     def nll(self) -> float:
         """Negative log marginal likelihood up to a constant."""
-        return self.factor.nll
+        return self.conditioned.nll
 
     def without(self, k: int) -> float:
         """`nll` of the scene without source k."""
@@ -214,4 +172,4 @@ class Posterior:
         real, imag = torch.zeros(n, n), torch.zeros(n, n)
         correlation = self.scene.visibility.correlation(self.rows.places, self.scene.sources[k])
         add_covariance(real, imag, scaled, correlation)
-        return CircularFactor.of(self.covariance - torch.complex(real, imag), self.rows.target).nll
+        return Conditioned.of(self.covariance - torch.complex(real, imag), self.rows.target).nll

@@ -22,11 +22,10 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter
-from gsparc.multipath.gp_likelihood import JITTER, Factored, Posterior, Scene
+from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.processes.factor import Factor
-from gsparc.processes.left_out import left_out
+from gsparc.processes.conditioned import Conditioned
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class PhasedScene:
     def of(rows: Rows, scene: Scene, quadrature: float) -> PhasedScene:
         """Phases of each source's mean gain under the circular process."""
         posterior = Posterior(rows, scene)
-        gain = (posterior.waves.mH @ posterior.factor.alpha).sum(1)
+        gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
         return PhasedScene(scene, gain.angle(), quadrature if rows.target.shape[1] == 1 else 1.0)
 
     def state(self) -> dict[str, Any]:
@@ -104,22 +103,10 @@ def add_source(covariance: Tensor, wave: Tensor, quadrature: float, correlation:
     )
 
 
-class RealFactor(Factored):
-    """A factored covariance of 2 n real numbers: the real parts of n rows, then the imaginary ones."""
-
-    @staticmethod
-    def of(covariance: Tensor, target: Tensor) -> RealFactor:
-        """From a positive definite covariance (2, n, 2, n), noise included, and targets (n, R) complex."""
-        size = 2 * len(target)
-        factor, flat = Factor.of(covariance.reshape(size, size)), stacked(target)[0]
-        alpha = factor.solved(flat)
-        nll = 0.5 * ((flat * alpha).double().sum() + target.shape[1] * factor.log_determinant)
-        return RealFactor(factor, alpha, float(nll))
-
-    @property
-    def slope(self) -> Tensor:
-        """G = R K^-1 - alpha alpha^T (2 n, 2 n): d nll = trace(G dK) / 2."""
-        return torch.addmm(self.inverse, self.alpha, self.alpha.T, beta=self.alpha.shape[1], alpha=-1)
+def given(covariance: Tensor, target: Tensor) -> Conditioned:
+    """Targets (n, R) complex as 2 n real numbers, given their covariance (2, n, 2, n), noise included."""
+    size = 2 * len(target)
+    return Conditioned.of(covariance.reshape(size, size), stacked(target)[0])
 
 
 class PhasedPosterior:
@@ -135,8 +122,8 @@ class PhasedPosterior:
         return self.phased.waves(self.rows)
 
     @cached_property
-    def factor(self) -> RealFactor:
-        """Of the covariance and the rows' targets."""
+    def conditioned(self) -> Conditioned:
+        """The rows' targets given their covariance."""
         n, scene = len(self.rows), self.scene
         covariance = torch.zeros(2, n, 2, n)
         for k, source in enumerate(scene.sources):
@@ -145,13 +132,13 @@ class PhasedPosterior:
             add_source(covariance, scaled, self.phased.quadrature, correlation)
         noise = math.exp(scene.log_noise) + self.noise_floor
         covariance.view(2 * n, 2 * n).diagonal().add_(noise / 2)
-        return RealFactor.of(covariance, self.rows.target)
+        return given(covariance, self.rows.target)
 
     @property
     def dual_weights(self) -> Tensor:
         """Dual weights of u_k + j v_k (K, n, R) complex64, before the correlation over places."""
         n, (along, across) = len(self.rows), shares(self.phased.quadrature)
-        alpha = torch.complex(self.factor.alpha[:n], self.factor.alpha[n:])
+        alpha = torch.complex(*self.conditioned.weights.split(n))
         power = self.scene.log_amplitude.mul(2).exp()
         circular = (self.waves.conj() * power).T[:, :, None] * alpha
         return torch.complex(along * circular.real, across * circular.imag)
@@ -170,9 +157,9 @@ class PhasedPosterior:
 
         Rasmussen and Williams (2006), eq. 5.12, in blocks.
         """
-        n, alpha, inverse = len(self.rows), self.factor.alpha, self.factor.inverse
+        n = len(self.rows)
         order = torch.argsort(self.rows.receiver, stable=True)
         counts = torch.unique_consecutive(self.rows.receiver[order], return_counts=True)[1]
         groups = (torch.cat([group, group + n]) for group in order.split(counts.tolist()))
-        error, _ = left_out(inverse, alpha, groups)
+        error, _ = self.conditioned.left_out(groups)
         return self.rows.target - torch.complex(error[:n], error[n:])

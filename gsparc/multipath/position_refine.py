@@ -21,9 +21,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.multipath.gp_likelihood import CircularFactor, steering
+from gsparc.multipath.gp_likelihood import steering, with_noise
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 
 SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
@@ -146,19 +147,19 @@ class PositionRefinement:
         """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            factor = CircularFactor.with_noise(self._total(), self.noise, self.rows.target)
-            explained = (factor.alpha.conj() * (self.terms @ factor.alpha)).real.sum((1, 2))
-            due = outputs * (factor.inverse.conj() * self.terms).real.sum((1, 2))
+            given = with_noise(self._total(), self.noise, self.rows.target)
+            explained = (given.weights.conj() * (self.terms @ given.weights)).real.sum((1, 2))
+            due = outputs * (given.factor.inverse.conj() * self.terms).real.sum((1, 2))
             self.power = self.power * (explained / due.clamp_min(1e-12)).clamp(1 / MAX_RATIO, MAX_RATIO)
             self.power = self.power.clamp_max(MAX_POWER * float(self.power.median())).clamp_min(1e-9)
-            residual = float(factor.alpha.abs().square().sum())
-            ratio = residual / max(outputs * float(factor.inverse.diagonal().real.sum()), 1e-12)
+            residual = float(given.weights.abs().square().sum())
+            ratio = residual / max(outputs * float(given.factor.inverse.diagonal().real.sum()), 1e-12)
             self.noise = max(self.noise * min(max(ratio, 1 / MAX_RATIO), MAX_RATIO), MIN_NOISE)
 
     def _refine(self, k: int) -> None:
         """Position and covariance of source k given its rays, the channels and all other sources."""
         conditional = ConditionalLikelihood.of(
-            self, k, CircularFactor.with_noise(self._total(without=k), self.noise, self.rows.target)
+            self, k, with_noise(self._total(without=k), self.noise, self.rows.target)
         )
         if self.resolved[k]:
             places = self.current.points[k][None]
@@ -207,13 +208,13 @@ class ConditionalLikelihood:
     precision: Tensor
 
     @staticmethod
-    def of(refinement: PositionRefinement, k: int, factor: CircularFactor) -> ConditionalLikelihood:
+    def of(refinement: PositionRefinement, k: int, given: Conditioned) -> ConditionalLikelihood:
         """Of source k, with the factor of the covariance without it."""
         rows_in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
         return ConditionalLikelihood(
             refinement.rows.take(rows_in_view),
-            factor.inverse[rows_in_view[:, None], rows_in_view],
-            factor.alpha[rows_in_view],
+            given.factor.inverse[rows_in_view[:, None], rows_in_view],
+            given.weights[rows_in_view],
             float(refinement.power[k]),
             refinement.prior.points[k],
             torch.linalg.inv(refinement.prior.covariance[k]),

@@ -161,7 +161,7 @@ class RowVariance:
         if len(few) < len(member.rows):
             member = PhasedPosterior(member.rows.take(few), member.phased, member.noise_floor)
         phased, kernel = member.phased, member.scene.visibility
-        self.place_of, self.root = place_of[few], member.factor.root.T.contiguous()
+        self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.contiguous()
         self.phasor = torch.polar(torch.ones(()), phased.phase)
         self.power = phased.scene.log_amplitude.mul(2).exp()
         self.noise = math.exp(phased.scene.log_noise)

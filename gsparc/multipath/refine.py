@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import (
     JITTER,
-    CircularFactor,
     Posterior,
     Scene,
     add_covariance,
@@ -21,6 +20,7 @@ from gsparc.multipath.gp_likelihood import (
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
+from gsparc.processes.conditioned import Conditioned
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
@@ -126,8 +126,8 @@ def _likelihood(
     for k in range(len(scene.sequences)):
         add_covariance(real, imag, scaled[:, k], correlation[k])
     real.diagonal().add_(noise + noise_floor)
-    factor = CircularFactor.of(torch.complex(real, imag), rows.target)
-    slope_re, slope_im = factor.slope.real.contiguous(), factor.slope.imag.contiguous()
+    conditioned = Conditioned.of(torch.complex(real, imag), rows.target)
+    slope_re, slope_im = (part.contiguous() for part in (conditioned.slope.real, conditioned.slope.imag))
     weighted = torch.empty_like(scaled)  # (G * C_k) s_k a_k
     for k in range(len(scene.sequences)):
         pair = torch.stack([scaled[:, k].real, scaled[:, k].imag], 1)
@@ -138,7 +138,7 @@ def _likelihood(
     by_noise = noise * slope_re.diagonal().sum()
     by_wave = 2 * weighted * values[2].exp()
     places = torch.autograd.grad(waves, [transmitter, planes], by_wave, materialize_grads=True)
-    return factor.nll, [*places, by_amplitude, by_noise]
+    return conditioned.nll, [*places, by_amplitude, by_noise]
 
 
 def learn_visibility(
@@ -160,7 +160,7 @@ def learn_visibility(
         if late():
             break
         posterior = Posterior(rows, replace(scene, visibility=KernelVisibility.of(value.detach())))
-        slope = posterior.factor.slope
+        slope = posterior.conditioned.slope
         scaled = posterior.waves * scene.log_amplitude.exp()
         optimizer.zero_grad()
         for k, source in enumerate(scene.sources):

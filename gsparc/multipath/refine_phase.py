@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import JITTER, steering
-from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene, RealFactor, add_source, shares, stacked
+from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene, add_source, given, shares, stacked
 from gsparc.multipath.refine import SPREAD, Cost, Late, descend, never, with_cost
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
@@ -56,8 +56,8 @@ def _likelihood(
     for k in range(len(sequences)):
         add_source(covariance, scaled[:, k], phased.quadrature, correlation[k])
     covariance.view(2 * n, 2 * n).diagonal().add_((noise + noise_floor) / 2)
-    factor = RealFactor.of(covariance, rows.target)
-    slope = factor.slope
+    conditioned = given(covariance, rows.target)
+    slope = conditioned.slope
     blocks = slope.view(2, n, 2, n)
     weighted = torch.empty_like(scaled)
     for k in range(len(sequences)):
@@ -69,7 +69,7 @@ def _likelihood(
     by_noise = noise * slope.diagonal().sum() / 4
     leaves = [transmitter, planes, phase]
     *places, by_phase = torch.autograd.grad(waves, leaves, weighted * values[2].exp(), materialize_grads=True)
-    return factor.nll, [*places, by_amplitude, by_noise, by_phase]
+    return conditioned.nll, [*places, by_amplitude, by_noise, by_phase]
 
 
 def learn_visibility(
@@ -103,7 +103,7 @@ def learn_visibility(
         if late():
             break
         posterior = PhasedPosterior(rows, current(), noise_floor)
-        slope = posterior.factor.slope
+        slope = posterior.conditioned.slope
         scaled = posterior.waves * scene.log_amplitude.exp()
         share = (torch.sigmoid(value[3]) if free else torch.ones(())) / 2
         loss = ((value - centre) / width).square().sum() / 2

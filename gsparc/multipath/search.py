@@ -148,7 +148,7 @@ class Search:
             return 0
         position = images(scene.transmitter, scene.planes, sequences)
         candidates = replace(scene, sequences=tuple(sequences)).images(self.rows)
-        scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).factor)
+        scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).conditioned)
         clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(
             position, scores * clear, 0.5 * self.wavelength, most or SEQUENCES_PER_ROUND, SEQUENCE_SCORE
@@ -169,7 +169,7 @@ class Search:
                 break
             spread = partial(self._spread, parent)
             found = search_box(
-                self.rows, posterior.factor, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
+                self.rows, posterior.conditioned, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
                 self.generator, spread,
             )  # fmt: skip
             added = 0
@@ -212,7 +212,7 @@ class Search:
         candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
         taken = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, taken).amin(1) > 0.5 * self.wavelength
-        scores = score(self.rows, candidates, posterior.factor)[0].reshape(mirrored.shape[:2])
+        scores = score(self.rows, candidates, posterior.conditioned)[0].reshape(mirrored.shape[:2])
         order = torch.tensor([len(scene.sequences[i]) for i in able])
         gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas

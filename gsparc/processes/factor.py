@@ -81,7 +81,7 @@ class Factor:
     def whitened(self, values: Tensor) -> Tensor:
         """`L^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
-            return _as_pairs(self.whitened, values)
+            return as_pairs(self.whitened, values)
         if not _alone(self.lower, values):
             return torch.linalg.solve_triangular(self.lower, values, upper=False)
         upper, right = _array(self.lower).T, _array(values.to(self.lower.dtype).contiguous()).T
@@ -91,7 +91,7 @@ class Factor:
     def solved(self, values: Tensor) -> Tensor:
         """`K^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
-            return _as_pairs(self.solved, values)
+            return as_pairs(self.solved, values)
         if not _alone(self.lower, values):
             return torch.cholesky_solve(values, self.lower)
         upper, white = _array(self.lower).T, _array(self.whitened(values)).T
@@ -129,7 +129,7 @@ class Factor:
         return 2 * self.lower.diagonal(dim1=-2, dim2=-1).real.double().log().sum(-1)
 
 
-def _as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
+def as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
     """Complex values (..., n, R) through a real factor, as twice as many real ones."""
     pairs = torch.view_as_real(values.resolve_conj()).flatten(-2)
     return torch.view_as_complex(solve(pairs).unflatten(-1, (-1, 2)).contiguous())

@@ -118,6 +118,43 @@ class Kernel:
         return cls(tuple(map(float, lengths)), tuple(map(float, shares)), float(noise), amplitude)
 
 
+@dataclass(frozen=True)
+class WaveKernel:
+    """`amplitude (sin(kd) / (kd) Matern-3/2(d / length) + noise identity)`: waves from everywhere alike.
+
+    Where both ends move it is the product over both, as waves leave in all directions as they arrive from all
+    (R. K. Cook et al., J. Acoust. Soc. Am. 27 (1955)).
+
+    Attributes:
+        wavenumber: [rad/m].
+        length: of the envelope [m].
+        noise: variance relative to `amplitude`.
+        amplitude: variance of a complex value.
+    """
+
+    wavenumber: float
+    length: Tensor | float
+    noise: float = 0.0
+    amplitude: float = 1.0
+
+    def between(self, a: Tensor, b: Tensor) -> Tensor:
+        """Correlations (..., n, m) of places (..., n, 3) and (..., m, 3) of one end, or 6 of both [m]."""
+        ends = [apart(*pair) for pair in zip(a.split(3, -1), b.split(3, -1), strict=True)]
+        waves = [
+            torch.sinc(each * (self.wavenumber / math.pi)) * matern32(each, self.length) for each in ends
+        ]
+        return waves[0] if len(waves) == 1 else waves[0] * waves[1]
+
+    def state(self) -> dict[str, list[float]]:
+        """Numbers that `read` needs."""
+        return {"wave": [self.wavenumber, float(self.length), self.noise, self.amplitude]}
+
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> Self:
+        """The kernel whose `state()` this was."""
+        return cls(*(float(v) for v in state["wave"]))
+
+
 class SmoothRough(Kernel):
     """The same with one `smooth_rough` part, of array vectors and emissions."""
 

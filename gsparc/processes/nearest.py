@@ -22,14 +22,15 @@ from torch import Tensor
 from gsparc.processes.covering import covering
 from gsparc.processes.density import walked
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import Kernel, apart, bounds_of, matern_sum, unpacked
+from gsparc.processes.kernel import Kernel, WaveKernel, apart, bounds_of, matern_sum, unpacked
 from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood
 from gsparc.processes.posterior import Answer, Posterior
 from gsparc.processes.prior import Prior
 
 COVER = 20_000  # rows that weigh the mean law
+WHITENED = 1_024  # rows at a time that are whitened by their neighbours
 FIRST = 256  # rows of an ordering that condition on each other alone
-BLOCK = 1_024  # systems solved at a time: memory
+ENTRIES = 1_000_000  # of systems and values that are solved with at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
 SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
@@ -49,7 +50,9 @@ def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
     return weights, (weights * cross).sum(-1)
 
 
-def weights_of(kernel: Kernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+def weights_of(
+    kernel: Kernel | WaveKernel, places: Tensor, near: Tensor, noise: Tensor
+) -> tuple[Tensor, Tensor]:
     """The same of places (B, D) float64 [m], with autograd, by near rows (B, k, D) of `noise` (B, k)."""
     gram = kernel.between(near, near)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
@@ -91,6 +94,7 @@ class Nearest(Posterior):
         rest: (n, P) values less the mean law, float32 or float64.
         noise: (n,) variance of each value.
         terms: (Q, P) and `spread` (Q, Q): weights of the mean law's terms, and their covariance.
+        most: neighbours of a place.
     """
 
     prior: Prior
@@ -99,8 +103,16 @@ class Nearest(Posterior):
     noise: Tensor
     terms: Tensor
     spread: Tensor
+    most: int = NEIGHBOURS
 
-    approximation = f"Vecchia {NEIGHBOURS}"
+    @property
+    def approximation(self) -> str:  # type: ignore[override]
+        """See `Posterior`."""
+        return f"Vecchia {self.most}"
+
+    @property
+    def _block(self) -> int:
+        return max(1, ENTRIES // (self.most * (self.most + self.rest.shape[1])))
 
     @property
     def places(self) -> Tensor:
@@ -113,7 +125,7 @@ class Nearest(Posterior):
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """See `Posterior`; which rows are nearest has no gradient."""
-        return torch.cat([self._answer(part, None).mean for part in queries.split(BLOCK)])
+        return torch.cat([self._answer(part, None).mean for part in queries.split(self._block)])
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """See `Posterior`."""
@@ -122,12 +134,13 @@ class Nearest(Posterior):
 
     @torch.no_grad()
     def _answers(self, queries: Tensor, without: np.ndarray | None) -> Answer:
-        blocks = [slice(start, start + BLOCK) for start in range(0, len(queries), BLOCK)]
+        step = self._block
+        blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
         parts = [self._answer(queries[b], None if without is None else without[b]) for b in blocks]
         return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
 
     def _answer(self, queries: Tensor, without: np.ndarray | None) -> Answer:
-        row, far = self.near.nearest(queries.detach().numpy(), without)
+        row = self.near.nearest(queries.detach().numpy(), without, self.most)
         near, index = torch.from_numpy(self.near.places[row]), torch.from_numpy(row)
         weights, known = weights_of(self.prior.kernel, queries, near, self.noise[index])
         mean = torch.einsum("bk,bkp->bp", weights.to(self.rest.dtype), self.rest[index])
@@ -138,24 +151,33 @@ class Nearest(Posterior):
             unsure = own - torch.einsum("bk,bkp->bp", weights, about)
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
             left = left + ((unsure @ self.spread) * unsure).sum(1)
-        return Answer(mean, left.clamp_min(0.0), torch.from_numpy(far))
+        return Answer(mean, left.clamp_min(0.0))
+
+    def distance(self, queries: Tensor) -> Tensor:
+        """See `Posterior`."""
+        return torch.from_numpy(self.near.distance(queries.detach().numpy()))
 
     def state(self) -> dict[str, Any]:
         """See `Posterior`."""
         arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
         parts = {name: getattr(self, name) for name in ("rest", "noise", "terms", "spread")}
-        return {**self.prior.state(), **arrays, **parts}
+        return {**self.prior.state(), **arrays, **parts, "most": self.most}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Nearest:
         """The posterior whose `state()` this was."""
         near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
         parts = (state[name] for name in ("rest", "noise", "terms", "spread"))
-        return cls(Prior.read(state), near, *parts)
+        return cls(Prior.read(state), near, *parts, int(state["most"]))
 
 
 def given(
-    prior: Prior, values: Values, seed: int, more: Values | None = None, extra: Tensor | None = None
+    prior: Prior,
+    values: Values,
+    seed: int,
+    more: Values | None = None,
+    extra: Tensor | None = None,
+    most: int = NEIGHBOURS,
 ) -> Nearest:
     """The process given places, with settings as they are.
 
@@ -165,6 +187,7 @@ def given(
         seed: of rows that weigh the mean law.
         more: pseudo-values of other places, whose variances beyond the noise are `extra` (m,).
         extra: see `more`.
+        most: neighbours of a place.
     """
     noise, every = prior.kernel.noise / values.count, values
     if more is not None and extra is not None:
@@ -177,12 +200,12 @@ def given(
     near = Neighbourhood.of(every.places, seed)
     if prior.trend is None:
         none = torch.zeros(0, every.values.shape[1], dtype=torch.float64)
-        return Nearest(prior, near, every.values, noise, none, none[:, :0])
+        return Nearest(prior, near, every.values, noise, none, none[:, :0], most)
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
     chosen = covering(every.places, COVER, seed)
     terms, spread = weighed(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
-    return Nearest(prior, near, rest, noise, terms, spread)
+    return Nearest(prior, near, rest, noise, terms, spread, most)
 
 
 @torch.no_grad()
@@ -210,8 +233,8 @@ def weighed(
     start = first
     while start < len(places):
         tree, end = cKDTree(places[:start]), min(2 * start, len(places))
-        for a in range(start, end, BLOCK):
-            block = slice(a, min(a + BLOCK, end))
+        for a in range(start, end, WHITENED):
+            block = slice(a, min(a + WHITENED, end))
             row = tree.query(places[block], k=np.arange(1, min(NEIGHBOURS, tree.n) + 1))[1]
             shares, known = weights_of(kernel, at[block], at[row], noise[row])
             left = (1 + noise[block] - known).sqrt()

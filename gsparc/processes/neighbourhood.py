@@ -47,31 +47,34 @@ class Neighbourhood:
         sets = [np.flatnonzero(self.level == number) for number in range(int(self.level.max()) + 1)]
         return [(own, cKDTree(self.places[own])) for own in sets]
 
+    @cached_property
+    def _every(self) -> cKDTree:
+        return cKDTree(self.places)
+
+    def distance(self, queries: np.ndarray) -> np.ndarray:
+        """From queries (B, D) to the nearest place (B,) [m]."""
+        return self._every.query(queries)[0]
+
     def nearest(
-        self, queries: np.ndarray, without: np.ndarray | None = None, most: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (B, k) of neighbours of queries (B, D), and the distance (B,) from the nearest [m].
+        self, queries: np.ndarray, without: np.ndarray | None = None, most: int = NEIGHBOURS
+    ) -> np.ndarray:
+        """Numbers (B, k) of neighbours of queries (B, D).
 
         Args:
             queries: [m].
             without: (B,) a place for each query that is no neighbour of it; None: none. Of one place
-                alone there is then no neighbour, and the distance is infinite.
-            most: neighbours; None: NEIGHBOURS.
+                alone there is then no neighbour.
+            most: neighbours.
         """
         sparser = len(self._trees) - 1
-        most = NEIGHBOURS if most is None else most
         share = int(most * WIDER) // max(sparser, 1)
         found: list[np.ndarray] = []
-        far: list[np.ndarray] = []
         for own, tree in self._trees[::-1]:
             count = share if found else most - share * sparser
             more = 0 if without is None else 1
-            ks = np.arange(1, min(count + more, tree.n) + 1)
-            distance, number = tree.query(queries, k=ks)
-            row = own[number]
+            row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if without is not None:
                 later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
-                row, distance = (np.take_along_axis(part, later, 1) for part in (row, distance))
+                row = np.take_along_axis(row, later, 1)
             found.append(row)
-            far.append(distance.min(1, initial=np.inf))
-        return np.concatenate(found, 1), np.min(far, axis=0)
+        return np.concatenate(found, 1)

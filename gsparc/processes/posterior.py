@@ -1,4 +1,4 @@
-"""A real process conditioned on rows: exactly, or each query on the rows nearest to it.
+"""A process conditioned on rows: exactly, or each query on the rows nearest to it.
 
 Many outputs share one covariance. Variances are of a measurement, its noise included, in units of the
 kernel's amplitude.
@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from gsparc.processes.conditioned import weighted
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart
 from gsparc.processes.left_out import left_out
@@ -25,14 +26,12 @@ class Answer:
     """What is said of B places.
 
     Attributes:
-        mean: (B, P) float64.
+        mean: (B, P) float64 or complex128.
         left: (B,) variance of a measurement.
-        nearest: (B,) distance to the nearest row [m].
     """
 
     mean: Tensor
     left: Tensor
-    nearest: Tensor
 
 
 class Posterior(ABC):
@@ -59,6 +58,10 @@ class Posterior(ABC):
         """Mean (n, P) and variance of a measurement (n,) at each row's place without its own."""
 
     @abstractmethod
+    def distance(self, queries: Tensor) -> Tensor:
+        """From places (B, D) to the nearest row (B,) [m]."""
+
+    @abstractmethod
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `read` needs."""
 
@@ -76,7 +79,7 @@ class Exact(Posterior):
     Attributes:
         prior: see there.
         rows: (n, D) float64 [m].
-        weights: (n, P) float64, of the covariances with the rows.
+        weights: (n, P) float64 or complex128, of the covariances with the rows.
         extra: (n,) variance beyond the noise, as pseudo-values have it, of the amplitude.
     """
 
@@ -90,9 +93,10 @@ class Exact(Posterior):
         """Of values (n, P) at places (n, D) float64 [m]."""
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra)
-        return cls(prior, places, factor.solved(values - prior.mean(places)), extra)._with(factor)
+        return cls(prior, places, factor.solved(values - prior.mean(places)), extra).with_factor(factor)
 
-    def _with(self, factor: Factor) -> Exact:
+    def with_factor(self, factor: Factor) -> Exact:
+        """The same, its factor made already."""
         self.__dict__["factor"] = factor  # as `cached_property` would keep it
         return self
 
@@ -109,20 +113,24 @@ class Exact(Posterior):
     @torch.no_grad()
     def answer(self, queries: Tensor) -> Answer:
         """See `Posterior`."""
-        distance = apart(queries, self.rows)
-        cross = self._cross(queries, distance)
-        mean = self.prior.mean(queries) + cross @ self.weights
-        prior = self.prior.variance(queries)
+        cross, prior = self._cross(queries), self.prior.variance(queries)
         known = self.factor.whitened(cross.T).square().sum(0)
-        return Answer(mean, (prior - known).clamp_min(0.0).minimum(prior), distance.amin(1))
+        return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
-        cross = self._cross(queries, apart(queries, self.rows))
-        return self.prior.mean(queries) + cross @ self.weights
+        return self._mean(queries, self._cross(queries))
 
-    def _cross(self, queries: Tensor, distance: Tensor) -> Tensor:
-        found, prior = self.prior.kernel.correlation(distance), self.prior
+    def distance(self, queries: Tensor) -> Tensor:
+        """See `Posterior`."""
+        return apart(queries, self.rows).amin(1)
+
+    def _mean(self, queries: Tensor, cross: Tensor) -> Tensor:
+        found = weighted(cross, self.weights)
+        return found if self.prior.trend is None else self.prior.mean(queries) + found
+
+    def _cross(self, queries: Tensor) -> Tensor:
+        found, prior = self.prior.kernel.between(queries, self.rows), self.prior
         return found if prior.trend is None else found.addmm(prior.columns(queries), self._columns.T)
 
     @cached_property
@@ -132,17 +140,21 @@ class Exact(Posterior):
     def values(self) -> Tensor:
         """What it was given (n, P)."""
         lower = self.factor.lower
-        return self.prior.mean(self.rows) + lower @ (lower.T @ self.weights)
+        return self.prior.mean(self.rows) + weighted(lower, weighted(lower.T, self.weights))
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """See `Posterior`."""
-        residual, variance = left_out(self.factor.precision, self.weights)
+        residual, variance = self.residual()
         return self.values() - residual, variance
+
+    def residual(self) -> tuple[Tensor, Tensor]:
+        """What all other rows miss of each (n, P), and its variance (n,)."""
+        return left_out(self.factor.precision, self.weights)
 
     @torch.no_grad()
     def covariance(self, queries: Tensor) -> Tensor:
         """(B, B) of the signal at places (B, D), in the kernel's units."""
-        cross = self._cross(queries, apart(queries, self.rows))
+        cross = self._cross(queries)
         white = self.factor.whitened(cross.T)
         return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
 

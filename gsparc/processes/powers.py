@@ -109,7 +109,8 @@ class PowerProcess:
         own = 1 + self.kernel.noise
         whole = max(self.heard, own)
         by_law = 1 - own / whole  # share of that variance
-        unknown = found.left / whole + by_law * (1 - (-(found.nearest / self._reach).square()).exp())
+        far = self.posterior.distance(queries) / self._reach
+        unknown = found.left / whole + by_law * (1 - (-far.square()).exp())
         return found.mean[:, 0], self.kernel.amplitude * found.left, unknown.clamp_max(1.0)
 
     @cached_property

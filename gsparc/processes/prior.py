@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from gsparc.processes.kernel import Kernel
+from gsparc.processes.kernel import Kernel, WaveKernel
 from gsparc.processes.trend import Trend, trend_of
 
 
@@ -16,11 +16,11 @@ class Prior:
     """`trend + process of the kernel`; covariances are relative to the kernel's amplitude.
 
     Attributes:
-        kernel: its noise is that of one measurement.
+        kernel: of places; its noise is that of one measurement.
         trend: mean and columns of terms with unit normal weights; None: mean 0.
     """
 
-    kernel: Kernel
+    kernel: Kernel | WaveKernel
     trend: Trend | None = None
 
     def mean(self, places: Tensor) -> Tensor:
@@ -47,4 +47,5 @@ class Prior:
     @classmethod
     def read(cls, state: dict[str, Any]) -> Prior:
         """The prior whose `state()` this was."""
-        return cls(Kernel.read(state), trend_of(state) if "trend" in state else None)
+        kernel = WaveKernel.read(state) if "wave" in state else Kernel.read(state)
+        return cls(kernel, trend_of(state) if "trend" in state else None)

@@ -152,7 +152,7 @@ def test_residual_is_the_same_likelihood():
     residual = Residual(rows, PhasedScene(_scene(_boxed(_box())), torch.arange(7.0), 0.2))
     scene = residual.phased.scene
     seen = scene.visible_share(rows.position).T
-    expected = PhasedPosterior(rows, residual.phased).factor.nll
+    expected = PhasedPosterior(rows, residual.phased).conditioned.nll
     assert residual.nll(seen, scene.log_amplitude).item() == pytest.approx(expected, rel=1e-4)
     gains = residual.nats_per_source(seen, scene.log_amplitude)
     quiet = scene.log_amplitude.clone()
@@ -172,7 +172,7 @@ def test_score_is_what_the_best_multiple_gains():
     best = int(score.argmax())
     moved = rows.target[:, 0] - multiple[best] * change[:, best]
     posterior = [
-        PhasedPosterior(replace(rows, target=target[:, None]), residual.phased).factor.nll
+        PhasedPosterior(replace(rows, target=target[:, None]), residual.phased).conditioned.nll
         for target in (rows.target[:, 0], moved)
     ]
     assert score[best].item() == pytest.approx(posterior[0] - posterior[1], rel=0.02)
@@ -309,7 +309,7 @@ def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room(monkeypatch)
         start = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
         found = find_clutter(rows, start, generator)
         assert bool(len(found.scene.clutter.boxes)) == boxes
-        bare, learned = (PhasedPosterior(rows, each).factor.nll for each in (start, found))
+        bare, learned = (PhasedPosterior(rows, each).conditioned.nll for each in (start, found))
         assert learned <= bare
     assert not len(found.scene.clutter)
 

@@ -74,7 +74,7 @@ def test_quadrature_one_is_the_circular_process():
     for noise in (-1.0, 0.5):
         circular = replace(scene, log_noise=noise)
         phased = replace(_phased(quadrature=1.0), scene=circular)
-        differences.append(Posterior(rows, circular).nll - PhasedPosterior(rows, phased).factor.nll)
+        differences.append(Posterior(rows, circular).nll - PhasedPosterior(rows, phased).conditioned.nll)
     assert differences[0] == pytest.approx(differences[1], abs=1e-2)
 
 
@@ -122,7 +122,7 @@ def test_slopes_of_the_phased_likelihood():
         scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), phased.phase,
     ]  # fmt: skip
     start = refine_phase._likelihood(rows, phased, values, seen, 1e-5)[0]
-    assert start == pytest.approx(PhasedPosterior(rows, phased).factor.nll)
+    assert start == pytest.approx(PhasedPosterior(rows, phased).conditioned.nll)
     _gradients_agree(
         values,
         lambda v: refine_phase._likelihood(rows, phased, v, seen, 1e-5),
@@ -134,7 +134,7 @@ def test_refining_never_worsens_the_likelihood():
     rows, scene, phased = _rows(), _scene(), _phased()
     assert Posterior(rows, refine.refine(rows, scene, 8)).nll < Posterior(rows, scene).nll
     better = refine_phase.refine(rows, phased, 8)
-    assert PhasedPosterior(rows, better).factor.nll < PhasedPosterior(rows, phased).factor.nll
+    assert PhasedPosterior(rows, better).conditioned.nll < PhasedPosterior(rows, phased).conditioned.nll
 
 
 def test_packed_queries_equal_the_processes():
@@ -163,7 +163,7 @@ def test_variance_is_that_of_the_joint_gaussian():
         torch.cat([rows.target, torch.zeros(1, 1, dtype=torch.complex64)]),
         torch.arange(COUNT + 1),
     )
-    inverse = PhasedPosterior(both, phased).factor.inverse
+    inverse = PhasedPosterior(both, phased).conditioned.factor.inverse
     block = inverse[[COUNT, 2 * COUNT + 1]][:, [COUNT, 2 * COUNT + 1]]
     assert variance.item() == pytest.approx(torch.linalg.inv(block).trace().item(), rel=1e-3)
 

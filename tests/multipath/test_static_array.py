@@ -170,7 +170,7 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
     waves = steering(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
     torch.testing.assert_close(quick_score(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
-    assert score(rows, spread, Posterior(rows, scene).factor)[0].shape == (300,)
+    assert score(rows, spread, Posterior(rows, scene).conditioned)[0].shape == (300,)
     with pytest.raises(ValueError, match="images of each"):
         steering(rows, points)
 
@@ -301,5 +301,7 @@ def test_one_antenna_is_a_case_of_several():
     mine = rows.take(torch.nonzero(rows.element == 0).flatten())
     alone = replace(mine, array=None, element=None)
     assert Posterior(mine, scene).nll == pytest.approx(Posterior(alone, scene).nll, rel=1e-4)
-    phased = [PhasedPosterior(each, PhasedScene.of(each, scene, 0.4)).factor.nll for each in (mine, alone)]
+    phased = [
+        PhasedPosterior(each, PhasedScene.of(each, scene, 0.4)).conditioned.nll for each in (mine, alone)
+    ]
     assert phased[0] == pytest.approx(phased[1], rel=1e-4)

@@ -72,13 +72,13 @@ def test_isotropic_term_alone_is_the_plain_process():
     assert field.count == 0
     if "kept" in notes[1]:  # powers beside the grid's
         with torch.no_grad():
-            field.log_power.copy_(torch.tensor([1.0, plain.noise]).log())
+            field.log_power.copy_(torch.tensor([1.0, plain.kernel.noise]).log())
         field.condition(data, np.concatenate([fold.train, fold.val]))
     batch = data.batch(fold.test)
     before, after = plain.predict(batch.tx, batch.rx), field(batch.tx, batch.rx)
     torch.testing.assert_close(after.mean, before.mean, rtol=1e-4, atol=1e-4)
     # Its power is the targets' mean square, the field's is that of largest likelihood.
-    level = field.weights[0].scale * (1 + plain.noise) / plain.power
+    level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
     torch.testing.assert_close(after.variance, before.variance * level, rtol=2e-3, atol=1e-6)
     torch.testing.assert_close(1 - after.unknown, before.confidence, rtol=2e-3, atol=1e-4)
     left = plain.leave_one_out()
@@ -228,7 +228,9 @@ def test_variances_have_the_digits_they_need(noise, plain, dtype):
     there, here = known.group.places, torch.from_numpy(data.moving[30:50]).double()
     shape, values, slot = field.shape, field._held, known.group.slot
     cross = _diffuse(shape, values, slot.wavenumber, here, there) + specular(shape, values, slot, here, there)
-    exact = torch.linalg.solve_triangular(known.lower, cross.mH, upper=False).abs().square().sum(0)
+    exact = (
+        torch.linalg.solve_triangular(known.given.factor.lower, cross.mH, upper=False).abs().square().sum(0)
+    )
     assert known.root.dtype == dtype
     assert (known.learned(cross) - exact).abs().max() < 2e-3 * noise + 1e-10
 

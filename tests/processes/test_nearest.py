@@ -20,6 +20,7 @@ from gsparc.processes.covering import covering
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values
 from gsparc.processes.nearest import given as given_places
+from gsparc.processes.neighbourhood import NEIGHBOURS
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, Rows, conditioned
 from gsparc.processes.prior import Prior
@@ -35,11 +36,11 @@ def rows_of(data, count: int) -> Rows:
     )
 
 
-def given(rows: Rows, level: float = -100.0) -> PowerProcess:
+def given(rows: Rows, most: int = NEIGHBOURS) -> PowerProcess:
     """The same process by nearest rows."""
     values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
     heard = float(np.average((rows.decibels - rows.decibels.mean()) ** 2)) / KERNEL.amplitude
-    return PowerProcess(given_places(Prior(KERNEL, Trend(level)), values, 0), heard)
+    return PowerProcess(given_places(Prior(KERNEL, Trend(-100.0)), values, 0, most=most), heard)
 
 
 @pytest.fixture
@@ -49,12 +50,11 @@ def many(monkeypatch):
     monkeypatch.setattr(neighbourhood, "FEWEST", 30)
 
 
-def test_given_all_rows_as_neighbours_it_is_the_exact_process(monkeypatch):
-    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
+def test_given_all_rows_as_neighbours_it_is_the_exact_process():
     data = town(140)
     rows = rows_of(data, 120)
     whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
-    near = given(rows)
+    near = given(rows, 1000)
     queries = torch.from_numpy(np.concatenate([data.moving[120:], data.moving[120:] + 3000.0]))
     for one, other in zip(near.answer(queries), whole.answer(queries), strict=True):
         assert np.allclose(one, other, rtol=1e-5)
@@ -63,19 +63,18 @@ def test_given_all_rows_as_neighbours_it_is_the_exact_process(monkeypatch):
 
 def test_the_only_place_was_its_own_neighbour():
     one = neighbourhood.Neighbourhood.of(np.zeros((1, 3)), 0)
-    row, far = one.nearest(np.zeros((2, 3)), np.zeros(2, int))
-    assert row.shape == (2, 0) and np.isinf(far).all()
-    assert one.nearest(np.ones((1, 3)))[0].tolist() == [[0]]
+    assert one.nearest(np.zeros((2, 3)), np.zeros(2, int)).shape == (2, 0)
+    assert one.nearest(np.ones((1, 3))).tolist() == [[0]]
+    assert np.allclose(one.distance(np.ones((1, 3))), 3**0.5)
 
 
-def test_rows_of_one_place_are_its_mean_and_lose_nothing(monkeypatch):
-    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
+def test_rows_of_one_place_are_its_mean_and_lose_nothing():
     data, rng = town(60), np.random.default_rng(0)
     often = np.repeat(np.arange(40), 3)
     rows = rows_of(data, 60).at(often)
     rows = Rows(rows.places, rows.decibels + rng.normal(size=120), rows.silent)
     whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
-    near = given(rows)
+    near = given(rows, 1000)
     assert len(near.places) == 40
     for one, other in zip(
         near.answer(torch.from_numpy(data.moving)), whole.answer(torch.from_numpy(data.moving)), strict=True
@@ -135,11 +134,10 @@ def test_slopes_of_the_mean():
         assert torch.allclose(slope @ axis, (ends[0] - ends[1]) / 2e-4, rtol=1e-4, atol=1e-7)
 
 
-def test_left_out_is_a_prediction_without_each_place(monkeypatch):
-    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
+def test_left_out_is_a_prediction_without_each_place():
     data = town(50)
     rows = rows_of(data, 50)
-    near = given(rows)
+    near = given(rows, 1000)
     whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
     exactly, spread = (part.numpy() for part in whole.posterior.left_out())
     mean, variance = (part.numpy() for part in near.posterior.left_out())

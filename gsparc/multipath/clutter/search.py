@@ -66,7 +66,7 @@ def find_clutter(
     bare, quadrature = replace(phased.scene, visibility=INITIAL_KERNEL), min(phased.quadrature, QUADRATURE)
     fresh = replace(phased, scene=bare, quadrature=quadrature)
     found = _ClutterSearcher(rows, fresh, generator, noise_floor).run(late)
-    before, after = (PhasedPosterior(rows, each, noise_floor).factor.nll for each in (phased, found))
+    before, after = (PhasedPosterior(rows, each, noise_floor).conditioned.nll for each in (phased, found))
     return found if after < before - PROGRESS else phased
 
 

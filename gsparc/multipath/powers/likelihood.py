@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.processes.factor import Factor
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import Kernel, matern_sum
-from gsparc.processes.left_out import left_out
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,6 @@ def left_out_losses(gram: Tensor, values: Tensor, log_amplitude: Tensor) -> Tens
     Raises:
         NotPositiveDefiniteError: the covariance is not positive definite.
     """
-    inverse = Factor.of(gram, "raise").inverse
-    residual, variance = left_out(inverse, inverse @ values)
+    residual, variance = Conditioned.of(gram, values[:, None], "raise").left_out()
     log_variance = log_amplitude + variance.log()
-    return 0.5 * (math.log(2 * math.pi) + log_variance + residual.square() * torch.exp(-log_variance))
+    return 0.5 * (math.log(2 * math.pi) + log_variance + residual[:, 0].square() * torch.exp(-log_variance))

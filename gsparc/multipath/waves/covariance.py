@@ -22,8 +22,9 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
-from gsparc.multipath.waves.kernels import apart, directed, envelope, plain, smooth, steering
+from gsparc.multipath.waves.kernels import directed, envelope, plain, smooth, steering
 from gsparc.physics.mirror_planes import Reflections, images
+from gsparc.processes.kernel import apart
 
 FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
 DRIFT_FIELD = 0.7  # share of the drift that is one of the diffuse field; the rest is of all places alike

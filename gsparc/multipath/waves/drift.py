@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, specular, temporal
-from gsparc.processes.factor import Factor
-from gsparc.processes.left_out import groups_of, left_out_signal
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.left_out import groups_of
 from gsparc.processes.worker import stop_when_late
 
 STRETCH = 400  # rows looked at
@@ -92,12 +92,9 @@ def left_out_cells(group: Group, signal: Tensor, other: Tensor, cells: list[np.n
         cells: numbers (n,) of cells.
     """
     other = other.to(torch.complex128)
-    inverse = Factor.of(signal + other).inverse
-    alpha, found = inverse @ group.target, []
-    for cell in cells:
-        own = None if len(np.unique(cell)) == len(cell) else groups_of(cell)
-        found.append(left_out_signal(inverse, alpha, other, own)[0])
-    return found
+    given = Conditioned.of(signal + other, group.target)
+    own = [None if len(np.unique(cell)) == len(cell) else groups_of(cell) for cell in cells]
+    return [given.left_out_signal(other, groups)[0] for groups in own]
 
 
 def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
@@ -114,11 +111,8 @@ def _likelihood(
 ) -> tuple[float, np.ndarray]:
     """Negative log likelihood with the scale profiled, and its slope by the terms' powers."""
     covariance = signal + sum(float(level) * term for level, term in zip(power, terms, strict=True))
-    factor = Factor.of(covariance)
-    inverse = factor.inverse
-    alpha = inverse @ group.target
+    given = Conditioned.of(covariance, group.target)
     count, outputs = group.target.shape
-    scale = float((group.target.conj() * alpha).real.mean())
-    nll = outputs * (count * math.log(scale) + float(factor.log_determinant))
-    weight = outputs * inverse - alpha @ alpha.mH / scale
+    nll = outputs * (count * math.log(given.scale) + float(given.factor.log_determinant))
+    weight = outputs * given.factor.inverse - given.weights @ given.weights.mH / given.scale
     return nll, np.array([float((term * weight.mT).sum().real) for term in terms])

@@ -23,7 +23,6 @@ from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import (
     Shape,
     Values,
-    apart,
     direct_wave,
     directions,
     image_waves,
@@ -31,6 +30,7 @@ from gsparc.multipath.waves.covariance import (
 )
 from gsparc.multipath.waves.kernels import envelope, plain, smooth
 from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import apart
 from gsparc.processes.left_out import left_out
 from gsparc.processes.worker import stop_when_late
 

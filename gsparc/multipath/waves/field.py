@@ -29,8 +29,8 @@ from gsparc.multipath.waves.covariance import (
     specular,
 )
 from gsparc.ops import Pose
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
-from gsparc.processes.left_out import left_out, left_out_signal
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
@@ -43,16 +43,14 @@ class Weights:
 
     Attributes:
         group: with targets in the phase and level of the largest run.
-        factor: of the covariance (n, n) complex128.
-        alpha: (n, D) complex128, its inverse times the targets.
+        given: the targets given their covariance (n, n) complex128.
         scale: power that the covariance is in units of.
         noise: least variance of a prediction, in these units.
         is_real: whether the covariance is.
     """
 
     group: Group
-    factor: Factor
-    alpha: Tensor
+    given: Conditioned
     scale: float
     noise: float
     is_real: bool
@@ -63,7 +61,7 @@ class Weights:
 
         A row's covariances c with all rows, its noise included, have c^H C^-1 c = C_ii: that tells the error.
         """
-        whole = self.factor.lower
+        whole = self.given.factor.lower
         lower = whole.real.contiguous() if self.is_real else whole
         root = Factor(lower).root
         few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
@@ -175,8 +173,9 @@ class ChannelField(ConditionalField):
             run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
             places = slot.places(moving[here], turned[here])
             group = Group(slot, here, places, _entries(target, here, slot), run, order)
-            inverse = Factor.of(_covariances((group,), shape, values)[0]).inverse
-            error, variance = left_out(inverse, inverse @ group.target)
+            error, variance = Conditioned.of(
+                _covariances((group,), shape, values)[0], group.target
+            ).left_out()
             variance = known.scale * variance
             density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
             outputs = group.target.shape[1]
@@ -212,14 +211,13 @@ class ChannelField(ConditionalField):
         found, noise = [], float(shape.of("noise", values.power))
         for group, factor in zip(groups, all_factors, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])
-            alpha = factor.solved(aligned.target)
-            scale = float((aligned.target.conj() * alpha).real.mean())
-            found.append(Weights(aligned, factor, alpha, max(scale, 1e-300), noise, shape.is_real))
+            given = Conditioned(factor, aligned.target, factor.solved(aligned.target))
+            found.append(Weights(aligned, given, max(given.scale, 1e-300), noise, shape.is_real))
         self.weights = tuple(found)
         self.stations = {}
         for known in found:
             self.stations.setdefault(known.group.slot.station, []).append(known)
-        heard = [(known.group, known.alpha, known.scale) for known in found]
+        heard = [(known.group, known.given.weights, known.scale) for known in found]
         self.common = Common.of(shape, self._held, heard) if len(self.stations) > 1 else None
 
     def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
@@ -283,10 +281,10 @@ class ChannelField(ConditionalField):
             for number, (known, here, _) in enumerate(alike):
                 slot = slots[number]
                 cross = fields[min(number, len(fields) - 1)] + specular(shape, values, slot, places, learned)
-                slot.put(mean, here, cross @ known.alpha)
+                slot.put(mean, here, known.given.mean(cross))
                 if self.count:
-                    slot.put(share, here, explained(shape, values, slot, places, learned) @ known.alpha)
-                weight = known.scale * known.alpha.shape[1] / size
+                    slot.put(share, here, known.given.mean(explained(shape, values, slot, places, learned)))
+                weight = known.scale * known.group.target.shape[1] / size
                 whole = prior(shape, values, slot, places) + disturbed
                 after.index_add_(0, here, weight * (whole - known.learned(cross)).clamp_min(0))
                 before.index_add_(0, here, weight * whole)
@@ -330,7 +328,7 @@ class ChannelField(ConditionalField):
             slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
             places = slot.places(moving[here], turned[here])
             found, variance, prior_variance = self.common.at(self.shape, values, slot, places)
-            outputs = template.alpha.shape[1]
+            outputs = template.group.target.shape[1]
             slot.put(mean, here, found[:, None].expand(-1, outputs))
             after.index_add_(0, here, variance * outputs / size)
             before.index_add_(0, here, prior_variance * outputs / size)
@@ -345,9 +343,9 @@ class ChannelField(ConditionalField):
         variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
         with torch.no_grad():
             for known in self._conditioned():
-                group, outputs = known.group, known.alpha.shape[1]
+                group, outputs = known.group, known.group.target.shape[1]
                 other = disturbance(shape, values, group).to(torch.complex128)
-                residual, error = left_out_signal(known.factor.inverse, known.alpha, other)
+                residual, error = known.given.left_out_signal(other)
                 assert error is not None
                 predicted = group.target - residual
                 group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])

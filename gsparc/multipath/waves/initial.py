@@ -41,6 +41,7 @@ from gsparc.multipath.waves.kernels import cells, directions, plain
 from gsparc.multipath.waves.mirrors import find_mirrors
 from gsparc.multipath.waves.offset import best_offset
 from gsparc.multipath.waves.settings import ChannelSettings
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.worker import Ended, ended_by
 
@@ -173,7 +174,7 @@ def _grid_point(
     for group, factor in zip(groups, solved, strict=True):
         target = group.target * turn[group.run][:, None]
         count, outputs = target.shape
-        fit = float((target.conj() * factor.solved(target)).real.sum()) / (count * outputs)
+        fit = Conditioned(factor, target, factor.solved(target)).scale
         nll += outputs * (count * math.log(max(fit, 1e-300)) + float(factor.log_determinant))
         nll -= 2 * outputs * float(turn.abs().log()[group.run].sum())
     return nll, 1 / turn

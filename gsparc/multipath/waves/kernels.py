@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsparc.multipath.visibility_kernel import matern32
 from gsparc.physics.waves import NEAR_M
+from gsparc.processes.kernel import WaveKernel
 
 FLAT_RAD = 0.5  # phase over the height of places, below which waves from above and below look alike
 
@@ -60,11 +61,6 @@ def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
         return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
 
 
-def apart(a: Tensor, b: Tensor) -> Tensor:
-    """Distances (..., n, m) [m]; exact at none, and differentiable there."""
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
-
-
 def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
     """Correlation (..., n, m) float64 of waves from everywhere alike within an envelope's length [m].
 
@@ -73,8 +69,7 @@ def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Te
     Args:
         a, b: (..., n, 3) and (..., m, 3) [m] of one end, or (..., 6) of both.
     """
-    ends = [apart(*pair) for pair in zip(a.split(3, -1), b.split(3, -1), strict=True)]
-    return math.prod(isotropic(each, wavenumber) * envelope(each, length) for each in ends)  # type: ignore[return-value]
+    return WaveKernel(wavenumber, length).between(a, b)
 
 
 def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:

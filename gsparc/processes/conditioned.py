@@ -1,0 +1,84 @@
+"""Values of rows given their covariance: density and its slope, means, variances, rows left out.
+
+Real values are Gaussian, complex ones circular (Rasmussen and Williams 2006, chapters 2 and 5). What a
+covariance is made of is the caller's: this is all that is done with one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+from torch import Tensor
+
+from gsparc.processes.factor import Factor, as_pairs
+from gsparc.processes.left_out import left_out, left_out_signal
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """n rows of R outputs that share their covariance.
+
+    Attributes:
+        factor: of the covariance (n, n), noise included.
+        values: (n, R) less their mean.
+        weights: (n, R), `K^-1 Y`.
+    """
+
+    factor: Factor
+    values: Tensor
+    weights: Tensor
+
+    @classmethod
+    def of(
+        cls, covariance: Tensor, values: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend"
+    ) -> Conditioned:
+        """Of a covariance (n, n), noise included, and values (n, R); see `Factor.of`."""
+        factor = Factor.of(covariance, failing)
+        return cls(factor, values, factor.solved(values))
+
+    @cached_property
+    def nll(self) -> float:
+        """Negative log density up to a constant [nats]."""
+        fit = (self.values.conj() * self.weights).real.double().sum()
+        both = float(fit + self.values.shape[1] * self.factor.log_determinant)
+        return both if self.values.is_complex() else 0.5 * both
+
+    @cached_property
+    def scale(self) -> float:
+        """Mean square of the whitened values: the power that fits a covariance known up to a factor."""
+        return float((self.values.conj() * self.weights).real.mean())
+
+    @cached_property
+    def slope(self) -> Tensor:
+        """`G = R K^-1 - K^-1 Y Y^H K^-1` (n, n): d nll = trace(G dK), half of it where values are real."""
+        inverse, weights = self.factor.inverse, self.weights
+        return inverse.addmm(weights, weights.mH, beta=weights.shape[1], alpha=-1)
+
+    def mean(self, cross: Tensor) -> Tensor:
+        """(m, R) where covariances with the rows are (m, n)."""
+        return weighted(cross, self.weights)
+
+    def known(self, cross: Tensor) -> Tensor:
+        """What the rows take from the variance (m,) of places of covariances (m, n) with them."""
+        return self.factor.whitened(cross.mH).abs().square().sum(0)
+
+    def left_out(self, groups: Iterable[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """Residuals (n, R) of rows left out, alone or in groups, and their variances (n,)."""
+        inverse = self.factor.precision if groups is None else self.factor.inverse
+        return left_out(inverse, self.weights, groups)
+
+    def left_out_signal(
+        self, disturbance: Tensor, groups: Iterable[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """The same of the signal alone; see `gsparc.processes.left_out.left_out_signal`."""
+        return left_out_signal(self.factor.inverse, self.weights, disturbance, groups)
+
+
+def weighted(cross: Tensor, weights: Tensor) -> Tensor:
+    """`cross @ weights` (..., m, R), where covariances (..., m, n) may be real and weights complex."""
+    if weights.is_complex() and not cross.is_complex():
+        return as_pairs(lambda pairs: cross @ pairs, weights)
+    return cross @ weights
