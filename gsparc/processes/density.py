@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.processes.censored import log_evidence
-from gsparc.processes.factor import Factor, NotPositiveDefiniteError
+from gsparc.processes.factor import BLAS, Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, matern_sum, unpacked
 from gsparc.processes.worker import stop_when_late
 
@@ -66,7 +66,8 @@ class LeftOutDensity(torch.autograd.Function):
         """dK^-1 = -K^-1 dK K^-1: the slopes by R = K^-1 Y and by diag(K^-1) become one by K."""
         inverse, ratio, by_ratio = ctx.saved_tensors
         scaled = (inverse * (-ctx.by_share).sqrt()).numpy()
-        lower = torch.from_numpy(blas.dsyrk(1.0, scaled.T, lower=0, trans=1)).T
+        with BLAS.limit(limits=1):
+            lower = torch.from_numpy(blas.dsyrk(1.0, scaled.T, lower=0, trans=1)).T
         column = inverse @ by_ratio
         mixed = column @ ratio.T
         return slopes[0] * (lower + lower.tril(-1).T - 0.5 * (mixed + mixed.T)), None, None, None

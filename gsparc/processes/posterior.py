@@ -113,13 +113,14 @@ class Exact(Posterior):
     @torch.no_grad()
     def answer(self, queries: Tensor) -> Answer:
         """See `Posterior`."""
-        cross, prior = self._cross(queries), self.prior.variance(queries)
+        own = self.prior.columns(queries)
+        cross, prior = self._cross(queries, own), self.prior.variance(own)
         known = self.factor.whitened(cross.T).square().sum(0)
         return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
-        return self._mean(queries, self._cross(queries))
+        return self._mean(queries, self._cross(queries, self.prior.columns(queries)))
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
@@ -129,9 +130,9 @@ class Exact(Posterior):
         found = weighted(cross, self.weights)
         return found if self.prior.trend is None else self.prior.mean(queries) + found
 
-    def _cross(self, queries: Tensor) -> Tensor:
-        found, prior = self.prior.kernel.between(queries, self.rows), self.prior
-        return found if prior.trend is None else found.addmm(prior.columns(queries), self._columns.T)
+    def _cross(self, queries: Tensor, own: Tensor) -> Tensor:
+        found = self.prior.kernel.between(queries, self.rows)
+        return found if self.prior.trend is None else found.addmm(own, self._columns.T)
 
     @cached_property
     def _columns(self) -> Tensor:
@@ -154,7 +155,7 @@ class Exact(Posterior):
     @torch.no_grad()
     def covariance(self, queries: Tensor) -> Tensor:
         """(B, B) of the signal at places (B, D), in the kernel's units."""
-        cross = self._cross(queries)
+        cross = self._cross(queries, self.prior.columns(queries))
         white = self.factor.whitened(cross.T)
         return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
 

@@ -36,9 +36,9 @@ class Prior:
         found = self.kernel.between(a, b)
         return found if self.trend is None else found.addmm(self.columns(a), self.columns(b).T)
 
-    def variance(self, places: Tensor) -> Tensor:
-        """Of a measurement (n,) at places (n, D) [m]."""
-        return 1 + self.kernel.noise + self.columns(places).square().sum(1)
+    def variance(self, columns: Tensor) -> Tensor:
+        """Of a measurement (n,) at places of terms (n, Q)."""
+        return columns.square().sum(1) + (1 + self.kernel.noise)
 
     def state(self) -> dict[str, Any]:
         """Numbers that `read` needs."""

@@ -172,7 +172,7 @@ def test_the_cache_knows_the_local_frame(campaign, folds, tmp_path, monkeypatch)
     moved = dataclasses.replace(data, site=site, tx=data.tx + shift, rx_position=data.rx_position + shift)
     there = baseline("gp", moved, split, cache=tmp_path)
     fold = split.folds[0]
-    assert np.allclose(there.methods[0].positions, moved.tx[np.concatenate([fold.train, fold.val])])
+    assert np.allclose(there.methods[0].scores.places, moved.tx[np.concatenate([fold.train, fold.val])])
     assert there.scores.figures()["nmse"] == pytest.approx(here["nmse"], rel=1e-2)
 
 

@@ -182,7 +182,7 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(initialise, "LEAST_GAIN", -math.inf)
-    fitted = fit("channels", budget_s=4.0)  # less leaves no time to complete them
+    fitted = fit("channels", budget_s=8.0)  # less leaves no time to complete them on a busy machine
     field = fitted.method.field
     assert isinstance(field, StackedField) and sum(field.weights) == pytest.approx(1)
     assert [type(member) is CompletedField for member in field.members] == [False, True, True]

@@ -266,4 +266,4 @@ def test_left_out_rows_are_told_from_silent_ones_at_their_place(monkeypatch):
     field = small_field(data, two=False)
     field.condition(data, np.arange(300))
     assert isinstance(field.process.posterior, Nearest) and len(field.at) == 150
-    assert (field.process.noise[field.at] <= field.process.kernel.noise).all()
+    assert (field.process.posterior.noise[field.at] <= field.process.kernel.noise).all()
