@@ -335,7 +335,7 @@ class ReducedMean(View):
         self._mean, self._axes = mean, axes
         self._weights = scores.weights[:, kept].float().contiguous()
         self._middle = scores.rows.mean(0).float()
-        self._scale = math.sqrt(3) / scores.prior.kernel.lengths[0]
+        self._scale = math.sqrt(3) / float(scores.prior.kernel.length)
         self._places = (scores.rows.float() - self._middle) * self._scale
 
     @torch.no_grad()

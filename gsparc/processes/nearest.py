@@ -167,8 +167,8 @@ class Nearest(Posterior):
     def read(cls, state: dict[str, Any]) -> Nearest:
         """The posterior whose `state()` this was."""
         near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
-        parts = (state[name] for name in ("rest", "noise", "terms", "spread"))
-        return cls(Prior.read(state), near, *parts, int(state["most"]))
+        rest, noise, terms, spread = (state[name] for name in ("rest", "noise", "terms", "spread"))
+        return cls(Prior.read(state), near, rest, noise, terms, spread, int(state["most"]))
 
 
 def given(
@@ -315,6 +315,7 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
         seed: of what is drawn.
     """
     count, start = len(values.places), prior.kernel
+    assert isinstance(start, Kernel)
     if count <= NEIGHBOURS:
         return start, f"settings of {count} places, as they were"
     chosen = covering(values.places, COVER, seed)

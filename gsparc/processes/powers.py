@@ -86,7 +86,9 @@ class PowerProcess:
     @property
     def kernel(self) -> Kernel:
         """Of the prior."""
-        return self.posterior.prior.kernel
+        kernel = self.posterior.prior.kernel
+        assert isinstance(kernel, Kernel)
+        return kernel
 
     @property
     def trend(self) -> Trend:
