@@ -1,0 +1,71 @@
+"""Posteriors against an independent library, and complex ones against twice as many real numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern
+
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.kernel import Kernel, WaveKernel
+from gsparc.processes.nearest import Nearest, Values, given
+from gsparc.processes.posterior import Exact
+from gsparc.processes.prior import Prior
+from gsparc.processes.trend import Trend
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_twenty_random_problems_are_scikit_learns(seed):
+    rng = np.random.default_rng(seed)
+    count, outputs, share = rng.integers(5, 60), rng.integers(1, 4), rng.uniform(0.1, 0.9)
+    lengths, noise, level = rng.uniform(0.1, 3, 2), 10 ** rng.uniform(-3, 0), rng.normal()
+    places, queries = rng.uniform(0, 4, (count, 3)), rng.uniform(-1, 5, (7, 3))
+    values = rng.normal(size=(count, outputs))
+    kernel = Kernel(tuple(lengths), (share, 1 - share), noise)
+    posterior = Exact.given(Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values))
+    found = posterior.answer(torch.from_numpy(queries))
+    shape = ConstantKernel(share) * Matern(lengths[0], nu=1.5)
+    shape = shape + ConstantKernel(1 - share) * Matern(lengths[1], nu=1.5) + ConstantKernel(1.0)
+    library = GaussianProcessRegressor(shape, alpha=noise, optimizer=None).fit(places, values - level)
+    mean, covariance = library.predict(queries, return_cov=True)
+    covariance = covariance[..., 0] if covariance.ndim == 3 else covariance  # alike for all outputs
+    np.testing.assert_allclose(found.mean, mean.reshape(7, -1) + level, atol=1e-8)
+    np.testing.assert_allclose(found.left, covariance.diagonal() + noise, atol=1e-8)
+    np.testing.assert_allclose(posterior.covariance(torch.from_numpy(queries)), covariance, atol=1e-8)
+    np.testing.assert_allclose(posterior.values(), values, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.rand(30, 3, generator=generator, dtype=torch.float64)
+    values = torch.randn(30, 2, generator=generator, dtype=torch.complex128)
+    prior = Prior(WaveKernel(20.0, 0.7, 0.05))
+    both = Exact.given(prior, places, values)
+    pairs = Exact.given(prior, places, torch.cat([values.real, values.imag], 1))
+    queries = torch.rand(6, 3, generator=generator, dtype=torch.float64)
+    one, two = both.answer(queries), pairs.answer(queries)
+    torch.testing.assert_close(one.mean, torch.complex(*two.mean.split(2, 1)))
+    torch.testing.assert_close(one.left, two.left)
+    near = given(prior, Values(places.numpy(), values, torch.ones(30).double()), 0, most=1000)
+    torch.testing.assert_close(near.answer(queries).mean, one.mean, rtol=1e-5, atol=1e-6)
+    again = Nearest.read(near.state()).answer(queries)
+    torch.testing.assert_close(again.mean, near.answer(queries).mean)
+
+
+def test_density_and_slope_of_circular_values():
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(12, 24, generator=generator, dtype=torch.complex128)
+    covariance, values = root @ root.mH / 12, torch.randn(12, 3, generator=generator, dtype=torch.complex128)
+    change = torch.randn(12, 12, generator=generator, dtype=torch.complex128)
+    change = 1e-6 * (change + change.mH)
+    ends = [Conditioned.of(covariance + step * change, values).nll for step in (-0.5, 0.5)]
+    told = Conditioned.of(covariance, values)
+    expected = float((told.slope @ change).diagonal().sum().real)
+    assert ends[1] - ends[0] == pytest.approx(expected, rel=1e-5)
+    density = (
+        3 * torch.logdet(covariance).real + (values.mH @ torch.linalg.solve(covariance, values)).trace().real
+    )
+    assert told.nll == pytest.approx(float(density))
