@@ -140,7 +140,7 @@ class GaussianProcess(Interpolator):
             thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
             looked_at = draw(np.zeros(len(targets), bool), CHOSEN_ON, 0)
         kernel = choose_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
-        self.scores = Exact.given(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
+        self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         self.lost = parts.lost
         notes = [f"gp: length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"]

@@ -106,9 +106,8 @@ class ComplexGP(Method):
         kernel = min(self._kernels(), key=lambda one: _aligned(one, *looked_at)[0])
         _, conditioned, aligning = _aligned(kernel, places, target, run)
         power = max(float((target * aligning[:, None]).abs().square().mean()), 1e-30)
-        none = torch.zeros(len(known), dtype=torch.float64)
         prior = Prior(replace(kernel, amplitude=power))
-        self.posterior = Exact(prior, places, conditioned.weights, none).with_factor(conditioned.factor)
+        self.posterior = Exact.of(prior, places, conditioned.values, None, conditioned.factor)
         self.turned = 1 / aligning
         first = torch.from_numpy(np.unique(run, return_index=True)[1])
         self.runs = RunFactors(names.astype(np.int64), self.turned[first])

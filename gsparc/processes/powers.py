@@ -136,9 +136,7 @@ class PowerProcess:
         few = covering(self.places, MOST_ROWS, 0)
         places, prior = torch.from_numpy(self.places[few]), nearest.prior
         extra = nearest.noise[few] - prior.kernel.noise
-        return replace(
-            self, posterior=Exact.given(prior, places, nearest.rest[few] + prior.mean(places), extra)
-        )
+        return replace(self, posterior=Exact.of(prior, places, nearest.rest[few] + prior.mean(places), extra))
 
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `read` needs."""
@@ -190,7 +188,7 @@ def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str
     if rows.silent.any():
         notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
     places, decibels, extra = _with_pseudo_values(rows, prior, seed, notes)
-    posterior = Exact.given(prior, places, decibels[:, None], extra)
+    posterior = Exact.of(prior, places, decibels[:, None], extra)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
     heard = float(loud.var(correction=0)) / prior.kernel.amplitude if len(loud) else 0.0
     return PowerProcess(posterior, heard), tuple(notes)

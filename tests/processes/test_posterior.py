@@ -24,7 +24,7 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     places, queries = rng.uniform(0, 4, (count, 3)), rng.uniform(-1, 5, (7, 3))
     values = rng.normal(size=(count, outputs))
     kernel = Kernel(tuple(lengths), (share, 1 - share), noise)
-    posterior = Exact.given(Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values))
+    posterior = Exact.of(Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values))
     found = posterior.answer(torch.from_numpy(queries))
     shape = ConstantKernel(share) * Matern(lengths[0], nu=1.5)
     shape = shape + ConstantKernel(1 - share) * Matern(lengths[1], nu=1.5) + ConstantKernel(1.0)
@@ -43,8 +43,8 @@ def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
     places = torch.rand(30, 3, generator=generator, dtype=torch.float64)
     values = torch.randn(30, 2, generator=generator, dtype=torch.complex128)
     prior = Prior(WaveKernel(20.0, 0.7, 0.05))
-    both = Exact.given(prior, places, values)
-    pairs = Exact.given(prior, places, torch.cat([values.real, values.imag], 1))
+    both = Exact.of(prior, places, values)
+    pairs = Exact.of(prior, places, torch.cat([values.real, values.imag], 1))
     queries = torch.rand(6, 3, generator=generator, dtype=torch.float64)
     one, two = both.answer(queries), pairs.answer(queries)
     torch.testing.assert_close(one.mean, torch.complex(*two.mean.split(2, 1)))
@@ -69,3 +69,21 @@ def test_density_and_slope_of_circular_values():
         3 * torch.logdet(covariance).real + (values.mH @ torch.linalg.solve(covariance, values)).trace().real
     )
     assert told.nll == pytest.approx(float(density))
+
+
+@pytest.mark.parametrize("kernel", [Kernel((0.5, 2.0), (0.3, 0.7), 0.05), WaveKernel(9.0, 0.8, 0.05)])
+def test_more_rows_and_fewer_are_a_fit_to_those(kernel):
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    values = torch.randn(40, 2, generator=generator, dtype=torch.complex128)
+    values = values if isinstance(kernel, WaveKernel) else values.real
+    prior = Prior(kernel, Trend(0.0) if isinstance(kernel, Kernel) else None)
+    whole, queries = Exact.of(prior, places, values), places[:5] + 0.1
+    grown = Exact.of(prior, places[:33], values[:33]).given(places[33:], values[33:])
+    few = whole.without(torch.arange(33, 40))
+    for found, rows in ((grown, slice(40)), (few, slice(33))):
+        expected = Exact.of(prior, places[rows], values[rows])
+        for one in (found, Exact.read(found.state())):
+            torch.testing.assert_close(one.answer(queries).mean, expected.answer(queries).mean)
+            torch.testing.assert_close(one.answer(queries).left, expected.answer(queries).left)
+            torch.testing.assert_close(one.left_out()[0], expected.left_out()[0])

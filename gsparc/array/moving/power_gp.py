@@ -64,7 +64,7 @@ class Trend:
 
 def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
     """Weights (n, K) of centred values (n, K) at places (n, 3) [m], and their left-out residuals (n, K)."""
-    posterior = Exact.given(Prior(kernel), torch.from_numpy(places), values)
+    posterior = Exact.of(Prior(kernel), torch.from_numpy(places), values)
     return posterior.weights, left_out(posterior.factor.precision, posterior.weights)[0]
 
 

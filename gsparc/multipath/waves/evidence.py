@@ -29,6 +29,7 @@ from gsparc.multipath.waves.covariance import (
     ways,
 )
 from gsparc.multipath.waves.kernels import envelope, plain, smooth
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart
 from gsparc.processes.left_out import left_out
@@ -112,14 +113,12 @@ class Solved:
 
     Attributes:
         nll: negative log marginal likelihood of complex targets [nats], but for a constant.
-        inverse: (r, r) complex128.
-        alpha: (r, D) complex128.
+        given: the targets in the basis, given their covariance (r, r) complex128.
         scale: mean square of the whitened targets: the group's own power.
     """
 
     nll: float
-    inverse: Tensor
-    alpha: Tensor
+    given: Conditioned
     scale: float
 
 
@@ -237,20 +236,19 @@ def solved(part: Compressed, power: Tensor) -> Solved:
     for level, term in zip(power[room:], part.terms, strict=False):
         covariance = term.added(covariance, level)
     covariance.diagonal().add_(noise)
-    factor = Factor.of(covariance)
-    inverse = factor.inverse
-    alpha = inverse @ part.target
+    given = Conditioned.of(covariance, part.target)
     count, outputs = part.group.target.shape
-    quadratic = float((part.target.conj() * alpha).real.sum()) + part.rest / float(noise)
+    quadratic = given.scale * part.target.numel() + part.rest / float(noise)
     scale = max(quadratic / (count * outputs), 1e-300)
-    determinant = float(factor.log_determinant) + (count - len(covariance)) * math.log(float(noise))
-    return Solved(outputs * (count * math.log(scale) + determinant), inverse, alpha, scale)
+    determinant = float(given.factor.log_determinant) + (count - len(covariance)) * math.log(float(noise))
+    return Solved(outputs * (count * math.log(scale) + determinant), given, scale)
 
 
 def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
     """Gradient (P,) of the negative log likelihood by log powers."""
     count, outputs = part.group.target.shape
-    weight = outputs * at.inverse - at.alpha @ at.alpha.mH / at.scale
+    weights = at.given.weights
+    weight = at.given.factor.inverse.addmm(weights, weights.mH, beta=outputs, alpha=-1 / at.scale)
     room = len(part.room)
     found = torch.zeros_like(power)
     found[:room] = (part.room.reshape(room, -1) @ weight.T.reshape(-1)).real
@@ -338,15 +336,15 @@ def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:
     """
     at, noise = solved(part, power), power[len(part.room) + len(part.terms)]
     wide = part.basis.to(torch.complex128)
-    alpha = wide @ at.alpha + (part.group.target - wide @ part.target) / noise
+    alpha = wide @ at.given.weights + (part.group.target - wide @ part.target) / noise
     if len(np.unique(cell)) == len(cell):
-        own = ((wide @ at.inverse) * wide.conj()).sum(1) + (1 - wide.abs().square().sum(1)) / noise
-        return left_out(own.real, alpha)[0]
+        inside, outside = (wide @ at.given.factor.inverse) * wide.conj(), 1 - wide.abs().square().sum(1)
+        return left_out(inside.sum(1).real + outside / noise, alpha)[0]
     error = torch.empty_like(alpha)
     for number in np.unique(cell):
         mine = torch.from_numpy(np.flatnonzero(cell == number))
         own = wide[mine]
-        block = own @ (at.inverse @ own.mH) - own @ own.mH / noise
+        block = own @ (at.given.factor.inverse @ own.mH) - own @ own.mH / noise
         block.diagonal().add_(1 / noise)
         error[mine] = Factor.of(block).solved(alpha[mine])
     return error

@@ -38,8 +38,9 @@ class Probe:
         """With the group's own powers (P,)."""
         at, basis = solved(part, power), part.basis.to(torch.complex128)
         noise = float(power[len(part.room) + len(part.terms)])
-        alpha = basis @ at.alpha + (part.group.target - basis @ part.target) / noise
-        root = basis @ Factor.of(at.inverse + 1e-12 * torch.eye(len(at.inverse))).lower
+        alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
+        inverse = at.given.factor.inverse
+        root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
         return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
 
     def known(self, waves: Tensor) -> Tensor:
