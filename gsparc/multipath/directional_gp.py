@@ -30,9 +30,9 @@ from gsparc.multipath.position_refine import PositionRefinement, UncertainPositi
 from gsparc.multipath.rows import Rows, gather
 from gsparc.multipath.triangulation import Rays, triangulate
 from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
-from gsparc.multipath.visibility_kernel import matern32
 from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
+from gsparc.processes.kernel import matern32_of_squares
 from gsparc.processes.left_out import left_out_group
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.
@@ -65,7 +65,7 @@ class GainKernel:
         """(n, m) float32 of places (n, 3) and (m, 3) float64 [m]."""
         apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
         squared = (apart / self.length).square()
-        return (self.constant + (1 - self.constant) * matern32(squared)).float()
+        return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).float()
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.multipath.visibility_kernel import matern32
+from gsparc.processes.kernel import matern32_of_squares
 from gsparc.processes.left_out import left_out as residuals
 
 LENGTHS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # candidates for every source
@@ -55,7 +55,7 @@ class VisibilityGP:
         left_out = mean.expand_as(seen).clone()  # without a better kernel the mean
         best = (left_out - seen).square().mean(0)
         for tried in LENGTHS_M:
-            values, vectors = torch.linalg.eigh(matern32((apart / tried).square()))
+            values, vectors = torch.linalg.eigh(matern32_of_squares((apart / tried).square()))
             turned = vectors.T @ (seen - mean)
             for noise in NOISES:
                 shrunk = 1 / (values.clamp_min(0) + noise)
@@ -73,7 +73,7 @@ class VisibilityGP:
         """Probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
         apart = torch.cdist(places, self.places, compute_mode="donot_use_mm_for_euclid_dist")
         lengths, weights = self._by_length
-        correlation = matern32((apart[:, None] / lengths).square()).flatten(1)
+        correlation = matern32_of_squares((apart[:, None] / lengths).square()).flatten(1)
         return torch.addmm(self._mean, correlation, weights).clamp(0, 1)
 
     @cached_property

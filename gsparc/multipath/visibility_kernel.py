@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.processes.kernel import matern32_of_squares
+
 ROUNDED = 1e-3  # of a squared length, largest rounding error of a squared distance
 
 
@@ -37,7 +39,7 @@ class KernelVisibility:
         if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
             places = places.float()
         squared = squared + _squared(places).float() / self.length**2
-        return self.constant + (1 - self.constant) * matern32(squared)
+        return self.constant + (1 - self.constant) * matern32_of_squares(squared)
 
     @staticmethod
     def of(value: Tensor) -> KernelVisibility:
@@ -59,12 +61,6 @@ def directions(places: Tensor, sources: Tensor) -> Tensor:
     """Unit vectors (..., n, 3) float32 from sources (..., 3) to places (n, 3) float64 [m]."""
     offset = places - sources[..., None, :]
     return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).float()
-
-
-def matern32(squared: Tensor) -> Tensor:
-    """Matern-3/2 of squared distances (...) in units of the length; like them."""
-    root = (3 * squared + 1e-9).sqrt()
-    return (1 + root) * torch.exp(-root)
 
 
 def _is_wide(places: Tensor, length: float) -> bool:

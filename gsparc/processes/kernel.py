@@ -33,6 +33,12 @@ def matern32(distance: Tensor, length: Tensor | float) -> Tensor:
     return torch.sub(ONE, scaled) * scaled.exp()
 
 
+def matern32_of_squares(squared: Tensor) -> Tensor:
+    """Matern-3/2 of squared distances (...) in units of the length, with a slope where they are 0."""
+    root = (3 * squared + 1e-9).sqrt()
+    return (1 + root) * torch.exp(-root)
+
+
 def matern52(distance: Tensor, length: Tensor | float) -> Tensor:
     """Matern-5/2 of distances (...) [m]."""
     scaled = distance * (-math.sqrt(5) / length)

@@ -19,7 +19,7 @@ from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
-from gsparc.multipath.visibility_kernel import matern32
+from gsparc.processes.kernel import matern32_of_squares
 
 REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
 
@@ -112,7 +112,9 @@ def test_visibility_at_queries_is_the_sum_over_each_sources_kernel():
     fitted = VisibilityGP(places, seen, length, weights, seen)
     queries = torch.rand(3, 3, generator=rng, dtype=torch.float64)
     apart = torch.cdist(queries, places)
-    each = [matern32((apart / length[k]) ** 2) @ weights[:, k] + seen[:, k].mean() for k in range(4)]
+    each = [
+        matern32_of_squares((apart / length[k]) ** 2) @ weights[:, k] + seen[:, k].mean() for k in range(4)
+    ]
     torch.testing.assert_close(fitted.probability(queries), torch.stack(each, 1).clamp(0, 1))
 
 

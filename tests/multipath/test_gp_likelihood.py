@@ -11,7 +11,8 @@ from gsparc.multipath.gp_likelihood import Posterior, Scene, correlations, steer
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import KernelVisibility, matern32
+from gsparc.multipath.visibility_kernel import KernelVisibility
+from gsparc.processes.kernel import matern32_of_squares
 
 COUNT = 24
 
@@ -209,6 +210,6 @@ def test_visibility_of_a_wide_site_is_a_covariance(extent):
     rays = (places - source) / (places - source).norm(dim=1, keepdim=True)
     squared = (rays[:, None] - rays).square().sum(-1) / law.angle**2
     squared = squared + (places[:, None] - places).square().sum(-1) / law.length**2
-    exact = law.constant + (1 - law.constant) * matern32(squared)
+    exact = law.constant + (1 - law.constant) * matern32_of_squares(squared)
     assert found.dtype == torch.float32 and (found - exact).abs().max() < 1e-5
     assert torch.linalg.eigvalsh(found.double()).min() > -1e-5

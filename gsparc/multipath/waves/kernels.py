@@ -14,16 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.multipath.visibility_kernel import matern32
 from gsparc.physics.waves import NEAR_M
-from gsparc.processes.kernel import WaveKernel
+from gsparc.processes.kernel import WaveKernel, matern32_of_squares
 
 FLAT_RAD = 0.5  # phase over the height of places, below which waves from above and below look alike
 
 
 def envelope(distance: Tensor, length: Tensor | float) -> Tensor:
     """Matern-3/2 of distances [m]."""
-    return matern32((distance / length).square())
+    return matern32_of_squares((distance / length).square())
 
 
 def smooth(distance: Tensor, length: Tensor | float) -> Tensor:
