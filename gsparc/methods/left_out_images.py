@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsparc.methods.gp import choose_kernel
 from gsparc.processes.factor import Factor
-from gsparc.processes.left_out import left_out_group
+from gsparc.processes.left_out import left_out_around
 
 
 @dataclass(frozen=True)
@@ -96,18 +96,13 @@ def predict_left_out(
     """
     precision, weighted = torch.from_numpy(inverse), torch.from_numpy(inverse @ values)
     mean = np.full((len(gaps), len(centres), values.shape[1]), np.nan, dtype=values.dtype)
-    variance = np.full(mean.shape[:2], np.nan)
+    variance, rows = np.full(mean.shape[:2], np.nan), torch.from_numpy(centres)
     for g, gap in enumerate(gaps):
-        for c, i in enumerate(centres):
-            near = distance[i] <= gap
-            near[i] = True
-            if near.all():
-                continue
-            rows = np.flatnonzero(near)
-            own = int(np.searchsorted(rows, i))
-            residual, covariance = left_out_group(precision, weighted, torch.from_numpy(rows))
-            mean[g, c] = values[i] - residual[own].numpy()
-            variance[g, c] = covariance[own, own]
+        near = distance[centres] <= gap
+        near[np.arange(len(centres)), centres] = True
+        some = np.flatnonzero(~near.all(1))
+        found = left_out_around(precision, weighted, rows[some], torch.from_numpy(near[some]))
+        mean[g, some], variance[g, some] = values[centres[some]] - found[0].numpy(), found[1].numpy()
     return mean, variance
 
 

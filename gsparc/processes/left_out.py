@@ -14,6 +14,8 @@ from torch import Tensor
 
 from gsparc.processes.factor import Factor
 
+ENTRIES = 2_000_000  # of systems solved at a time: memory
+
 
 def left_out(
     inverse: Tensor, weights: Tensor, groups: Iterable[Tensor] | None = None
@@ -39,6 +41,28 @@ def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> tuple[Tens
     """Residuals (s, R) of rows (s,) left out together, and their covariance (s, s); see `left_out`."""
     block = Factor.of(inverse[rows[:, None], rows])
     return block.solved(weights[rows]), block.inverse
+
+
+def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """Residuals (c, R) of rows (c,), each left out with what is `near` it (c, n) bool, and variances (c,).
+
+    Small systems of many sizes, solved as batches of the largest with units where a group has ended.
+    """
+    size = near.sum(1)
+    residual, variance = weights[rows].clone(), inverse.diagonal()[rows].real.clone()
+    order = size.argsort()
+    while len(order):
+        most = int(size[order[-1]])  # the largest that is left, and as many as memory takes with it
+        part, order = order[-max(ENTRIES // most**2, 1) :], order[: -max(ENTRIES // most**2, 1)]
+        index = near[part].to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
+        valid = torch.arange(most) < size[part, None]
+        block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])
+        block.diagonal(dim1=1, dim2=2).add_((~valid).to(block.dtype))
+        unit = ((index == rows[part, None]) & valid).to(block.dtype)
+        share = Factor.of(block, "raise").solved(unit[..., None])[..., 0] * valid
+        residual[part] = torch.einsum("cm,cmr->cr", share.to(weights.dtype), weights[index])
+        variance[part] = (share * unit).sum(1).real
+    return residual, variance
 
 
 def left_out_signal(
