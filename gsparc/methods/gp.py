@@ -133,6 +133,7 @@ class GaussianProcess(Interpolator):
             return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
+        self.powers = None
         thinned: list[str] = []
         parts = principal_components(targets, self.kind, self.limit)
         looked_at: np.ndarray | slice = slice(None)

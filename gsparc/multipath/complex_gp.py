@@ -124,12 +124,17 @@ class ComplexGP(Method):
         place = torch.from_numpy(numbered(data.moving[known]))
         _, first, count = np.unique(place.numpy(), return_index=True, return_counts=True)
         self.first, counts = torch.from_numpy(first), torch.from_numpy(count).double()
-        means = torch.zeros(len(count), targets.shape[1], dtype=targets.dtype).index_add_(0, place, targets)
-        means /= counts[:, None].float()
-        squares = torch.zeros(len(count), dtype=torch.float64)
-        squares.index_add_(0, place, targets.abs().square().mean(1).double())
-        scatter = (squares - counts * means.abs().square().mean(1)).clamp_min(0)
-        values = Values(data.moving[known][first], means, counts)
+        means, scatter = targets, torch.zeros(len(count), dtype=torch.float64)
+        if len(count) == len(known):  # no copy of what may be gigabytes
+            self.first = torch.arange(len(known))
+        else:
+            means = torch.zeros(len(count), targets.shape[1], dtype=targets.dtype).index_add_(
+                0, place, targets
+            )
+            means /= counts[:, None].float()
+            scatter.index_add_(0, place, targets.abs().square().mean(1).double())
+            scatter = (scatter - counts * means.abs().square().mean(1)).clamp_min(0)
+        values = Values(data.moving[known[self.first.numpy()]], means, counts)
         near = Neighbourhood.of(values.places, 0)
         row = covering(values.places, TRIED_ON, 0)
         rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]

@@ -123,11 +123,6 @@ class PowerProcess:
         """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
         return self.posterior.mean_at(queries)[:, 0]
 
-    def about(self, trend: Trend) -> PowerProcess:
-        """The same with another object for its mean law."""
-        prior = replace(self.posterior.prior, trend=trend)
-        return replace(self, posterior=replace(self.posterior, prior=prior))  # type: ignore[type-var]
-
     def exact(self) -> PowerProcess:
         """One that has covariances between places; of many rows, given some that cover the site."""
         nearest = self.posterior
