@@ -53,7 +53,8 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
     order = size.argsort()
     while len(order):
         most = int(size[order[-1]])  # the largest that is left, and as many as memory takes with it
-        part, order = order[-max(ENTRIES // most**2, 1) :], order[: -max(ENTRIES // most**2, 1)]
+        count = max(ENTRIES // most**2, 1)
+        part, order = order[-count:], order[:-count]
         index = near[part].to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
         valid = torch.arange(most) < size[part, None]
         block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsparc.processes.censored import ConditionalGaussian, propagate
 from gsparc.processes.covering import covering
+from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.neighbourhood import NEIGHBOURS
@@ -182,8 +183,8 @@ def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str
     notes: list[str] = []
     if rows.silent.any():
         notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
-    places, decibels, extra = _with_pseudo_values(rows, prior, seed, notes)
-    posterior = Exact.of(prior, places, decibels[:, None], extra)
+    places, decibels, extra, factor = _with_pseudo_values(rows, prior, seed, notes)
+    posterior = Exact.of(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
     heard = float(loud.var(correction=0)) / prior.kernel.amplitude if len(loud) else 0.0
     return PowerProcess(posterior, heard), tuple(notes)
@@ -191,12 +192,12 @@ def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str
 
 def _with_pseudo_values(
     rows: Rows, prior: Prior, seed: int, notes: list[str]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Places, decibels and extra variances; pseudo-values of the silent rows that say anything."""
+) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
+    """Places, decibels, extra variances and a factor; pseudo-values of the silent rows that say anything."""
     places, decibels = torch.from_numpy(rows.places), torch.from_numpy(rows.decibels)
     extra, silent = torch.zeros_like(decibels), torch.from_numpy(rows.silent)
     if not rows.silent.any():
-        return places, decibels, extra
+        return places, decibels, extra, None
     deviation, mean = math.sqrt(prior.kernel.amplitude), prior.mean(places)[:, 0]
     gram = prior.between(places, places)
     gram.diagonal().add_(prior.kernel.noise)
@@ -214,4 +215,6 @@ def _with_pseudo_values(
         if not sites.settled:
             notes.append("what these rows say had not settled after all sweeps")
     used = torch.cat([(~silent).nonzero()[:, 0], at]).sort().values
-    return places[used], decibels[used], extra[used]
+    gram = gram[used[:, None], used]
+    gram.diagonal().add_(extra[used])
+    return places[used], decibels[used], extra[used], Factor.of(gram, "raise")
