@@ -16,11 +16,11 @@ import torch
 from record import guarded, output_of
 from torch import Tensor
 
-from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
 from gsparc.ops.geometry import Gaussians
 from gsparc.ops.networks import networks, products
 from gsparc.ops.operators import composite_backward_op, view_of
+from gsparc.prediction.timing import ClockSettings, interleaved
 from gsparc.training.losses import _Kernel, _written_out, ssim
 
 GRID = SphereGrid.hemisphere()

@@ -31,9 +31,10 @@ from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.own import load_own
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext, Method
-from gsparc.methods.per_station import for_links
+from gsparc.models.method import Method
+from gsparc.models.per_station import for_links
 from gsparc.simulate.rfid_sim import write_rfid_sim
+from gsparc.training.context import FitContext
 
 POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
 CHANNELS = ("mean", "nearest", "complex_gp")
@@ -49,7 +50,7 @@ def make(name: str) -> Method:
     """An unfitted method with what `conf/model` sets."""
     from hydra import compose, initialize_config_module
 
-    from gsparc.methods.registry import build
+    from gsparc.models.registry import build
 
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         return build(compose("train", overrides=[f"model={name}"]).model)

@@ -5,10 +5,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gsparc.methods.predictor import Predictor as Predictor
-    from gsparc.methods.predictor import load as load
     from gsparc.ops import Pose as Pose
     from gsparc.ops import SphereGrid as SphereGrid
+    from gsparc.prediction.load import load as load
+    from gsparc.prediction.predictor import Predictor as Predictor
 
 # Torch's threads would otherwise spin for one another and against our kernels' own: up to twice slower, and
 # twenty times beside another busy process. It works where gsparc is imported before torch.
@@ -16,8 +16,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 # Looked up on first use: `import gsparc` costs nothing.
 _PUBLIC = {
-    "load": "gsparc.methods.predictor",
-    "Predictor": "gsparc.methods.predictor",
+    "load": "gsparc.prediction.load",
+    "Predictor": "gsparc.prediction.predictor",
     "Pose": "gsparc.ops",
     "SphereGrid": "gsparc.ops",
     "load_ipython_extension": "gsparc.commands.notebook",  # what `%load_ext gsparc` asks for

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsparc.array import vector_cache
 from gsparc.commands.compare import problem
 from gsparc.commands.compare.cells import key
 from gsparc.commands.compare.problem import SplitChoice, load_problems
@@ -16,8 +15,9 @@ from gsparc.data.assemble import identity
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
 from gsparc.evaluation import baseline_cache
-from gsparc.methods.checkpoint import _as_numpy, _plain, _site_from
-from gsparc.multipath.image_source_gp import ImageSourceGP
+from gsparc.models.array_vectors import vector_cache
+from gsparc.models.checkpoint import _as_numpy, _plain, _site_from
+from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.ops import SphereGrid
 
 ONE = np.ones(3)

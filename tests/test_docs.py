@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_module
 from pages import FOLDERS, PAGES, PRESENT, ROOT, commands, said
 
 from gsparc.commands.plugins import offer_scenes
-from gsparc.methods.registry import METHODS
+from gsparc.models.registry import METHODS
 from gsparc.simulate.scenes.shipped import shipped
 
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")

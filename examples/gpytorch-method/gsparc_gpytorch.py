@@ -9,9 +9,9 @@ import gpytorch
 import numpy as np
 import torch
 
-from gsparc.methods.gp import Components, principal_components
-from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import Prediction
+from gsparc.models.baselines.gp import Components, principal_components
+from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.method import Prediction
 
 
 class _Exact(gpytorch.models.ExactGP):

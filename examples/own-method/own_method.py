@@ -7,9 +7,9 @@ from scipy.spatial import cKDTree
 from gsparc.data.datamodule import DataModule
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
-from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import Prediction
-from gsparc.methods.target_rows import to_real
+from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.method import Prediction
+from gsparc.models.target_rows import to_real
 
 
 class NearestK(Interpolator):

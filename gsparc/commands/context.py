@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.settings import plain
 from gsparc.data.load import split_settings
-from gsparc.methods.method import FitContext
+from gsparc.training.context import FitContext
 
 
 def context_of(

@@ -17,7 +17,7 @@ from gsparc.data.claims import claimed
 from gsparc.data.files import whole_file
 from gsparc.evaluation.report.sweep import FAILURE
 from gsparc.evaluation.summary import provenance
-from gsparc.methods.parts import LAST
+from gsparc.models.parts import LAST
 
 log = logging.getLogger(__name__)
 

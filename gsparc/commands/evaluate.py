@@ -16,7 +16,7 @@ from gsparc.data.splits import Split, write_split
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
-from gsparc.methods import checkpoint
+from gsparc.models import checkpoint
 
 
 def evaluate_files(

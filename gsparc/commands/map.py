@@ -26,11 +26,12 @@ from gsparc.maps.making import map_of
 from gsparc.maps.page import write_page
 from gsparc.maps.pictures import draw_layer, file_name, layers
 from gsparc.maps.promise import Promise, PromiseSettings, gather, stored_promise
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
-from gsparc.methods.predictor import Predictor, load
-from gsparc.methods.registry import build
-from gsparc.methods.timing import machine_facts, peak_memory
+from gsparc.models import checkpoint
+from gsparc.models.registry import build
+from gsparc.prediction.load import load
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import machine_facts, peak_memory
+from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 

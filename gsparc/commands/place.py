@@ -22,11 +22,11 @@ from gsparc.maps.placing import (
     unheard_refused,
 )
 from gsparc.maps.promise import PromiseSettings
-from gsparc.methods import checkpoint
-from gsparc.methods.per_station import UNHEARD
-from gsparc.methods.predictor import load
-from gsparc.methods.registry import build
-from gsparc.methods.timing import machine_facts
+from gsparc.models import checkpoint
+from gsparc.models.per_station import UNHEARD
+from gsparc.models.registry import build
+from gsparc.prediction.load import load
+from gsparc.prediction.timing import machine_facts
 
 
 def task(config: DictConfig) -> dict[str, Any]:

@@ -15,8 +15,9 @@ from gsparc.evaluation.summary import provenance, write_samples, write_summary
 from gsparc.maps.pictures import draw_plan_picture
 from gsparc.maps.planning import Plan, plan_next
 from gsparc.maps.promise import PromiseSettings
-from gsparc.methods.predictor import Predictor, load
-from gsparc.methods.timing import machine_facts
+from gsparc.prediction.load import load
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import machine_facts
 
 
 def write_places(path: Path, found: Plan, predictor: Predictor | None) -> None:

@@ -43,11 +43,12 @@ from gsparc.evaluation.summary import (
     write_samples,
     write_summary,
 )
-from gsparc.methods import checkpoint, parts
-from gsparc.methods.method import FitContext, FitReport, Method, TrainsByGradient
-from gsparc.methods.registry import build
-from gsparc.methods.time_budget import TimeBudget
+from gsparc.models import checkpoint, parts
+from gsparc.models.method import Method, TrainsByGradient
+from gsparc.models.registry import build
 from gsparc.training import tracking
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from gsparc.data.walls import read_walls
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.pictures import layers
-from gsparc.methods.timing import machine_facts, peak_memory
+from gsparc.prediction.timing import machine_facts, peak_memory
 from gsparc.view.building import Given, cloud_colours, cloud_of
 from gsparc.view.ply import write_ply
 from gsparc.view.site_view import SiteView, grid_for

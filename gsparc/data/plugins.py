@@ -6,7 +6,7 @@ import inspect
 from importlib.metadata import entry_points
 from typing import Any
 
-GROUPS = {"model": "gsparc.methods", "dataset": "gsparc.datasets"}
+GROUPS = {"model": "gsparc.models", "dataset": "gsparc.datasets"}
 PLAIN = (bool, int, float, str, list, dict, type(None))
 
 

@@ -15,10 +15,11 @@ from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext, Method
-from gsparc.methods.per_station import for_links, trained_stations
-from gsparc.methods.registry import method_class
+from gsparc.models import checkpoint, loading
+from gsparc.models.method import Method
+from gsparc.models.per_station import for_links, trained_stations
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +69,7 @@ def baseline(
     """Fit (or find) the baseline `name` with its default settings on each fold, and score it.
 
     Args:
-        name: as in `gsparc.methods.registry.METHODS`.
+        name: as in `gsparc.models.registry.METHODS`.
         data: the dataset.
         split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
         eval_on: `train`, `val` or `test`.
@@ -108,7 +109,7 @@ def _stored_fit(path: Path) -> tuple[Method, float] | None:
     if not path.exists():
         return None
     try:
-        method, stored = checkpoint.load(path)
+        method, stored = loading.load(path)
         return method, float(stored.extra["train_s"])
     except (checkpoint.CheckpointError, KeyError, ValueError) as error:
         log.warning("a cached baseline is unusable and fitted again: %s", error)

@@ -16,10 +16,10 @@ from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import Scores, rows_of, score, unseen_runs
-from gsparc.methods import timing
-from gsparc.methods.label import common_label
-from gsparc.methods.method import Method
-from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved
+from gsparc.models.label import common_label
+from gsparc.models.method import Method
+from gsparc.prediction import timing
+from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
@@ -59,7 +59,7 @@ def evaluate(
         data: the dataset.
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
-        baselines: names in `gsparc.methods.registry.METHODS`; None: all plain ones that serve these rows.
+        baselines: names in `gsparc.models.registry.METHODS`; None: all plain ones that serve these rows.
         cache: folder where baselines are kept between runs; None keeps nothing.
         clock: how long to measure latencies.
 

@@ -15,9 +15,9 @@ from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, indices_hash
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.methods import checkpoint
-from gsparc.methods.method import Method
-from gsparc.methods.predictor import SAME_PLACE_M
+from gsparc.models import checkpoint, loading
+from gsparc.models.method import Method
+from gsparc.prediction.predictor import SAME_PLACE_M
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ def open_files(
     Raises:
         ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
     """
-    loaded = [checkpoint.load(path) for path in paths]
+    loaded = [loading.load(path) for path in paths]
     stored = [one for _, one in loaded]
     chosen_class = "_target_" in (dataset or {})
     module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)

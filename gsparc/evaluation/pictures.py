@@ -10,7 +10,7 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.methods.method import Method
+from gsparc.models.method import Method
 
 SPECTRA = 4  # test rows drawn
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.metrics import metrics_for
-from gsparc.methods.method import Method
+from gsparc.models.method import Method
 
 SUBSETS = ("train", "val", "test")
 CHUNK = 64  # rows predicted at a time

@@ -24,7 +24,7 @@ class FieldSettings(Checked):
         count: initial number of Gaussians N.
         placement: `uniform` in the scene box enlarged by `margin` (the paper), or `sphere`: evenly spread
             directions around the static receiver at distances between `near` and `far`. `auto` is settled by
-            the group `init` (`gsparc.training.auto_settings`).
+            the group `init` (`gsparc.models.splat.auto_settings`).
         margin: enlargement of the box on each side [m].
         near, far: range of distances of `sphere` [m].
         opacity: initial opacity in (0, 1).

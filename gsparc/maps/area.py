@@ -16,7 +16,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.schema import Site
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.geojson import read_shapes
-from gsparc.methods.predictor import usual_heights
+from gsparc.prediction.predictor import usual_heights
 
 CELLS = 20_000  # of a map whose step nobody chose, about
 LEAST = 1e-4  # of a site's width, of a rectangle: in degrees a site is 1e-5 as wide as in metres

@@ -13,9 +13,9 @@ from gsparc.data.schema import Site
 from gsparc.maps.levels import predicted
 from gsparc.maps.making import CHUNK, ends_of
 from gsparc.maps.promise import Promise
-from gsparc.methods.method import HasProcess
-from gsparc.methods.power_settings import fit_powers
-from gsparc.methods.predictor import Predictor
+from gsparc.models.method import HasProcess
+from gsparc.models.powers.settings import fit_powers
+from gsparc.prediction.predictor import Predictor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, Rows

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsparc.data.schema import Kind, Measurements
 from gsparc.evaluation.intervals import DB, in_decibels
-from gsparc.methods.method import Prediction
+from gsparc.models.method import Prediction
 
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,8 +23,8 @@ from gsparc.maps.intervals import Calibration
 from gsparc.maps.levels import MAPPED, predicted
 from gsparc.maps.promise import Promise, stored_promise
 from gsparc.maps.refining import refined
-from gsparc.methods.method import HasPaths
-from gsparc.methods.predictor import Predictor
+from gsparc.models.method import HasPaths
+from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
@@ -43,15 +43,15 @@ def map_of(
     noise_db: float | None = None,
     other_end: Sequence[float] | None = None,
     plan: FloorPlan | None = None,
-    promise: Promise | None = None,
+    promise: Promise | Literal["stored"] | None = "stored",
     share: float = 0.9,
     tolerance_db: float = 0.1,
     asked: Callable[[float], None] = lambda share: None,
     dry: bool = False,
 ) -> FieldMap:
-    """Predict every cell of an area; `predictor.map(...)` is this.
+    """Predict every cell of an area.
 
-    >>> found = gsparc.load("model.ckpt").map(step_m=0.5)
+    >>> found = map_of(gsparc.load("model.ckpt"), step_m=0.5)
     >>> found.power_db.shape, found.outage.mean()
 
     Args:
@@ -62,8 +62,8 @@ def map_of(
         load, noise_db: see `sinr`.
         other_end: (3,) world place of the end that the map is not of, where both moved [m].
         plan: beneath the map.
-        promise: evidence of held-out blocks; None: intervals are the model's own deviations, and nothing is
-            refused.
+        promise: evidence of held-out blocks, or what the checkpoint holds of it; None: intervals are the
+            model's own deviations, and nothing is refused.
         share: of measurements that intervals are to hold.
         tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
             every cell. Known places must be stored with the model.
@@ -76,6 +76,7 @@ def map_of(
     site = predictor.site
     if site.kind not in MAPPED:
         raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
+    promise = stored_promise(predictor.extra) if promise == "stored" else promise
     names, notes = answering(predictor, stations, promise)
     grid = grid_of(site, area, height_m, step_m, plan, len(names))
     share_of = loads(load, names)
@@ -125,11 +126,6 @@ def map_of(
         np.zeros((0, 2)) if promise is None else _measured_places(promise, site), _still(site, names),
         tuple(notes),
     )  # fmt: skip
-
-
-def mapped(predictor: Predictor, area: Any = None, **how: Any) -> FieldMap:
-    """`map_of` with the evidence that the model's checkpoint holds, where it does."""
-    return map_of(predictor, area, **{"promise": stored_promise(predictor.extra), **how})
 
 
 def answering(

@@ -19,7 +19,7 @@ from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.placing import Placing
 from gsparc.maps.planning import Plan
 from gsparc.maps.promise import Promise
-from gsparc.methods.predictor import Predictor
+from gsparc.prediction.predictor import Predictor
 
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn

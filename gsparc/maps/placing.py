@@ -18,8 +18,9 @@ from gsparc.maps.levels import predicted
 from gsparc.maps.making import map_of
 from gsparc.maps.planning import coarse_grid, walkable_places
 from gsparc.maps.promise import Promise, evidence_of, without
-from gsparc.methods.method import FitContext, Method
-from gsparc.methods.predictor import Predictor
+from gsparc.models.method import Method
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
 
 Goal = Literal["coverage", "worst"]
 GOALS = ("coverage", "worst")

@@ -22,7 +22,7 @@ from gsparc.maps.geojson import Shapes, read_shapes
 from gsparc.maps.making import answering
 from gsparc.maps.promise import Promise
 from gsparc.maps.route import Tour
-from gsparc.methods.predictor import Predictor
+from gsparc.prediction.predictor import Predictor
 
 TARGETS = 900  # places that the error is averaged over, about
 CANDIDATES = 900  # where somebody may measure, at most

@@ -17,9 +17,10 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
 from gsparc.maps.levels import measured, predicted
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext, Method, Reconditions
-from gsparc.methods.per_station import PerStation, for_links, trained_stations
+from gsparc.models import checkpoint
+from gsparc.models.method import Method, Reconditions
+from gsparc.models.per_station import PerStation, for_links, trained_stations
+from gsparc.training.context import FitContext
 
 KEY = "map"
 CHUNK = 512  # rows predicted at a time

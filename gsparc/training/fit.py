@@ -22,11 +22,11 @@ from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext
-from gsparc.methods.time_budget import Spent, TimeBudget
-from gsparc.training.lightning_module import GaussianModule
+from gsparc.training.context import FitContext
+from gsparc.training.module import GaussianModule
+from gsparc.training.pace import SPENT, Budget, Stretched
 from gsparc.training.processes import Processes
-from gsparc.training.time_budget import SPENT, Budget, Stretched
+from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
 

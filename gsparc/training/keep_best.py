@@ -12,7 +12,7 @@ import torch
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 from gsparc.training.fit import KEPT
-from gsparc.training.lightning_module import GaussianModule
+from gsparc.training.module import GaussianModule
 from gsparc.training.processes import agreed
 
 log = logging.getLogger(__name__)

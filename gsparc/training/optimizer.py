@@ -10,8 +10,8 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
 from gsparc.data.limits import Checked, number, setting, whole
-from gsparc.field.conditional import ConditionalField
-from gsparc.training.time_budget import Pace
+from gsparc.training.conditional import ConditionalField
+from gsparc.training.pace import Pace
 
 RATE = number(0)
 

@@ -1,155 +1,107 @@
-"""Training for a number of seconds: every schedule written in steps is stretched to end with the budget.
-
-Nothing is known of a step's cost before: after each step the share of the budget that is spent says where in
-its schedule the training is.
-"""
+"""Seconds that a fit may take, by the clock on the wall or by processor time, and whether they ended it."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import astuple
-from typing import Any
+import math
+import time
+from dataclasses import dataclass
+from typing import Literal
 
-import lightning.pytorch as L
 import torch
 
-from gsparc.methods.time_budget import NOTHING, Spent, TimeBudget
-from gsparc.training.processes import agreed
-from gsparc.training.schedule import in_steps
-
-SPENT = "time/spent_s"  # metric of both clocks
+Clock = Literal["wall", "processor"]
 
 
-class Pace:
-    """How far a schedule written for `total` steps has come, when seconds decide.
+@dataclass(frozen=True)
+class Spent:
+    """Seconds of the same work by both clocks.
 
-    Args:
-        total: steps of the schedule.
-        budget_s: seconds in which they are to pass [s].
+    Attributes:
+        wall: [s]
+        processor: of all threads, divided by torch's number of them [s].
     """
 
-    def __init__(self, total: int, budget_s: float) -> None:
-        self.total, self.budget_s = total, budget_s
-        self.step = self._before = 0
+    wall: float = 0.0
+    processor: float = 0.0
 
-    def spend(self, seconds: float) -> None:
-        """Now this much is spent [s]."""
-        self._before = self.step
-        share = seconds / self.budget_s if self.budget_s > 0 else 1.0
-        self.step = min(int(share * self.total), self.total)
+    def by(self, clock: Clock) -> float:
+        """[s]"""
+        return self.wall if clock == "wall" else self.processor
 
-    def passed(self, interval: int) -> int | None:
-        """The last multiple of `interval` that the last step passed or reached; None when it passed none."""
-        multiple = self.step // interval * interval
-        return multiple if multiple > self._before else None
+    def __add__(self, other: Spent) -> Spent:
+        return Spent(self.wall + other.wall, self.processor + other.processor)
 
-    @property
-    def over(self) -> bool:
-        """Whether the budget is spent."""
-        return self.step >= self.total
+    def __sub__(self, other: Spent) -> Spent:
+        return Spent(self.wall - other.wall, self.processor - other.processor)
 
 
-class Budget(L.Callback):
-    """Counts the seconds of a stage, validations too, and ends it with its pace.
-
-    Args:
-        pace: told after every step; None where steps decide.
-        budget: running, with all that was spent before.
-    """
-
-    def __init__(self, pace: Pace | None, budget: TimeBudget) -> None:
-        self.pace, self.budget, self._begin, self._process = pace, budget, budget.counted, os.getpid()
-        self._validating = 0.0  # seconds of the longest validation: one more follows the last step
-        self._since, self._resumed = 0.0, NOTHING
-
-    @property
-    def _learned(self) -> Spent:
-        return self.budget.counted - self._begin
-
-    def _look(self, trainer: L.Trainer) -> None:
-        if self.pace is not None:
-            self.pace.spend(agreed(self._learned.by(self.budget.clock) + self._validating, trainer))
-            trainer.should_stop = trainer.should_stop or self.pace.over
-
-    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
-        """Of several processes each has a processor time of its own."""
-        if os.getpid() != self._process:
-            self.budget.moved()
-
-    def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """The schedule begins now; what making the Trainer took is no part of it, and shortens it."""
-        setup = self._learned - self._resumed
-        self._begin = self._begin + setup
-        if self.pace is not None:
-            self.pace.budget_s -= agreed(setup.by(self.budget.clock), trainer)
-        self._look(trainer)
-
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
-        """Say how far it is; end when it is over."""
-        self._look(trainer)
-
-    def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Look at the clock."""
-        self._since = self.budget.spent
-
-    def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
-        """How long it took."""
-        self._validating = max(self._validating, self.budget.spent - self._since)
-
-    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Bring home what was spent; only metrics leave the process where there are several devices."""
-        trainer.callback_metrics[SPENT] = torch.tensor(astuple(self.budget.counted), dtype=torch.float64)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Seconds spent, so that a resumed run has only the rest."""
-        return {"seconds": self._learned.wall, "processor_s": self._learned.processor}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
-        self._resumed = Spent(float(state["seconds"]), float(state["processor_s"]))
-        self.budget.charge(self._resumed)
+NOTHING = Spent()
 
 
-class Stretched(L.Callback):
-    """A callback with an `interval` of steps, shown the steps of the stretched schedule.
+def less_repeatable(*clocks: Clock | None) -> Clock | None:
+    """Of clocks that decided something, the one whose seconds repeat a result worst; None of none."""
+    return "wall" if "wall" in clocks else next(filter(None, clocks), None)
+
+
+class TimeBudget:
+    """Counts from where it is made, but for pauses.
+
+    A busy machine does less within seconds of the wall, about the same within seconds of its processor;
+    only fixed numbers of steps or searches repeat a result exactly.
 
     Args:
-        inner: acts at multiples of its `interval`.
-        pace: says which step of the schedule it is.
+        seconds: all of them [s].
+        clock: whose seconds they are.
+        before: spent by the run that this one goes on from.
+
+    Attributes:
+        limited: whether `over` has ended something.
     """
 
-    def __init__(self, inner: Any, pace: Pace) -> None:
-        self.inner, self.pace = inner, pace
+    def __init__(self, seconds: float = math.inf, clock: Clock = "wall", before: Spent = NOTHING) -> None:
+        self.seconds, self.clock, self.limited = seconds, clock, False
+        self._threads = torch.get_num_threads()  # searches change it for a while
+        self._before = before
+        self._since: Spent | None = self._now()
+
+    def _now(self) -> Spent:
+        return Spent(time.monotonic(), time.process_time() / self._threads)
 
     @property
-    def state_key(self) -> str:
-        """The inner callback's."""
-        return self.inner.state_key
+    def counted(self) -> Spent:
+        """By both clocks."""
+        return self._before if self._since is None else self._before + (self._now() - self._since)
 
-    def on_after_backward(self, trainer: L.Trainer, module: Any) -> None:
-        """As the inner callback, at the schedule's step."""
-        self.inner.on_after_backward(_At(trainer, self.pace.step), module)
+    @property
+    def spent(self) -> float:
+        """[s]"""
+        return self.counted.by(self.clock)
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *rest: Any) -> None:
-        """As the inner callback, when a multiple of its interval was passed."""
-        multiple = self.pace.passed(in_steps(self.inner.interval, self.pace.total))
-        if multiple is not None:
-            self.inner.on_train_batch_end(_At(trainer, multiple), module, *rest)
+    @property
+    def limited_by(self) -> Clock | None:
+        """The clock, if it has ended something."""
+        return self.clock if self.limited else None
 
-    def state_dict(self) -> dict[str, Any]:
-        """The inner callback's."""
-        return self.inner.state_dict()
+    def charge(self, more: Spent) -> None:
+        """Count what was spent elsewhere, too."""
+        self._before = self._before + more
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """The inner callback's."""
-        self.inner.load_state_dict(state)
+    def pause(self) -> None:
+        """Count no more until `go`."""
+        self._before, self._since = self.counted, None
 
+    def go(self) -> None:
+        """Count again."""
+        if self._since is None:
+            self._since = self._now()
 
-class _At:
-    """A trainer at another step."""
+    def moved(self) -> None:
+        """Count on in another process, whose processor time began with it."""
+        if self._since is not None:
+            self._since = Spent(self._since.wall, 0.0)
 
-    def __init__(self, trainer: L.Trainer, step: int) -> None:
-        self._trainer, self.global_step = trainer, step
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._trainer, name)
+    def over(self, share: float = 1.0) -> bool:
+        """Whether that share of it is spent; whoever asks then ends what it does."""
+        found = self.spent > share * self.seconds
+        self.limited |= found
+        return found

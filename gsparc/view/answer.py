@@ -10,9 +10,9 @@ import numpy as np
 
 from gsparc.data.schema import Site
 from gsparc.maps.levels import predicted
-from gsparc.methods.export import Paths
-from gsparc.methods.method import HasPaths
-from gsparc.methods.predictor import Predictor
+from gsparc.models.method import HasPaths
+from gsparc.prediction.export import Paths
+from gsparc.prediction.predictor import Predictor
 
 SILENT_DB = 30.0  # below the strongest, where paths are not shown
 SAME_NS = 0.25  # between delays of one path, as several searches find it

@@ -15,7 +15,7 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.levels import MAPPED
-from gsparc.methods.method import HasGaussians
+from gsparc.models.method import HasGaussians
 from gsparc.ops import Pose
 from gsparc.view.answer import SILENT_DB, Answer
 from gsparc.view.scene import EXTENT, Faces, Frame, Legend, Lines, Mark, Part, Points, Scene, Sheet, Splats

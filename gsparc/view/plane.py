@@ -11,7 +11,7 @@ import numpy as np
 from gsparc.maps.area import Grid
 from gsparc.maps.levels import predicted
 from gsparc.maps.making import ends_of
-from gsparc.methods.predictor import Predictor
+from gsparc.prediction.predictor import Predictor
 from gsparc.view.reasons import Usual
 from gsparc.view.scene import Legend, Sheet
 

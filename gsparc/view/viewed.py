@@ -16,12 +16,12 @@ from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import open_files
 from gsparc.maps import levels
-from gsparc.methods import checkpoint
-from gsparc.methods.confidence import Trusted
-from gsparc.methods.confidence import kept as trusted_of
-from gsparc.methods.predictor import Predictor
-from gsparc.methods.reduced import reduced
-from gsparc.methods.stored_front import kept
+from gsparc.models import loading
+from gsparc.models.reduced import reduced
+from gsparc.prediction.confidence import Trusted
+from gsparc.prediction.confidence import kept as trusted_of
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.stored_front import kept
 
 log = logging.getLogger(__name__)
 
@@ -207,7 +207,7 @@ def open_viewed(
         else:
             notes.append(f"no errors of test rows are drawn: the model was trained on {run.foreign}")
     except (ValueError, OSError) as error:
-        method, stored = checkpoint.load(path)
+        method, stored = loading.load(path)
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
     site, trusted = stored.site, trusted_of(stored.extra)
     points, measured = kept(stored.extra)

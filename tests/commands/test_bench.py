@@ -13,8 +13,8 @@ from gsparc.commands.bench.claims import Claim
 from gsparc.commands.bench.measure import Machine, measure
 from gsparc.commands.bench.report import markdown
 from gsparc.commands.bench.scene import receiver, scene
-from gsparc.methods.timing import ClockSettings
 from gsparc.ops import composite, machine_limits, make_plan
+from gsparc.prediction.timing import ClockSettings
 
 
 @pytest.mark.slow

@@ -16,9 +16,9 @@ from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correla
 from gsparc.commands.calibrate.trial import Trial, best_kind, cells, divided, divisible, trials
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.methods.confidence_scores import Evidence, gather, joined
-from gsparc.methods.method import FitContext
-from gsparc.methods.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
+from gsparc.prediction.confidence_scores import Evidence, gather, joined
+from gsparc.prediction.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
+from gsparc.training.context import FitContext
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:
@@ -130,8 +130,8 @@ def test_thinned_rows_keep_their_distance() -> None:
 
 
 def test_evidence_of_a_method(campaign, folds) -> None:
-    from gsparc.methods.gp import GaussianProcess
-    from gsparc.methods.mean import Mean
+    from gsparc.models.baselines.gp import GaussianProcess
+    from gsparc.models.baselines.mean import Mean
 
     data, split = campaign("csi", rows=60, static_end="tx"), folds(60)
     fold = split.folds[0]

@@ -18,10 +18,10 @@ from omegaconf import OmegaConf
 
 import gsparc.conf
 from gsparc.evaluation.console import one_line
-from gsparc.methods.method import Method
-from gsparc.methods.registry import build
+from gsparc.models.method import Method
+from gsparc.models.registry import build
+from gsparc.models.splat.method import LearnedField
 from gsparc.training.fit import DEFAULTS
-from gsparc.training.splatting import LearnedField
 
 CONF = Path(gsparc.conf.__path__[0])
 ROOT = Path(__file__).parents[2]

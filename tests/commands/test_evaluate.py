@@ -20,9 +20,9 @@ from gsparc.data.load import load, split_for
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.summary import remarks
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
-from gsparc.methods.nearest import Nearest
+from gsparc.models import checkpoint, loading
+from gsparc.models.baselines.nearest import Nearest
+from gsparc.training.context import FitContext
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def trained(room, tmp_path):
     config = {
         "dataset": {"name": "newrf", "file": str(room)},
         "split": {"name": "random"},
-        "model": {"_target_": "gsparc.methods.nearest.Nearest"},
+        "model": {"_target_": "gsparc.models.baselines.nearest.Nearest"},
         "seed": 3,
     }
     data = load(config["dataset"])
@@ -135,7 +135,7 @@ def test_another_subset_and_split(trained, caplog):
 
 def test_a_checkpoint_that_names_no_rows_is_marked_unless_its_settings_do(trained, tmp_path):
     """Written from Python: any split was taken for its own."""
-    method, stored = checkpoint.load(trained)
+    method, stored = loading.load(trained)
     bare = tmp_path / "bare.ckpt"
     checkpoint.save(bare, method, stored.config)
     assert evaluate_files([bare])[0].facts["split/foreign"] is None
@@ -192,7 +192,7 @@ def test_what_is_in_target_units_is_converted_with_the_target(trained, room):
 
 
 def test_folds_need_their_checkpoints(trained):
-    method, stored = checkpoint.load(trained)
+    method, stored = loading.load(trained)
     checkpoint.save(trained, method, stored.config, {})
     with pytest.raises(ValueError, match="give as many checkpoints"):
         evaluate_files([trained, trained])

@@ -16,12 +16,12 @@ from gsparc.commands.link.adaptation import Rates
 from gsparc.commands.link.beams import gain, loss_db
 from gsparc.commands.link.channels import truth
 from gsparc.commands.link.study import beam_facts, crossing, rate_facts
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
-from gsparc.methods.resource_grid import centred, interpolated, resource_grid
-from gsparc.methods.risk_threshold import binomial_interval
-from gsparc.multipath.uplink.method import UplinkField
-from gsparc.multipath.uplink.search import SearchSettings
+from gsparc.models import checkpoint
+from gsparc.models.uplink.method import UplinkField
+from gsparc.models.uplink.search import SearchSettings
+from gsparc.prediction.resource_grid import centred, interpolated, resource_grid
+from gsparc.prediction.risk_threshold import binomial_interval
+from gsparc.training.context import FitContext
 
 needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")
 

@@ -21,6 +21,7 @@ from PIL import Image
 from towns import town_model
 
 import gsparc
+from gsparc.maps import map_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -62,9 +63,9 @@ def test_every_layer_a_table_and_a_page(mapped):
 
 
 def test_the_promise_stays_with_the_model(mapped, model):
-    found = gsparc.load(model).map(step_m=5.0)
+    found = map_of(gsparc.load(model), step_m=5.0)
     assert found.calibrated and np.isfinite(found.power_db).any()
-    far = gsparc.load(model).map([0, 0, 200, 60], step_m=5.0)
+    far = map_of(gsparc.load(model), [0, 0, 200, 60], step_m=5.0)
     assert np.isnan(far.power_db[:, :, -1]).all() and far.refused[:, -1].all()
     near, edge = far.expected_error_db[0, 5, 5], np.nanmax(far.expected_error_db[0])
     assert edge > near

@@ -21,10 +21,10 @@ from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.evaluation.open_runs import aligned
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
-from gsparc.methods.per_station import for_links
-from gsparc.methods.registry import method_class
+from gsparc.models import checkpoint
+from gsparc.models.per_station import for_links
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
 
 ROOT = Path(__file__).parents[2]
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])

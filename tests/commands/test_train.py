@@ -25,10 +25,10 @@ from gsparc.commands import evaluate
 from gsparc.commands.train import Objects, main, train
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
-from gsparc.methods.origin import Origin
-from gsparc.training.splatting import LearnedField
+from gsparc.models import checkpoint
+from gsparc.models.origin import Origin
+from gsparc.models.splat.method import LearnedField
+from gsparc.training.context import FitContext
 
 ROOT = Path(__file__).parents[2]
 CONTRACT = {  # what scripts read of a summary

@@ -20,8 +20,8 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.figures import DECIDING, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
-from gsparc.methods import checkpoint
-from gsparc.training.lightning_module import GaussianModule
+from gsparc.models import checkpoint
+from gsparc.models.loading import module_of
 
 STILL = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
          "opacities", "emission", "confidence", "gain")]  # fmt: skip
@@ -165,7 +165,7 @@ def test_weights_mean_nothing_to_a_method_without_any(file, trained, tmp_path):
 @pytest.mark.parametrize("name", ["model.ckpt", "last.ckpt"])
 def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, file, trained):
     path = trained.parent / name
-    module = GaussianModule.load_from_checkpoint(path)
+    module = module_of(path)
     data = datamodule({"name": "own", "file": str(file)}).measurements
     rows = np.arange(20)
     shown = Loaded(data, 8).use(Fold(rows, rows[:0], rows))
@@ -179,7 +179,7 @@ def test_a_method_without_a_field_has_no_module(file, tmp_path):
     settings = [s for s in brief(file) if not s.startswith("model.")]
     _, objects = train(compose(*settings, "model=nearest"), tmp_path)
     with pytest.raises(checkpoint.CheckpointError, match="nearest holds no Gaussian field"):
-        GaussianModule.load_from_checkpoint(objects.checkpoints[0])
+        module_of(objects.checkpoints[0])
 
 
 # -- the objective of a search ------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from gsparc.data.assemble import content_hash
 from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own, write_own
-from gsparc.methods.target_rows import training_targets
+from gsparc.models.target_rows import training_targets
 
 
 def arrays(rows: int = 40) -> dict[str, np.ndarray]:

@@ -146,7 +146,10 @@ def test_data_modules_are_of_different_classes():
     ("settings", "says"),
     [
         ({"name": "own", "_target_": "os.system"}, "no gsparc.data.datamodule.DataModule|no such setting"),
-        ({"name": "own", "_target_": "gsparc.methods.mean.Mean"}, "is no gsparc.data.datamodule.DataModule"),
+        (
+            {"name": "own", "_target_": "gsparc.models.baselines.mean.Mean"},
+            "is no gsparc.data.datamodule.DataModule",
+        ),
         (
             {"name": "own", "_target_": "gsparc.data.modules.own.Onw"},
             "is no gsparc.data.datamodule.DataModule",

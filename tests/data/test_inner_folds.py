@@ -10,7 +10,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import NOT_TESTED, cut_inside, inner_folds
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
-from gsparc.methods.per_station import UNHEARD, of_station
+from gsparc.models.per_station import UNHEARD, of_station
 
 KINDS = ("random", "grouped", "corner", "blocks", "sparse")
 SIDE = 0.2

@@ -13,10 +13,11 @@ from gsparc.evaluation.baseline_cache import BASELINES, baseline
 from gsparc.evaluation.evaluate import evaluate, paired_differences
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import decided_by_a_row, write_samples, write_summary
-from gsparc.methods.idw import InverseDistance
-from gsparc.methods.mean import Mean
-from gsparc.methods.method import FitContext, Method, Prediction
-from gsparc.methods.timing import ClockSettings
+from gsparc.models.baselines.idw import InverseDistance
+from gsparc.models.baselines.mean import Mean
+from gsparc.models.method import Method, Prediction
+from gsparc.prediction.timing import ClockSettings
+from gsparc.training.context import FitContext
 
 QUICK = ClockSettings(rounds=3, least=2, warmup=1)
 
@@ -142,7 +143,7 @@ def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatc
         raise AssertionError("fitted again")
 
     with monkeypatch.context() as patch:
-        patch.setattr("gsparc.methods.gp.GaussianProcess.fit", refuse)
+        patch.setattr("gsparc.models.baselines.gp.GaussianProcess.fit", refuse)
         patch.setattr("gsparc.evaluation.baseline_cache.score", refuse)
         second = baseline("gp", data, split, cache=tmp_path)
     assert second.train_s == first.train_s
@@ -150,7 +151,7 @@ def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatc
         assert np.array_equal(second.scores.samples[name], values)
     other = dataclasses.replace(data, site=dataclasses.replace(data.site, sha256="other"))
     with monkeypatch.context() as patch, pytest.raises(AssertionError, match="fitted again"):
-        patch.setattr("gsparc.methods.gp.GaussianProcess.fit", refuse)
+        patch.setattr("gsparc.models.baselines.gp.GaussianProcess.fit", refuse)
         baseline("gp", other, split, cache=tmp_path)
 
 
@@ -158,7 +159,7 @@ def test_a_cheap_fit_is_timed_anew(campaign, folds, tmp_path, monkeypatch):
     """A fit that once took a second on a busy machine stood in every later table with that second."""
     data, split = campaign("csi", 40), folds(40)
     steps = iter(range(100))
-    monkeypatch.setattr("gsparc.methods.interpolation.time.perf_counter", lambda: 5.0 * next(steps))
+    monkeypatch.setattr("gsparc.models.baselines.interpolation.time.perf_counter", lambda: 5.0 * next(steps))
     baseline("gp", data, split, cache=tmp_path)
     assert not list(tmp_path.rglob("fold*.ckpt")) and list(tmp_path.rglob("test.npz"))
 

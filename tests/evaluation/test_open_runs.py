@@ -13,9 +13,9 @@ from gsparc.data.tables.read import read_table
 from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.scores import score
-from gsparc.methods.method import FitContext
-from gsparc.methods.per_station import for_links
-from gsparc.methods.registry import method_class
+from gsparc.models.per_station import for_links
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
 
 RNG = np.random.default_rng(0)
 WALK = np.column_stack([RNG.uniform(0, 50, (80, 2)), np.full(80, 1.5)])

@@ -8,8 +8,8 @@ from PIL import Image
 
 from gsparc.data.splits import Fold
 from gsparc.evaluation.pictures import draw_points, draw_predictions
-from gsparc.methods.mean import Mean
-from gsparc.methods.method import FitContext
+from gsparc.models.baselines.mean import Mean
+from gsparc.training.context import FitContext
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])

@@ -23,8 +23,8 @@ from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
-from gsparc.methods.method import FitContext
-from gsparc.methods.registry import build, method_class
+from gsparc.models.registry import build, method_class
+from gsparc.training.context import FitContext
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -125,7 +125,7 @@ def test_another_text_of_a_plugin_is_another_method(installed, tmp_path, monkeyp
 def test_a_broken_plugin_is_warned_of(installed, tmp_path):
     project = tmp_path / "broken"
     project.mkdir()
-    entry = '[project.entry-points."gsparc.methods"]\nbroken = "no_such_module:Nothing"\n'
+    entry = '[project.entry-points."gsparc.models"]\nbroken = "no_such_module:Nothing"\n'
     (project / "pyproject.toml").write_text(f'[project]\nname = "broken"\nversion = "1"\n{entry}')
     with pytest.warns(UserWarning, match=r"plugin broken \(no_such_module.Nothing\) is left out"):
         installed(project)

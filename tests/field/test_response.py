@@ -19,7 +19,7 @@ from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import frozen_view, seen_by_array
 from gsparc.field.response import ArrayResponse, ChannelResponse
-from gsparc.methods.registry import build
+from gsparc.models.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalised
 from gsparc.simulate.shoebox import LIGHT

@@ -18,7 +18,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import Objects, train
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.figures import DECIDING
-from gsparc.methods import checkpoint
+from gsparc.models import loading
 
 FAR_M = 1e3  # from all that was measured
 SURE_FAR = 0.3  # confidence there, at most
@@ -31,7 +31,7 @@ def checked(world: World, folder: Path, objects: Objects) -> None:
 
 def reloaded(world: World, folder: Path, objects: Objects) -> None:
     """The checkpoint answers as the model that was trained."""
-    method, _ = checkpoint.load(folder / "run" / "model.ckpt")
+    method, _ = loading.load(folder / "run" / "model.ckpt")
     batch = objects.data.batch(objects.split.folds[0].test[:16])
     before, after = (one.answer(batch) for one in (objects.methods[0], method))
     scale = float(before.mean.abs().max()) or 1.0

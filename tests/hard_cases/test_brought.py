@@ -20,8 +20,8 @@ from gsparc.data.load import load, split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.scores import score
-from gsparc.methods.method import Method
-from gsparc.methods.registry import build, method_class
+from gsparc.models.method import Method
+from gsparc.models.registry import build, method_class
 
 LEAST_NMSE = 0.02
 

@@ -1,7 +1,7 @@
 """Full disk: a checkpoint or a dataset that no longer fits.
 
 Remedy: written beside and renamed, so that the good one survives; the error is one line that says which
-file (gsparc/methods/checkpoint.py, gsparc/data/raw.py). Shown with a limit on the size of files, which
+file (gsparc/models/checkpoint.py, gsparc/data/raw.py). Shown with a limit on the size of files, which
 fails like a full disk does: in the middle of writing. Naive: writing in place loses the good one first.
 """
 
@@ -15,14 +15,14 @@ import torch
 from campaigns import brief, spectra
 from crashes import Limited, run, simulation, training
 
-from gsparc.methods import checkpoint
-from gsparc.methods.checkpoint import CheckpointError
-from gsparc.methods.method import FitContext
+from gsparc.models import checkpoint
+from gsparc.models.checkpoint import CheckpointError
+from gsparc.training.context import FitContext
 
 
 @pytest.fixture
 def fitted(campaign, folds, tmp_path):
-    from gsparc.methods.gp import GaussianProcess
+    from gsparc.models.baselines.gp import GaussianProcess
 
     method = GaussianProcess()
     method.fit(campaign("spectrum", 30), folds(30).folds[0], FitContext(tmp_path))

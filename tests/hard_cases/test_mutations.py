@@ -1,6 +1,6 @@
 """Three hundred ways to damage each kind of file: refused in one line, or read exactly as before.
 
-Remedy: checksums of archives (gsparc/methods/checkpoint.py), of arrays and of everything together
+Remedy: checksums of archives (gsparc/models/checkpoint.py), of arrays and of everything together
 (gsparc/data/raw.py). Tolerance: none. Naive: HDF5 checks no scalar and no attribute, so a changed carrier is
 read like a sound one.
 """
@@ -20,9 +20,9 @@ from ledger import LEDGER
 from gsparc.data.load import load, split_for
 from gsparc.data.own import load_own, write_own
 from gsparc.data.raw import read_raw
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
-from gsparc.methods.registry import build
+from gsparc.models import checkpoint, loading
+from gsparc.models.registry import build
+from gsparc.training.context import FitContext
 
 TIMES, TOGETHER = 300, 50
 
@@ -59,7 +59,7 @@ def files(tmp_path_factory) -> dict[str, Path]:
     for name in ("own.npz", "own.h5"):
         write_own(folder / name, raw.arrays, {"name": "room", "measured_by": "somebody"})
     data = load({"name": "own", "file": str(spectra(folder / "spectra.npz"))})
-    method = build({"_target_": "gsparc.methods.idw.InverseDistance"})
+    method = build({"_target_": "gsparc.models.baselines.idw.InverseDistance"})
     method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(folder))
     checkpoint.save(folder / "idw.ckpt", method, "seed: 3\n", {"train_s": 1.5})
     return {path.suffix: path for path in (folder / "own.npz", folder / "own.h5", folder / "idw.ckpt")}
@@ -68,7 +68,7 @@ def files(tmp_path_factory) -> dict[str, Path]:
 def answer(path: Path) -> list[object]:
     """Everything that is read."""
     if path.suffix == ".ckpt":
-        method, stored = checkpoint.load(path)
+        method, stored = loading.load(path)
         state = method.state()
         parts = [v.numpy().tobytes() if isinstance(v, torch.Tensor) else repr(v) for v in state.values()]
         return [stored.method, stored.config, repr(stored.extra), stored.site.sha256, *parts]

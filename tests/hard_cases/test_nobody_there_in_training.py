@@ -16,7 +16,7 @@ from contexts import short
 
 from gsparc.commands.train import train
 from gsparc.data.load import load, split_for
-from gsparc.methods.registry import build
+from gsparc.models.registry import build
 
 PRUNE = (
     "callbacks=densify",

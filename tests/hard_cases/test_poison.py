@@ -17,10 +17,10 @@ from campaigns import brief, compose, spectra
 from contexts import short
 from rasters import GRIDS, origin, random_scene, render
 
-from gsparc.methods import checkpoint
-from gsparc.methods.registry import build
+from gsparc.models import checkpoint
+from gsparc.models.registry import build
 from gsparc.ops.settings import FARTHEST, WIDEST
-from gsparc.training.lightning_module import NonFiniteLoss
+from gsparc.training.module import NonFiniteLoss
 
 
 class Spoil(L.Callback):

@@ -21,7 +21,7 @@ import torch
 from campaigns import brief, compose, spectra
 
 from gsparc.commands.train import train
-from gsparc.methods import checkpoint
+from gsparc.models import checkpoint
 
 ROOT = Path(__file__).parents[2]
 STEPS = 63  # a multiple of 7: the last checkpoint of a stage is its end

@@ -19,7 +19,7 @@ from releases import REAL
 
 from gsparc.callbacks import Densify, OpacityReset
 from gsparc.data.load import load, split_for
-from gsparc.methods.registry import build
+from gsparc.models.registry import build
 
 
 def dataset(name: str, folder: Path) -> tuple[str, dict]:

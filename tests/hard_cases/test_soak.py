@@ -22,9 +22,9 @@ from omegaconf import OmegaConf
 
 import gsparc
 from gsparc.data.load import load, split_for
-from gsparc.methods import checkpoint
-from gsparc.methods.checkpoint import CheckpointError
-from gsparc.methods.registry import build
+from gsparc.models import checkpoint
+from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.registry import build
 
 MODELS = {  # what is loaded and asked: a method and the file it learns from
     "gp": spectra, "idw": spectra, "kriging": powers, "gp_power": powers, "complex_gp": channels,

@@ -27,9 +27,9 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
-from gsparc.methods.registry import build
+from gsparc.models.registry import build
 from gsparc.ops import Pose, SphereGrid
-from gsparc.training.lightning_module import NonFiniteLoss
+from gsparc.training.module import NonFiniteLoss
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 SITE = Site(

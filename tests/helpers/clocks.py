@@ -25,6 +25,6 @@ class WoundClock:
 def wound(monkeypatch) -> SimpleNamespace:
     """The `monotonic` and `process_time` that every time budget looks at."""
     clocks = SimpleNamespace(monotonic=WoundClock(), process_time=WoundClock())
-    monkeypatch.setattr("gsparc.methods.time_budget.time", clocks)
-    monkeypatch.setattr("gsparc.methods.time_budget.torch.get_num_threads", lambda: 1)
+    monkeypatch.setattr("gsparc.training.time_budget.time", clocks)
+    monkeypatch.setattr("gsparc.training.time_budget.torch.get_num_threads", lambda: 1)
     return clocks

@@ -9,7 +9,7 @@ from typing import Any
 
 import lightning.pytorch as L
 
-from gsparc.methods.method import FitContext
+from gsparc.training.context import FitContext
 from gsparc.training.fit import DEFAULTS
 
 

@@ -17,7 +17,7 @@ from ledger import LEDGER
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    ["crashes", "campaigns", "gsparc.commands.train", "gsparc.training.splatting", "gsparc.callbacks"]
+    ["crashes", "campaigns", "gsparc.commands.train", "gsparc.models.splat.method", "gsparc.callbacks"]
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsparc.multipath.phased_gp import PhasedPosterior
+from gsparc.models.image_sources.phased_gp import PhasedPosterior
 
 
 def gains(member: PhasedPosterior, places: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose
-from gsparc.training.lightning_module import GaussianModule, LossSettings
+from gsparc.training.module import GaussianModule, LossSettings
 from gsparc.training.optimizer import OptimizerSettings
 
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))

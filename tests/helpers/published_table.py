@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from gsparc.methods.registry import METHODS
+from gsparc.models.registry import METHODS
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "peers.md"

@@ -23,12 +23,12 @@ from gsparc.callbacks import Densify, OpacityReset
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext
-from gsparc.methods.time_budget import TimeBudget
 from gsparc.ops import Pose
+from gsparc.training.context import FitContext
 from gsparc.training.fit import DEFAULTS, run_stage
-from gsparc.training.lightning_module import GaussianModule
+from gsparc.training.module import GaussianModule
 from gsparc.training.optimizer import OptimizerSettings
+from gsparc.training.time_budget import TimeBudget
 
 BATCH = 7  # no multiple of two processes, nor a divisor of the rows
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from types import FrameType
 from unittest import mock
 
-from gsparc.methods.time_budget import TimeBudget
 from gsparc.processes import worker
+from gsparc.training.time_budget import TimeBudget
 
 OFTEN_S = 0.02  # between signals, as Ctrl-C would come
 

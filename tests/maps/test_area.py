@@ -12,6 +12,7 @@ from towns import town_model
 import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
+from gsparc.maps import map_of
 from gsparc.maps.area import grid_of
 from gsparc.maps.floor_plan import read_plan
 from gsparc.maps.geojson import read_shapes
@@ -148,5 +149,5 @@ def test_a_plan_that_is_no_image(tmp_path):
 )
 def test_spoilt_maps(how, said):
     with pytest.raises(DataError, match=said) as caught:
-        gsparc.load(town_model()).map(**{"step_m": 5.0, **how})
+        map_of(gsparc.load(town_model()), **{"step_m": 5.0, **how})
     assert "\n" not in str(caught.value)

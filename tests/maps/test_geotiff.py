@@ -12,6 +12,7 @@ from towns import town_model
 import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
+from gsparc.maps import map_of
 from gsparc.maps.geotiff import wanted, write_geotiff
 from gsparc.maps.planning import plan_next
 
@@ -22,7 +23,7 @@ def test_read_back_at_the_right_place(tmp_path):
     rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
     from rasterio.warp import transform
 
-    found = gsparc.load(town_model()).map([0, 0, 80, 60], step_m=4.0)
+    found = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
         assert file.descriptions[0] == "power_db" and file.count == 10
@@ -50,7 +51,7 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
                for ring in rings]  # fmt: skip
     drawn = {"type": "Polygon", "coordinates": [ring.tolist() for ring in degrees]}
     (tmp_path / "area.geojson").write_text(json.dumps({"type": "Feature", "geometry": drawn}))
-    found = predictor.map(tmp_path / "area.geojson", step_m=1.0)
+    found = map_of(predictor, tmp_path / "area.geojson", step_m=1.0)
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
         power = file.read(1)
@@ -64,11 +65,11 @@ def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
     (tmp_path / "area.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
     predictor = gsparc.load(town_model())
     with pytest.raises(DataError, match="degrees mean nothing to"):
-        predictor.map(tmp_path / "area.geojson")
+        map_of(predictor, tmp_path / "area.geojson")
     with pytest.raises(DataError, match="degrees mean nothing to"):
         plan_next(predictor, 3, walkable=tmp_path / "area.geojson")
     with pytest.raises(DataError, match="a rectangle is in metres"):
-        predictor.map([11.3, 47.2, 11.301, 47.2008])
+        map_of(predictor, [11.3, 47.2, 11.301, 47.2008])
 
 
 def test_asked_for_without_a_place_on_earth():

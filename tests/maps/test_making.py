@@ -17,9 +17,9 @@ from gsparc.maps.making import _usual, answering, map_of
 from gsparc.maps.pictures import layers
 from gsparc.maps.promise import Promise
 from gsparc.maps.refining import refined
-from gsparc.methods.method import FitContext
-from gsparc.methods.predictor import Predictor
-from gsparc.methods.registry import method_class
+from gsparc.models.registry import method_class
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def predictor():
 
 
 def test_cells_hold_what_the_model_predicts(predictor):
-    found = predictor.map([0, 0, 80, 60], step_m=4.0, threshold_db=-90)
+    found = map_of(predictor, [0, 0, 80, 60], step_m=4.0, threshold_db=-90)
     assert found.power_db.shape == (2, 15, 20) and found.power_db.dtype == np.float32
     place = [found.grid.x[3], found.grid.y[5], 1.5]
     for number, name in enumerate(found.stations):
@@ -42,10 +42,10 @@ def test_cells_hold_what_the_model_predicts(predictor):
 
 
 def test_chunks_do_not_change_a_map(predictor, monkeypatch):
-    whole = predictor.map(step_m=5.0)
+    whole = map_of(predictor, step_m=5.0)
     monkeypatch.setattr("gsparc.maps.making.CHUNK", 7)
     monkeypatch.setattr("gsparc.maps.making.BANDS", 13)
-    assert np.allclose(predictor.map(step_m=5.0).power_db, whole.power_db, atol=1e-4)
+    assert np.allclose(map_of(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
 
 
 def test_an_interrupt_is_heeded_between_chunks(predictor):
@@ -57,11 +57,11 @@ def test_an_interrupt_is_heeded_between_chunks(predictor):
 
 
 def test_stations_by_name_or_number_in_the_order_asked_for(predictor):
-    found = predictor.map(step_m=10.0, stations=["east", 0])
-    both = predictor.map(step_m=10.0)
+    found = map_of(predictor, step_m=10.0, stations=["east", 0])
+    both = map_of(predictor, step_m=10.0)
     assert found.stations == ("east", "west")
     assert np.array_equal(found.power_db[::-1], both.power_db)
-    assert predictor.map(step_m=10.0, stations=["east"]).power_db.shape[0] == 1
+    assert map_of(predictor, step_m=10.0, stations=["east"]).power_db.shape[0] == 1
 
 
 def test_ratio_of_signal_to_interference_by_hand():
@@ -83,8 +83,8 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
     usual = np.array([[-80.0, 5.0], [-50.0, 5.0]])  # the second is unknown in the last cell, mostly louder
     told = server_chance(power, error, usual, np.array([-60.0, -100.0]))
     assert told[0] == pytest.approx(0.5, abs=1e-4) and told[3] == pytest.approx(0.5 * 0.0786, abs=1e-3)
-    quiet = predictor.map(step_m=10.0)
-    loud = predictor.map(step_m=10.0, noise_db=0.0)
+    quiet = map_of(predictor, step_m=10.0)
+    loud = map_of(predictor, step_m=10.0, noise_db=0.0)
     assert not quiet.unsure.any() and loud.unsure.all() and loud.figures()["map/server_unsure"] == 1
     unsure = {layer.name: layer.unsure for layer in layers(loud)}
     assert unsure["best_server"] is not None and unsure["power"] is None
@@ -99,7 +99,7 @@ def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
 
 
 def test_saved_and_read_back(predictor, tmp_path):
-    found = predictor.map(step_m=10.0)
+    found = map_of(predictor, step_m=10.0)
     found.save(tmp_path / "map.npz")
     with np.load(tmp_path / "map.npz") as stored:
         assert np.array_equal(stored["power_db"], found.power_db)

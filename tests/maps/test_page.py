@@ -8,6 +8,7 @@ import pytest
 from towns import town_model
 
 import gsparc
+from gsparc.maps import map_of
 from gsparc.maps.page import write_page
 from gsparc.maps.pictures import layers
 
@@ -15,7 +16,7 @@ ActionChains = pytest.importorskip("selenium.webdriver", reason="selenium is not
 
 
 def test_layers_switch_and_the_pointer_reads_values(browser, tmp_path):
-    found = gsparc.load(town_model()).map([0, 0, 80, 60], step_m=4.0)
+    found = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
     drawn = list(layers(found))
     write_page(tmp_path / "map.html", found, drawn, "a <town>", ["a & b"], None)
     browser.get((tmp_path / "map.html").as_uri())

@@ -13,10 +13,10 @@ from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.maps.placing import NewStation, new_station_error, place_next
-from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
-from gsparc.methods.per_station import for_links
-from gsparc.methods.registry import method_class
+from gsparc.models import checkpoint
+from gsparc.models.per_station import for_links
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from scipy.spatial.distance import cdist
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.maps.promise import PromiseSettings, gather, predict_rows
-from gsparc.methods.gp import GaussianProcess
-from gsparc.methods.method import FitContext
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.training.context import FitContext
 
 TOWNS, ROWS, SHARE = 30, 200, 0.9
 NOISE_DB = (1.0, 4.0)  # of a measurement, by turns

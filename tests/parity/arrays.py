@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from small_worlds import smooth, spread
 
-from gsparc.array import vector_gp
-from gsparc.array.moving import power_gp, residual
-from gsparc.multipath.uplink.search import SearchSettings, SourceSearch
+from gsparc.models.array_vectors import vector_gp
+from gsparc.models.moving_array import power_gp, residual
+from gsparc.models.uplink.search import SearchSettings, SourceSearch
 from gsparc.physics.plane_waves import Aperture, delays, steering
 from gsparc.processes.kernel import Kernel, SmoothRough
 

@@ -8,21 +8,21 @@ from rooms import directed
 from small_worlds import CARRIER, ceiling, channel, fold
 
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext
-from gsparc.multipath import complex_gp, directional_gp
-from gsparc.multipath.clutter.residual import Residual
-from gsparc.multipath.gp_likelihood import Posterior, Scene
-from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
-from gsparc.multipath.query import Query
-from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_gp import VisibilityGP
-from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.multipath.waves import evidence
-from gsparc.multipath.waves.columns import gather, thinned
-from gsparc.multipath.waves.covariance import Shape, Values
-from gsparc.multipath.waves.field import ChannelField
-from gsparc.multipath.waves.kernels import cells, sphere
+from gsparc.models.channels import complex_gp, evidence
+from gsparc.models.channels.columns import gather, thinned
+from gsparc.models.channels.covariance import Shape, Values
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.kernels import cells, sphere
+from gsparc.models.directional import method as directional_gp
+from gsparc.models.image_sources.clutter.residual import Residual
+from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
+from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.visibility_gp import VisibilityGP
+from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.ops import Pose
+from gsparc.training.context import FitContext
 
 Arrays = dict[str, np.ndarray]
 

@@ -10,14 +10,14 @@ import torch
 from small_worlds import LAW, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
-from gsparc.multipath.powers import waves
-from gsparc.multipath.powers.field import PowerField
-from gsparc.multipath.powers.likelihood import Covariance, left_out_losses
-from gsparc.multipath.powers.together.field import JointPowerField
-from gsparc.multipath.powers.together.law import fit_site_law
-from gsparc.multipath.powers.together.learning import _ends, left_out_loss, start
-from gsparc.multipath.powers.together.prior import grid
-from gsparc.multipath.powers.together.rows import heard_rows
+from gsparc.models.powers import waves
+from gsparc.models.powers.field import PowerField
+from gsparc.models.powers.likelihood import Covariance, left_out_losses
+from gsparc.models.powers.together.field import JointPowerField
+from gsparc.models.powers.together.law import fit_site_law
+from gsparc.models.powers.together.learning import _ends, left_out_loss, start
+from gsparc.models.powers.together.prior import grid
+from gsparc.models.powers.together.rows import heard_rows
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 

@@ -10,14 +10,15 @@ from small_worlds import LAW, fold, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
 from gsparc.maps import covariance
-from gsparc.methods import gp, power_settings
-from gsparc.methods.confidence_scores import process_variance
-from gsparc.methods.left_out_images import predict_left_out
-from gsparc.methods.method import FitContext
+from gsparc.models.baselines import gp
+from gsparc.models.left_out_images import predict_left_out
+from gsparc.models.powers import settings as power_settings
+from gsparc.prediction.confidence_scores import process_variance
 from gsparc.processes import censored, density, features, nearest, powers
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law
+from gsparc.training.context import FitContext
 
 ONE = Kernel((2.5,), (1.0,), 0.05, 18.0)
 TWO = Kernel((1.2, 6.0), (0.4, 0.6), 0.08, 20.0)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 from releases import real
+from tests.methods.test_power_settings import error_db, fit, town
 
 from gsparc.data.own import interpret
 from gsparc.data.raw import read_raw
 from gsparc.data.selection import keep_above
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.methods.gp import GaussianProcess
-from gsparc.methods.kriging import Kriging
-from gsparc.methods.method import FitContext
-from gsparc.methods.reduced import reduced
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.baselines.kriging import Kriging
+from gsparc.models.reduced import reduced
 from gsparc.processes import neighbourhood, powers
 from gsparc.processes.covering import covering
 from gsparc.processes.kernel import Kernel
@@ -25,7 +25,7 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, Rows, conditioned
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
-from tests.methods.test_power_settings import error_db, fit, town
+from gsparc.training.context import FitContext
 
 KERNEL = Kernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 
@@ -170,7 +170,7 @@ def test_a_parked_car_counts_no_more_than_a_street():
 
 
 def test_kriging_of_many_places_says_how_many(monkeypatch):
-    monkeypatch.setattr("gsparc.methods.kriging.WHOLE", 150)
+    monkeypatch.setattr("gsparc.models.baselines.kriging.WHOLE", 150)
     data, method = town(700), Kriging()
     batch, _ = fit(method, data, 400)
     assert method.label == "kriging (nearest 100)" and Kriging().label == "kriging"
@@ -182,7 +182,7 @@ def test_kriging_of_many_places_says_how_many(monkeypatch):
 def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatch, tmp_path, kind):
     data, near, whole = campaign(kind, 90), GaussianProcess(), GaussianProcess()
     batch, _ = fit(whole, data, 80)
-    monkeypatch.setattr("gsparc.methods.gp.MOST_ROWS", 40)
+    monkeypatch.setattr("gsparc.models.baselines.gp.MOST_ROWS", 40)
     batch, notes = fit(near, data, 80)
     assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
     assert "gp: each query is predicted from the 30 nearest of 80 rows (Vecchia)" in notes

@@ -16,19 +16,19 @@ SOLVING = {
 }  # fmt: skip
 GENERAL = {"solve", "inv", "lstsq", "lu_factor", "lu_solve"}  # of numpy.linalg, torch.linalg and scipy.linalg
 EXCEPTIONS = {  # who solves a system for itself, and why
-    "gsparc/methods/kriging.py": "an independent check of the engine",
-    "gsparc/methods/ridge.py": "a baseline: complex ridge regression, no covariance of places",
-    "gsparc/methods/resource_grid.py": "a baseline's filter over tones, no covariance of places",
+    "gsparc/models/baselines/kriging.py": "an independent check of the engine",
+    "gsparc/models/baselines/ridge.py": "a baseline: complex ridge regression, no covariance of places",
+    "gsparc/prediction/resource_grid.py": "a baseline's filter over tones, no covariance of places",
     "gsparc/commands/link/pusch.py": "the receiver's filter of a link, no covariance of places",
     "gsparc/data/campaigns/powder.py": "a map from degrees to metres by least squares",
     "gsparc/data/checks/level_steps.py": "a mean law by least squares",
     "gsparc/physics/lags.py": "a basis of an array's lags",
-    "gsparc/multipath/position_refine.py": "three coordinates of a source",
-    "gsparc/multipath/triangulation.py": "three coordinates of a source",
-    "gsparc/multipath/uplink/search.py": "a batch of source fits in single precision, at times singular",
-    "gsparc/multipath/uplink/error_model.py": "six terms of a regression",
-    "gsparc/array/moving/triangulate.py": "powers of sources by least squares",
-    "gsparc/training/reduce.py": "weights of fewer Gaussians by least squares",
+    "gsparc/models/directional/position_refine.py": "three coordinates of a source",
+    "gsparc/models/directional/triangulation.py": "three coordinates of a source",
+    "gsparc/models/uplink/search.py": "a batch of source fits in single precision, at times singular",
+    "gsparc/models/uplink/error_model.py": "six terms of a regression",
+    "gsparc/models/moving_array/triangulate.py": "powers of sources by least squares",
+    "gsparc/models/splat/reduce.py": "weights of fewer Gaussians by least squares",
 }
 
 

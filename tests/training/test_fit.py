@@ -10,8 +10,8 @@ from contexts import short
 
 from gsparc.callbacks import CostLedger
 from gsparc.data.load import load, split_for
-from gsparc.methods import checkpoint
-from gsparc.methods.registry import build
+from gsparc.models import checkpoint
+from gsparc.models.registry import build
 
 
 class Interrupt(L.Callback):

@@ -9,7 +9,7 @@ from campaigns import brief, compose, spectra
 from contexts import short
 
 from gsparc.data.load import load, split_for
-from gsparc.methods.registry import build
+from gsparc.models.registry import build
 
 COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 

@@ -10,7 +10,7 @@ from watchdog import watched
 
 from gsparc.commands.context import context_of
 from gsparc.data.load import load, split_for
-from gsparc.methods.registry import build
+from gsparc.models.registry import build
 
 LONGEST_S = 2.0  # of the thread's own processor time: a busy machine does not lengthen it
 KINDS = {  # what is measured, seconds, and overrides; as many rows as make the longest phase last

@@ -12,8 +12,9 @@ from towns import town_model
 
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
+from gsparc.maps import map_of
 from gsparc.maps.field_map import FieldMap
-from gsparc.methods import checkpoint
+from gsparc.models import checkpoint
 from gsparc.view.building import SPLATS, Given, build
 from gsparc.view.viewed import open_viewed
 
@@ -66,7 +67,7 @@ def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, 
 def test_a_map_that_was_made_is_read_again(here):
     import gsparc
 
-    made = gsparc.load(town_model()).map([0, 0, 80, 60], step_m=8.0)
+    made = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=8.0)
     made.save(here / "map.npz")
     found = FieldMap.read(here / "map.npz")
     np.testing.assert_array_equal(found.power_db, made.power_db)

@@ -18,8 +18,9 @@ from campaigns import compose, spectra
 
 import gsparc
 from gsparc.commands.train import train
+from gsparc.maps import map_of
 from gsparc.maps.pictures import layers
-from gsparc.methods.reduced import reduced
+from gsparc.models.reduced import reduced
 from gsparc.view.site_view import SiteView, grid_for
 from gsparc.view.viewed import Way, open_viewed
 
@@ -146,7 +147,7 @@ def test_the_sphere_of_a_receiver_that_moves_goes_with_it(visit, tmp_path):
 
 
 def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
-    found = gsparc.load(power_view.viewed.name).map([0, 0, 80, 60], step_m=8.0, height_m=3.0)
+    found = map_of(gsparc.load(power_view.viewed.name), [0, 0, 80, 60], step_m=8.0, height_m=3.0)
     made = [layer for layer in layers(found) if not layer.words]
     view = SiteView(power_view.viewed, grid=power_view.grid, layers=tuple((found.grid, one) for one in made))
     session = visit(view)

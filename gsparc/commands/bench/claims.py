@@ -13,8 +13,8 @@ from gsparc.commands.bench import kernels, layers, steps
 from gsparc.commands.bench.case import Call
 from gsparc.commands.bench.measure import Machine, measure, timed, undisturbed
 from gsparc.commands.bench.scene import Scene, scene
-from gsparc.methods.timing import ClockSettings
 from gsparc.ops.projection import Projection
+from gsparc.prediction.timing import ClockSettings
 
 # Of forward / limit: for fewer Gaussians than MANY, and for more. Where it comes from: docs/cpu.md.
 FORWARD: dict[Projection, tuple[float, float]] = {"tangent": (4.0, 5.0), "equirect": (3.0, 4.0)}

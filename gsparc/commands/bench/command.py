@@ -19,8 +19,8 @@ from gsparc.commands.bench.scene import NETWORK, scene
 from gsparc.commands.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.methods.timing import ClockSettings, machine_facts, peak_memory
 from gsparc.ops.native import instruction_set
+from gsparc.prediction.timing import ClockSettings, machine_facts, peak_memory
 
 log = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from gsparc.commands.bench.case import Call, Case
-from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.ops import machine_limits
+from gsparc.prediction.timing import ClockSettings, interleaved
 
 COPY_BYTES = 48 * 2**20  # with its copy, beyond every cache
 MARK_TASKS = 16  # of the bare exponential loop, a fraction of a millisecond

@@ -29,11 +29,18 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import provenance, shown, table, write_summary
-from gsparc.methods.confidence import Trusted, keep, threshold_of
-from gsparc.methods.confidence_scores import CHUNK, Evidence, gather, joined, known_positions, position_kernel
-from gsparc.methods.method import Method
-from gsparc.methods.risk_threshold import Promise
-from gsparc.methods.timing import machine_facts
+from gsparc.models.method import Method
+from gsparc.prediction.confidence import Trusted, keep, threshold_of
+from gsparc.prediction.confidence_scores import (
+    CHUNK,
+    Evidence,
+    gather,
+    joined,
+    known_positions,
+    position_kernel,
+)
+from gsparc.prediction.risk_threshold import Promise
+from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import numpy as np
 from gsparc.commands.calibrate.curves import bounded, risk_coverage
 from gsparc.commands.calibrate.trial import Trial
 from gsparc.evaluation.drawing import panels, save
-from gsparc.methods.confidence_scores import Evidence
+from gsparc.prediction.confidence_scores import Evidence
 
 NAMES = {
     "learned": "learned", "expected": "expected error", "distance": "distance to the nearest",

@@ -8,8 +8,15 @@ from typing import Literal
 import numpy as np
 
 from gsparc.commands.calibrate.curves import bounded, risk_coverage
-from gsparc.methods.confidence_scores import Evidence
-from gsparc.methods.risk_threshold import Promise, Threshold, binomial_interval, choose, levels_of, spread_out
+from gsparc.prediction.confidence_scores import Evidence
+from gsparc.prediction.risk_threshold import (
+    Promise,
+    Threshold,
+    binomial_interval,
+    choose,
+    levels_of,
+    spread_out,
+)
 
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate

@@ -18,7 +18,7 @@ from hydra.core.config_store import ConfigStore
 from gsparc.commands.compare.problem import Problem
 from gsparc.data.instantiate import find, targets
 from gsparc.data.plugins import plugins
-from gsparc.methods.registry import METHODS
+from gsparc.models.registry import METHODS
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 
@@ -198,7 +198,7 @@ def code_version(model: Mapping[str, Any]) -> str:
     """
     named = {base.__module__ for path in targets(model) for base in find(path).__mro__}
     own = {"gsparc", *(str(path).partition(".")[0] for path in targets(model))}  # plugins have texts too
-    open_ends = {name for name in named if name.partition(".")[0] in own} - {"gsparc.methods.method"}
+    open_ends = {name for name in named if name.partition(".")[0] in own} - {"gsparc.models.method"}
     sources: dict[str, str] = {}
     while open_ends:
         name = open_ends.pop()

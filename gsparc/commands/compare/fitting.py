@@ -21,11 +21,12 @@ from gsparc.commands.settings import plain
 from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.methods import checkpoint
-from gsparc.methods.label import common_label
-from gsparc.methods.method import FitReport, Method
-from gsparc.methods.registry import build
-from gsparc.methods.timing import machine_facts
+from gsparc.models import checkpoint
+from gsparc.models.label import common_label
+from gsparc.models.method import Method
+from gsparc.models.registry import build
+from gsparc.prediction.timing import machine_facts
+from gsparc.training.context import FitReport
 
 log = logging.getLogger(__name__)
 

@@ -10,9 +10,9 @@ import numpy as np
 from gsparc.commands.compare.fitting import Filled
 from gsparc.commands.compare.problem import Problem
 from gsparc.commands.study.run import queries
-from gsparc.methods import checkpoint
-from gsparc.methods.method import Method
-from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved, reference_copy
+from gsparc.models import loading
+from gsparc.models.method import Method
+from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, reference_copy
 
 SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
 ENDLESS_MS = 10_000.0  # from here on it is timed once
@@ -42,7 +42,7 @@ def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
     methods: dict[str, Method] = {}
     for one in filled:
         if one.cell.method not in methods:
-            methods[one.cell.method] = checkpoint.load(one.checkpoint)[0]
+            methods[one.cell.method] = loading.load(one.checkpoint)[0]
     calls = cycling(methods, queries(data, split.folds[0].test))
     once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
     endless = {name for name in calls if once[name][0] > ENDLESS_MS}

@@ -13,11 +13,11 @@ from torch import Tensor
 from gsparc.data.campaigns.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.confidence_scores import Evidence, expected_score, rivals
-from gsparc.methods.method import Method, Prediction
-from gsparc.methods.resource_grid import interpolated
-from gsparc.methods.uplink_method import SeparatesPaths
-from gsparc.multipath.phase_offsets import estimate
+from gsparc.models.image_sources.phase_offsets import estimate
+from gsparc.models.method import Method, Prediction
+from gsparc.models.uplink.interface import SeparatesPaths
+from gsparc.prediction.confidence_scores import Evidence, expected_score, rivals
+from gsparc.prediction.resource_grid import interpolated
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World

@@ -32,9 +32,9 @@ from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.methods.resource_grid import SUBCARRIERS_PER_BLOCK, centred
-from gsparc.methods.risk_threshold import Promise
-from gsparc.methods.timing import machine_facts
+from gsparc.prediction.resource_grid import SUBCARRIERS_PER_BLOCK, centred
+from gsparc.prediction.risk_threshold import Promise
+from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ import numpy as np
 from gsparc.commands.link.adaptation import Rates
 from gsparc.commands.link.study import Curve
 from gsparc.evaluation.drawing import GREY, PALETTE, panels, save
-from gsparc.methods.risk_threshold import binomial_interval
+from gsparc.prediction.risk_threshold import binomial_interval
 
 STYLES = {
     "perfect@accepted": ("perfect, accepted", "black", "-"),

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.commands.link.adaptation import Adaptation, Band, Rates, Rule
 from gsparc.commands.link.beams import LEAST, gain, loss_db
 from gsparc.commands.link.pusch import Blocks, Pusch
-from gsparc.methods.risk_threshold import binomial_interval
+from gsparc.prediction.risk_threshold import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
 FALLBACK = "lmmse"

@@ -11,8 +11,8 @@ import torch
 from gsparc.data.errors import DataError
 from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import End
-from gsparc.methods.method import Prediction
-from gsparc.methods.predictor import Predictor
+from gsparc.models.method import Prediction
+from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # places predicted at a time
 

@@ -17,7 +17,8 @@ from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.methods.predictor import Predictor, load
+from gsparc.prediction.load import load
+from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from gsparc.data.links.stations import station_number
 from gsparc.data.query_places import WORDS, QueryPlaces
 from gsparc.data.schema import End, Site
 from gsparc.data.tables.places import Places
-from gsparc.methods.predictor import usual_heights
+from gsparc.prediction.predictor import usual_heights
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
 SPECK = 1e-3  # of that side: in degrees a site is 1e-5 as wide as in metres, in kilometres 1e-3

@@ -21,9 +21,9 @@ from gsparc.commands.study.study import Row, Study, Variant
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, run_conditions, shown, table, write_samples, write_summary
-from gsparc.methods.method import Method
-from gsparc.methods.registry import build, method_class
-from gsparc.methods.timing import ClockSettings, machine_facts
+from gsparc.models.method import Method
+from gsparc.models.registry import build, method_class
+from gsparc.prediction.timing import ClockSettings, machine_facts
 
 
 def variants_of(config: DictConfig) -> list[Variant]:

@@ -12,11 +12,12 @@ from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import score
-from gsparc.methods import parts
-from gsparc.methods.method import FitContext, FitReport, Method
-from gsparc.methods.per_station import for_links
-from gsparc.methods.time_budget import Clock, less_repeatable
-from gsparc.methods.timing import ClockSettings, cycling, interleaved
+from gsparc.models import parts
+from gsparc.models.method import Method
+from gsparc.models.per_station import for_links
+from gsparc.prediction.timing import ClockSettings, cycling, interleaved
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import Clock, less_repeatable
 
 QUERIES = 64  # different positions asked for
 

@@ -14,8 +14,9 @@ from gsparc.commands.study.run import Outcome, fit_and_score, in_folders, query_
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.figures import DECIDING
-from gsparc.methods.method import FitContext, Method
-from gsparc.methods.timing import ClockSettings
+from gsparc.models.method import Method
+from gsparc.prediction.timing import ClockSettings
+from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 

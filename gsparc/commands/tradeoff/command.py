@@ -25,13 +25,14 @@ from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files, trained_on
 from gsparc.evaluation.scores import rows_of, score
 from gsparc.evaluation.summary import provenance, table, write_samples, write_summary
-from gsparc.methods import checkpoint, stored_front
-from gsparc.methods.method import Method
-from gsparc.methods.pareto import Point, cost_of_halving, front, worded
-from gsparc.methods.per_station import PerStation
-from gsparc.methods.predictor import Predictor
-from gsparc.methods.reduced import combinations, contributions, knobs, reduced
-from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
+from gsparc.models import loading
+from gsparc.models.method import Method
+from gsparc.models.pareto import Point, cost_of_halving, front, worded
+from gsparc.models.per_station import PerStation
+from gsparc.models.reduced import combinations, contributions, knobs, reduced
+from gsparc.prediction import stored_front
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
@@ -109,7 +110,7 @@ def _others(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | 
         fitted = baseline(name, data, run.split, config.eval_on, cache)
         found[name] = (fitted.methods[0], fitted.scores.figures()[figure])
     for path in config.peers:
-        method, other = checkpoint.load(path)
+        method, other = loading.load(path)
         if trained_on([other], replace(run.split, folds=run.split.folds[:1])) is False:
             raise ValueError(f"peers: {path} was trained on another split than {config.ckpt}")
         names = (method.name, f"{method.name} ({Path(path).parent.name})", path)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.figures import lower_is_better, score_of
-from gsparc.methods.pareto import Point
+from gsparc.models.pareto import Point
 
 NAMES = {
     "psnr_db": "PSNR [dB]", "nmse": "NMSE", "rmse_db": "RMSE [dB]", "ssim_gauss": "SSIM (11 x 11 Gaussian)"

@@ -16,11 +16,11 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.figures import DECIDING
 from gsparc.evaluation.scores import Scores, rows_of, score
-from gsparc.methods.method import Method, Prediction
-from gsparc.methods.pareto import Point, Settings
-from gsparc.methods.predictor import Predictor
-from gsparc.methods.reduced import View
-from gsparc.methods.timing import Call, ClockSettings, interleaved
+from gsparc.models.method import Method, Prediction
+from gsparc.models.pareto import Point, Settings
+from gsparc.models.reduced import View
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import Call, ClockSettings, interleaved
 
 log = logging.getLogger(__name__)
 

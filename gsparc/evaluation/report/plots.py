@@ -22,7 +22,7 @@ from gsparc.evaluation.report.intervals import interval, over_seeds
 from gsparc.evaluation.report.learning import curve, validation_figure
 from gsparc.evaluation.report.runs import Run, sizes
 from gsparc.evaluation.report.tables import BASELINES, grouped
-from gsparc.methods.pareto import front
+from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8
 MOST_CONFIDENCES = 8

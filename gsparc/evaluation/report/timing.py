@@ -11,8 +11,8 @@ import torch
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.report.runs import Run
 from gsparc.evaluation.summary import write_samples
-from gsparc.methods.predictor import Predictor
-from gsparc.methods.timing import BLOCKS, Call, interleaved
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import BLOCKS, Call, interleaved
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ import pytest
 from campaigns import compose
 from omegaconf import OmegaConf
 
-import gsparc.peers
+import gsparc.models.peers
 from gsparc.commands.compare.cells import Budget, Contender, code_version, contenders, key, plan
 from gsparc.commands.compare.problem import Problem, split_choices
 
@@ -95,7 +95,7 @@ def test_every_method_of_the_default_comparison_composes():
 
 
 MODULE = '''"""{doc}"""
-from gsparc.methods.mean import Mean
+from gsparc.models.baselines.mean import Mean
 
 
 class Toy(Mean):
@@ -105,20 +105,20 @@ class Toy(Mean):
 
 
 def test_words_do_not_make_another_method_and_numbers_do(tmp_path, monkeypatch):
-    monkeypatch.setattr("gsparc.peers.__path__", [*gsparc.peers.__path__, str(tmp_path)])
+    monkeypatch.setattr("gsparc.models.peers.__path__", [*gsparc.models.peers.__path__, str(tmp_path)])
     versions = []
     for doc, value in (("One.", 1), ("Other words.  # and a comment", 1), ("One.", 2)):
         (tmp_path / "toy.py").write_text(MODULE.format(doc=doc, value=value))
-        monkeypatch.delitem(sys.modules, "gsparc.peers.toy", raising=False)
-        versions.append(code_version({"_target_": "gsparc.peers.toy.Toy"}))
+        monkeypatch.delitem(sys.modules, "gsparc.models.peers.toy", raising=False)
+        versions.append(code_version({"_target_": "gsparc.models.peers.toy.Toy"}))
     assert versions[0] == versions[1] != versions[2]
-    assert code_version({"_target_": "gsparc.peers.gsrf.GSRF"}) != code_version(
-        {"_target_": "gsparc.methods.mean.Mean"}
+    assert code_version({"_target_": "gsparc.models.peers.gsrf.GSRF"}) != code_version(
+        {"_target_": "gsparc.models.baselines.mean.Mean"}
     )
 
 
 def test_a_key_names_data_split_and_settings():
-    model = {"_target_": "gsparc.methods.mean.Mean"}
+    model = {"_target_": "gsparc.models.baselines.mean.Mean"}
     base = key(model, {}, "data", "split")
     assert base == key(dict(model), {}, "data", "split")
     others = [

@@ -18,7 +18,7 @@ from gsparc.commands.compare.cells import Cell, Contender
 from gsparc.commands.compare.command import _may_match, _timed, fill_all
 from gsparc.commands.compare.fitting import Filled, Prepared, prepare
 from gsparc.commands.compare.problem import Problem, SplitChoice, split_choices, stored_problems
-from gsparc.methods.checkpoint import CheckpointError
+from gsparc.models.checkpoint import CheckpointError
 
 ROOT = Path(__file__).parents[3]
 

@@ -12,8 +12,8 @@ from gsparc.commands.compare import latency
 from gsparc.commands.compare.cells import Cell
 from gsparc.commands.compare.fitting import Filled
 from gsparc.commands.compare.problem import Problem
-from gsparc.methods import timing
-from gsparc.methods.method import Prediction
+from gsparc.models.method import Prediction
+from gsparc.prediction import timing
 
 WAITS = {"quick": 0.0, "slow": 0.2, "endless": 0.7}  # [s]
 

@@ -11,7 +11,7 @@ from campaigns import compose, spectra
 from hydra.core.hydra_config import HydraConfig
 
 from gsparc.commands.study.command import study_of, task
-from gsparc.training.terms import EffectSettings
+from gsparc.models.terms import EffectSettings
 
 PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
 LINES = {

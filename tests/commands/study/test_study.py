@@ -12,12 +12,12 @@ from invented import divide, invent
 from gsparc.commands.study.kinds import Measured, Positions
 from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.commands.study.study import Study, Variant
-from gsparc.methods import timing
-from gsparc.methods.gp import GaussianProcess
-from gsparc.methods.mean import Mean
-from gsparc.methods.method import FitContext, FitReport
-from gsparc.methods.nearest import Nearest
-from gsparc.methods.timing import ClockSettings
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.baselines.mean import Mean
+from gsparc.models.baselines.nearest import Nearest
+from gsparc.prediction import timing
+from gsparc.prediction.timing import ClockSettings
+from gsparc.training.context import FitContext, FitReport
 
 CONTEXT = FitContext(Path("not-written"), seed=5, budget_s=7.0)
 CLOCK = ClockSettings(rounds=10, budget_s=2)

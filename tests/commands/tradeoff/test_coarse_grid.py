@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.methods.coarse_grid import Filled, coarser
+from gsparc.models.coarse_grid import Filled, coarser
 from gsparc.ops import SphereGrid
 
 
@@ -44,6 +44,6 @@ def test_columns_that_cannot_be_divided_are_refused():
 
 @pytest.fixture
 def steady():
-    from gsparc.methods.mean import Mean
+    from gsparc.models.baselines.mean import Mean
 
     return Mean()

@@ -18,10 +18,11 @@ import gsparc
 from gsparc.commands.tradeoff.command import _alone, task
 from gsparc.commands.tradeoff.sweep import Recorded, closeness
 from gsparc.evaluation.scores import score
-from gsparc.methods import checkpoint, operating_point, stored_front
-from gsparc.methods.distance_law import DistanceLaw
-from gsparc.methods.pareto import Point
-from gsparc.methods.timing import ClockSettings, interleaved
+from gsparc.models import checkpoint
+from gsparc.models.baselines.distance_law import DistanceLaw
+from gsparc.models.pareto import Point
+from gsparc.prediction import operating_point, stored_front
+from gsparc.prediction.timing import ClockSettings, interleaved
 from gsparc.training import tracking
 
 

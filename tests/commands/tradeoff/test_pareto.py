@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gsparc.commands.tradeoff.picture import Other, beaten_by, draw
 from gsparc.evaluation.drawing import look
-from gsparc.methods.pareto import Point, cost_of_halving, front, worded
+from gsparc.models.pareto import Point, cost_of_halving, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 

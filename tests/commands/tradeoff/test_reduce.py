@@ -12,19 +12,19 @@ import torch
 from boxes import room_of_spectra
 from campaigns import brief, channels, compose
 
-from gsparc.array.method import ArrayField
-from gsparc.array.moving.method import MovingArrayField
-from gsparc.array.moving.triangulate import SearchSettings
 from gsparc.commands.train import train
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
-from gsparc.methods import reduced
-from gsparc.methods.gp import GaussianProcess
-from gsparc.methods.mean import Mean
-from gsparc.methods.method import FitContext
-from gsparc.multipath.image_source_gp import ImageSourceGP
-from gsparc.training import reduce as field_reduce
+from gsparc.models import reduced
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.baselines.mean import Mean
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.moving_array.method import MovingArrayField
+from gsparc.models.moving_array.triangulate import SearchSettings
+from gsparc.models.splat import reduce as field_reduce
+from gsparc.models.splat.array import ArrayField
+from gsparc.training.context import FitContext
 
 
 def answer(method, data, rows):

@@ -1,6 +1,6 @@
 """Hostile and damaged checkpoints at the doors that read them: nothing executes, one line says why.
 
-Remedy: gsparc/methods/checkpoint.py (weights-only unpickling, only classes of gsparc are built). Each hostile file
+Remedy: gsparc/models/checkpoint.py (weights-only unpickling, only classes of gsparc are built). Each hostile file
 would leave a mark; no mark may appear. Naive: `pickle.load` and `torch.load(weights_only=False)` leave it.
 """
 # ruff: noqa: E501 (a case is a row of a table)
@@ -30,11 +30,11 @@ from gsparc.commands.train import main as train
 from gsparc.data.errors import DataError
 from gsparc.data.load import load, split_for
 from gsparc.data.position_encoder.store import load as load_encoder
-from gsparc.methods import checkpoint
-from gsparc.methods.checkpoint import CheckpointError
-from gsparc.methods.method import FitContext
-from gsparc.methods.registry import build
-from gsparc.multipath.search_cache import SearchCache
+from gsparc.models import checkpoint
+from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.image_sources.search_cache import SearchCache
+from gsparc.models.registry import build
+from gsparc.training.context import FitContext
 
 evaluate = COMMANDS["evaluate"].run
 
@@ -74,8 +74,8 @@ def sound(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("sound")
     file = spectra(folder / "own.npz")
     data = load({"name": "own", "file": str(file)})
-    config = "model: {_target_: gsparc.methods.idw.InverseDistance}\n"
-    method = build({"_target_": "gsparc.methods.idw.InverseDistance"})
+    config = "model: {_target_: gsparc.models.baselines.idw.InverseDistance}\n"
+    method = build({"_target_": "gsparc.models.baselines.idw.InverseDistance"})
     method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(folder))
     checkpoint.save(folder / "m.ckpt", method, config)
     return folder / "m.ckpt", file
@@ -129,16 +129,16 @@ def test_commands_refuse_them_in_one_line(sound, tmp_path, name):
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "builtins.exec", "pathlib.Path.touch", "gsparc.methods.checkpoint.os.system", "gsparc.data.load.log",
-     "torch.load", "gsparc.methods.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
+    ["os.system", "builtins.exec", "pathlib.Path.touch", "gsparc.models.checkpoint.os.system", "gsparc.data.load.log",
+     "torch.load", "gsparc.models.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
 )  # fmt: skip
 def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
     mark = tmp_path / MARK
     config = f"model: {{_target_: '{target}', _args_: ['{mark}']}}\n"
     for name, changes in {
         "named": {"config": config, "target": target},
-        "nested": {"config": f"model: {{_target_: gsparc.methods.idw.InverseDistance, power: {config[7:-1]}}}\n",
-                   "target": "gsparc.methods.idw.InverseDistance"},
+        "nested": {"config": f"model: {{_target_: gsparc.models.baselines.idw.InverseDistance, power: {config[7:-1]}}}\n",
+                   "target": "gsparc.models.baselines.idw.InverseDistance"},
     }.items():  # fmt: skip
         path = altered(sound[0], tmp_path / f"{name}.ckpt", **changes)
         with pytest.raises(CheckpointError) as refused:
@@ -158,7 +158,7 @@ def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
         ({"site": None}, "incomplete"),
         ({"state": [1, 2]}, "incomplete"),
         ({"state": {}}, "cannot be restored"),
-        ({"target": "gsparc.methods.gp.GaussianProcess", "config": ""}, "cannot be restored"),
+        ({"target": "gsparc.models.baselines.gp.GaussianProcess", "config": ""}, "cannot be restored"),
         ({"config": "model: ["}, "not YAML"),
         ({"config": "a: !!python/object/apply:os.system ['true']"}, "not YAML"),
     ],
@@ -244,7 +244,7 @@ def test_a_deflated_entry_is_not_inflated(sound, tmp_path):
 def test_aliases_in_a_stored_configuration_are_refused(sound, tmp_path):
     """Nine levels of nine aliases, 300 bytes, had no end in 200 s."""
     levels = [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}' if i else 'x'] * 9)}]\n" for i in range(9)]
-    config = "".join(levels) + "model: {_target_: gsparc.methods.idw.InverseDistance}\n"
+    config = "".join(levels) + "model: {_target_: gsparc.models.baselines.idw.InverseDistance}\n"
     path = altered(sound[0], tmp_path / "aliases.ckpt", config=config)
     assert_refused_everywhere(path, sound[1], tmp_path / "run", "aliases")
 

@@ -1,0 +1,145 @@
+"""Kernel length and noise of the vector GP by cross-validation with a gap around each held-out sample.
+
+Plain leave-one-out tests interpolation over millimetres only and picks a length that fails beyond them. Here
+each sample is predicted without all others within a gap, for several gaps; the score is the PSNR of the
+spectra, averaged over samples and gaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+from gsparc.field.confidence import fit_errors
+from gsparc.models.array_vectors.vector_gp import align, refine_alignment
+from gsparc.models.left_out_images import LeftOut, mean_log_error, predict_left_out
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import SmoothRough
+
+GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
+PIXELS = 600  # drawn from the grid: the score needs no more
+ROWS = 384  # neighbouring samples used: the inverse costs their cube
+CENTRES = 160  # of them predicted
+STEPS = 36  # evaluations of Nelder-Mead
+STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The chosen kernel and its held-out errors.
+
+    Attributes:
+        kernel: length and noise.
+        unknown: (k,) posterior variance of each held-out prediction, as a share of the prior's.
+        error: (k,) mean squared error of its spectrum.
+        left_out: the held-out predictions; None for too few samples.
+    """
+
+    kernel: SmoothRough
+    unknown: np.ndarray
+    error: np.ndarray
+    left_out: LeftOut | None = None
+
+    def error_model(self) -> tuple[float, float]:
+        """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
+
+        See `fit_errors`.
+        """
+        return fit_errors(self.unknown, self.error)
+
+
+def tune(
+    vectors: np.ndarray,
+    positions: np.ndarray,
+    images: np.ndarray,
+    matrix: np.ndarray,
+    wavelength: float,
+    partner: np.ndarray | None,
+    seed: int = 0,
+) -> Tuned:
+    """Choose a kernel.
+
+    Args:
+        vectors: (n, M) complex, phases and twins unknown.
+        positions: (n, 3) [m].
+        images: (n, P) in [0, 1].
+        matrix: (M, P) steering.
+        wavelength: [m].
+        partner: of `mirror_elements`.
+        seed: of the neighbourhood, the predicted samples and the pixels.
+    """
+    rng = np.random.default_rng([seed, 3])
+    background = images.mean(0, dtype=np.float64)
+    if len(positions) > ROWS:
+        centre = positions[rng.integers(len(positions))]
+        rows = np.argsort(np.linalg.norm(positions - centre, axis=1))[:ROWS]
+        vectors, positions, images = vectors[rows], positions[rows], images[rows]
+    pixels = rng.choice(images.shape[1], min(PIXELS, images.shape[1]), replace=False)
+    samples = _Samples(
+        images=images[:, pixels].astype(np.float64),
+        matrix=matrix[:, pixels].conj(),
+        background=background[pixels] ** 2,
+        centres=np.sort(rng.permutation(len(positions))[:CENTRES]),
+        gaps=np.array(GAPS) * wavelength,
+        distance=cdist(positions, positions),
+    )
+    aligned = align(vectors, positions, partner)
+
+    def kernel_at(parameters: np.ndarray) -> SmoothRough:
+        length, noise = np.exp(np.clip(parameters, np.log([0.02, 1e-4]), np.log([5.0, 1.0])))
+        return SmoothRough.of_one(float(length * wavelength), float(noise))
+
+    def inverse_of(kernel: SmoothRough) -> np.ndarray:
+        return Factor.of(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
+
+    def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
+        kernel = kernel_at(parameters)
+        inverse = inverse_of(kernel)
+        found = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
+        return mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
+
+    if len(positions) < 4:
+        return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
+    first = min((np.log(start) for start in STARTS), key=objective)
+    refined = refine_alignment(aligned, inverse_of(kernel_at(first)), partner)
+    found = minimize(
+        objective, first, args=(refined,), method="Nelder-Mead",
+        options={
+            "maxfev": STEPS, "xatol": 0.03, "fatol": 1e-3,
+            "initial_simplex": first + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, -1.0]]),
+        },
+    )  # fmt: skip
+    kernel = kernel_at(found.x)
+    inverse = inverse_of(kernel)
+    unknown, predicted = samples.predictions(kernel, inverse, refine_alignment(refined, inverse, partner))
+    error = samples.error(predicted)
+    seen = ~np.isnan(error)
+    left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
+    return Tuned(kernel, unknown[seen], error[seen], left_out)
+
+
+@dataclass(frozen=True)
+class _Samples:
+    images: np.ndarray
+    matrix: np.ndarray
+    background: np.ndarray
+    centres: np.ndarray
+    gaps: np.ndarray
+    distance: np.ndarray
+
+    def predictions(
+        self, kernel: SmoothRough, inverse: np.ndarray, vectors: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Posterior variance (g, c) and spectra (g, c, P) of held-out samples; NaN where no other is left."""
+        mean, variance = predict_left_out(inverse, vectors, self.distance, self.centres, self.gaps)
+        unknown = np.clip(variance - kernel.noise, 0.0, 1.0)
+        power = np.abs(mean @ self.matrix) ** 2 + unknown[..., None] * self.background
+        return unknown, np.sqrt(power)
+
+    def error(self, predicted: np.ndarray) -> np.ndarray:
+        """(g, c) mean squared."""
+        return ((predicted - self.images[self.centres]) ** 2).mean(-1)

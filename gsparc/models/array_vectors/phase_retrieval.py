@@ -1,0 +1,243 @@
+"""The complex vectors behind published spectra: least squares on lags, then Levenberg-Marquardt.
+
+A spectrum `g |A^H h| + o` (gain g absorbed into h, offset o only when the minimum was subtracted) fixes h up
+to a global phase and, for arrays symmetric about a point, its twin `conj(h)` in reversed element order.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsparc.data.schema import Site
+from gsparc.physics.array_response import lags
+from gsparc.processes.factor import Factor
+from gsparc.training.time_budget import TimeBudget
+
+log = logging.getLogger(__name__)
+
+SEEDED = 4  # one row in this many starts at random, the others from their solved neighbours
+NEIGHBOURS = 4  # solved neighbours that a row starts from
+STARTS = (24, 48, 96, 384)  # random starts of the rows still unsolved, round by round
+SCREENING = 12  # iterations, after which only the best eighth of the starts continues
+ITERATIONS = 60
+FINAL_ITERATIONS = 12  # from every solution
+ENOUGH = 1.0  # a residual within the lags this many quantisation errors large is consistent with zero
+SUSPECT = 4.0  # misfit over quantisation error above which an image is reported
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """Array vectors of n spectra.
+
+    Attributes:
+        vectors: (n, M) complex128, scaled so that `|A^H h|` is the published spectrum (plus `offset`).
+        offset: (n,) what was subtracted before publishing; 0 unless the normalisation is `minmax`.
+        residual: (n,) root mean square over pixels of `|A^H h|^2 - image^2`, the part inside the lags.
+        floor: (n,) the same for the part that no array vector can explain.
+        expected: (n,) the same as quantisation alone would make it.
+        time_limited: (n,) bool: seconds ended the search, so that another machine's result may differ.
+    """
+
+    vectors: np.ndarray
+    offset: np.ndarray
+    residual: np.ndarray
+    floor: np.ndarray
+    expected: np.ndarray
+    time_limited: np.ndarray
+
+    @property
+    def suspect(self) -> np.ndarray:
+        """(n,) bool: the array cannot have measured this image, or the solver did not converge."""
+        return np.hypot(self.residual, self.floor) > SUSPECT * self.expected
+
+
+def recover(
+    site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, budget_s: float = 120.0
+) -> Recovered:
+    """Array vectors of spectra.
+
+    Args:
+        site: array, wavelength, grid and normalisation.
+        images: (n, H, W) uint8 (255 = 1) or float.
+        positions: (n, 3) [m] of the transmitter; neighbours start each other's search.
+        seed: of the random starts.
+        budget_s: every row is solved once from its neighbours or from random starts; no row is restarted
+            after this many seconds of the processor, because runs of either clock share the result (spectra
+            of another array never converge) [s].
+    """
+    budget, time_limited = TimeBudget(budget_s, "processor"), np.zeros(len(images), dtype=bool)
+    problem = _Problem.of(site, images)
+    generator = torch.Generator().manual_seed(seed)
+    n = len(images)
+    state, cost = torch.zeros(n, problem.unknowns, dtype=torch.float64), torch.full((n,), torch.inf).double()
+    enough = (ENOUGH * problem.expected) ** 2
+
+    def keep(rows: Tensor, found: tuple[Tensor, Tensor]) -> None:
+        better = found[1] < cost[rows]
+        state[rows[better]], cost[rows[better]] = found[0][better], found[1][better]
+
+    every = torch.arange(n)
+    order = torch.from_numpy(np.random.default_rng(seed).permutation(n))
+    for turn, starts in enumerate(STARTS):
+        unsolved = order[cost[order] > enough[order]]
+        if turn == 0:
+            unsolved = unsolved[: -(-n // SEEDED)]
+        if not len(unsolved):
+            break
+        if turn > 1 and budget.over():
+            time_limited[unsolved.numpy()] = True
+            break
+        for rows in unsolved.split(max(1, 1536 // starts)):
+            keep(rows, _search(problem, rows, problem.random(rows, starts, generator), enough))
+        while len(rows := every[cost > enough]):
+            solved = (cost <= enough).numpy()
+            near = _solved_neighbours(positions, rows.numpy(), solved)
+            if near is None:
+                break
+            before = int(solved.sum())
+            for part, around in zip(rows.split(256), near.split(256), strict=True):
+                keep(part, _search(problem, part, state[around].flatten(0, 1), enough))
+            if int((cost <= enough).sum()) - before < max(1, len(rows) // 20):
+                break
+        log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
+    for rows in every.split(512):
+        keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), FINAL_ITERATIONS))
+    return problem.result(state, cost, time_limited)
+
+
+def _solved_neighbours(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
+    """Rows (len(rows), <= NEIGHBOURS) of the nearest solved spectra; None when there is none."""
+    known = np.flatnonzero(solved)
+    if not len(known):
+        return None
+    wanted = np.arange(1, min(NEIGHBOURS, len(known)) + 1)
+    return torch.from_numpy(known[cKDTree(positions[known]).query(positions[rows], k=wanted)[1]])
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Sums of squares in whitened lag coordinates: `|v S v - (z2 + 2 o z1 + o^2 z0)|^2`.
+
+    Attributes:
+        forms: (2 M, K * 2 M) S for one product, K the number of lag numbers.
+        z2, z1: (n, K) lag coordinates of image^2 and image; z0: (K,) of the constant 1.
+        floor, expected: (n,) see Recovered.
+        offsets: whether o is unknown (else 0).
+    """
+
+    forms: Tensor
+    z2: Tensor
+    z1: Tensor
+    z0: Tensor
+    floor: Tensor
+    expected: Tensor
+    offsets: bool
+
+    @staticmethod
+    def of(site: Site, images: np.ndarray) -> _Problem:
+        assert site.array is not None and site.grid is not None and site.wavelength is not None
+        known = lags(site.array, site.wavelength)
+        basis = known.basis(site.grid, site.wavelength)
+        q, r = torch.linalg.qr(basis / len(basis) ** 0.5)
+        forms = torch.einsum("ij,jkl->ikl", r, known.forms())
+        projector = q / len(basis) ** 0.5
+        parts: list[list[Tensor]] = [[], [], [], []]
+        step = 1 / 255 if images.dtype == np.uint8 else 1e-4
+        for block in np.array_split(images, max(1, len(images) // 256)):
+            image = torch.from_numpy(block.reshape(len(block), -1)).double()
+            image = image / 255 if images.dtype == np.uint8 else image
+            z2, z1 = image.square() @ projector, image @ projector
+            outside = image.square().square().mean(1) - z2.square().sum(1)
+            # A rounding error e of the amplitude a is 2 a e of its square.
+            rounding = 2 * image.square().mean(1).sqrt() * step / 12**0.5
+            for part, value in zip(parts, (z2, z1, outside.clamp_min(0).sqrt(), rounding), strict=True):
+                part.append(value)
+        z2, z1, floor, expected = (torch.cat(part) for part in parts)
+        flat = forms.permute(1, 0, 2).reshape(len(forms[0]), -1).contiguous()
+        minmax = site.normalisation == "minmax"
+        return _Problem(flat, z2, z1, projector.sum(0), floor, expected.clamp_min(1e-9), minmax)
+
+    @property
+    def unknowns(self) -> int:
+        return len(self.forms) + (1 if self.offsets else 0)
+
+    def random(self, rows: Tensor, starts: int, generator: torch.Generator) -> Tensor:
+        """Starting points (len(rows) * starts, unknowns) of about the spectra's power."""
+        start = torch.randn(len(rows), starts, self.unknowns, generator=generator, dtype=torch.float64)
+        # z2[0] is the mean square of the image up to sign: the first whitened column is the constant.
+        start *= (self.z2[rows, :1].abs() / len(self.forms)).sqrt()[:, :, None]
+        return start.flatten(0, 1)
+
+    def residual(self, state: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors (B, K) and their slopes (B, K, unknowns)."""
+        v = state[:, : len(self.forms)]
+        half = (v @ self.forms).view(len(v), -1, v.shape[1])
+        error = torch.bmm(half, v[:, :, None]).squeeze(2) - self.z2[rows]
+        if not self.offsets:
+            return error, 2 * half
+        o = state[:, -1:]
+        error = error - 2 * o * self.z1[rows] - o.square() * self.z0
+        return error, torch.cat([2 * half, (-2 * self.z1[rows] - 2 * o * self.z0)[:, :, None]], 2)
+
+    def result(self, state: Tensor, cost: Tensor, time_limited: np.ndarray) -> Recovered:
+        m = len(self.forms) // 2
+        vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
+        offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
+        residual, floor, expected = (v.numpy() for v in (cost.sqrt(), self.floor, self.expected))
+        return Recovered(vectors, offset, residual, floor, expected, time_limited)
+
+
+def _search(
+    problem: _Problem, rows: Tensor, start: Tensor, enough: Tensor, iterations: int = ITERATIONS
+) -> tuple[Tensor, Tensor]:
+    """Best of several starts per row: state (n, unknowns) and sum of squared errors (n,).
+
+    Levenberg-Marquardt with all starts of all rows in one batch; after a few iterations only the best eighth
+    continues, and rows at the quantisation floor end.
+    """
+    n, starts = len(rows), len(start) // len(rows)
+    best = torch.zeros(n, problem.unknowns, dtype=torch.float64)
+    best_cost = torch.full((n,), torch.inf).double()
+    owner = torch.arange(n).repeat_interleave(starts)
+    state, damping = start.clone(), torch.full((len(start),), 1e-2, dtype=torch.float64)
+    error, slope = problem.residual(state, rows[owner])
+    cost = error.square().sum(1)
+    for iteration in range(iterations):
+        normal = slope.transpose(1, 2) @ slope
+        lift = damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-12
+        normal.diagonal(dim1=1, dim2=2).add_(lift[:, None])
+        step = Factor.of(normal, "ignore").solved(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
+        tried = state - step
+        new_error, new_slope = problem.residual(tried, rows[owner])
+        new_cost = new_error.square().sum(1)
+        better = new_cost < cost
+        state = torch.where(better[:, None], tried, state)
+        error = torch.where(better[:, None], new_error, error)
+        slope = torch.where(better[:, None, None], new_slope, slope)
+        cost = torch.where(better, new_cost, cost)
+        damping = torch.where(better, damping * 0.4, damping * 3).clamp(1e-9, 1e3)
+        stuck = damping >= 1e2
+        lowest = torch.full((n,), torch.inf).double().scatter_reduce(0, owner, cost, "amin")
+        improved = lowest < best_cost
+        least = torch.nonzero(cost <= lowest[owner]).squeeze(1)
+        first = torch.zeros(n, dtype=torch.int64).scatter_(0, owner[least], least)
+        best[improved], best_cost[improved] = state[first[improved]], lowest[improved]
+        done = best_cost <= enough[rows]
+        going = ~done[owner] & ~stuck
+        if iteration == SCREENING and starts > 8:
+            rank = torch.argsort(torch.argsort(cost + owner * (cost.max() + 1)))
+            count = torch.bincount(owner, minlength=n)
+            place = rank - (count.cumsum(0) - count)[owner]
+            going &= place < max(4, starts // 8)
+        if not going.any():
+            break
+        if not going.all():
+            state, error, slope, cost = state[going], error[going], slope[going], cost[going]
+            damping, owner = damping[going], owner[going]
+    return best, best_cost

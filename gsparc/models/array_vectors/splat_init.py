@@ -1,0 +1,159 @@
+"""A splatted field whose array vectors are the posterior of the vector process, in closed form.
+
+Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen plan.
+Emissions are linear in features of the process (`gsparc.processes.features`), whose weights give its
+posterior mean h(x) = phi(x) W: the emissions of least norm are phi(x) W G^+. The same features tell the
+unknown share.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import astuple, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.files import platform_cache
+from gsparc.data.schema import Measurements
+from gsparc.field.encoding import Prior
+from gsparc.field.frozen import seen_by_array
+from gsparc.field.initial import InitTask, Start
+from gsparc.field.model import GaussianModel
+from gsparc.field.response import ArrayResponse
+from gsparc.models.array_vectors.cross_validation import tune
+from gsparc.models.array_vectors.vector_cache import recovered, report
+from gsparc.models.array_vectors.vector_gp import aligned_by, aligned_to, mirror_elements
+from gsparc.models.left_out_images import LeftOut
+from gsparc.models.target_rows import to_real, training_targets
+from gsparc.ops import Pose
+from gsparc.physics.array_response import steering
+from gsparc.processes.covering import covering
+from gsparc.processes.features import whitened
+from gsparc.training.time_budget import Spent, TimeBudget
+
+log = logging.getLogger(__name__)
+
+MOST_ROWS = 5000  # spectra whose vectors are aligned as one, in their number cubed: more follow their nearest
+RIDGE = 1e-3  # of the largest singular value of G: bounds the norm of emissions
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What training spectra say about a field through their array.
+
+    Attributes:
+        prior: features of the emission.
+        weights: (E, M) complex128, features to array vectors.
+        background: (H, W) float32, the mean spectrum.
+        error: level and power of the field's `ErrorModel`.
+        left_out: training spectra predicted without their neighbours; None for too few.
+        elapsed, training: time of phase retrieval in this run, and when it was computed.
+        time_limited: whether seconds ended it.
+    """
+
+    prior: Prior
+    weights: Tensor
+    background: Tensor
+    error: tuple[float, float]
+    left_out: LeftOut | None
+    elapsed: Spent
+    training: Spent
+    time_limited: bool
+
+
+class ThroughArray:
+    """Gaussians whose emissions through the array are the posterior of its vectors; see `Initialiser`."""
+
+    def __call__(self, task: InitTask) -> Start:
+        """Retrieve the vectors of the training rows and fit their process.
+
+        Raises:
+            ValueError: no array, no rows, or an emission that is not linear in its features.
+        """
+        assert task.receiver is not None
+        if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
+            raise ValueError(
+                "init=vectors solves a linear read-out: set model.emission.hidden=0 and "
+                "model.attenuation.inverse_distance=false"
+            )
+        found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
+        return Start(
+            found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
+            astuple(found.elapsed), found.time_limited, found.left_out,
+        )  # fmt: skip
+
+
+def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Learned:
+    """Retrieve the vectors of the given rows (cached where known) and fit their process.
+
+    Args:
+        data: spectra of a static array.
+        rows: (n,) to learn from.
+        anchors: largest number of places that stand for them.
+        seed: of every random choice.
+        run_dir: for the report of phase retrieval.
+
+    Raises:
+        ValueError: the site declares no usable array, or there are no rows.
+    """
+    site = data.site
+    if site.array_problem is not None:
+        raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
+    if not len(rows):
+        raise ValueError("the training set is empty")
+    assert site.array is not None and site.grid is not None and site.wavelength is not None
+    watch = TimeBudget()
+    found, training = recovered(data, rows, platform_cache(), seed)
+    elapsed = watch.counted
+    report(found, data, rows, run_dir / "array_recovery.csv")
+    matrix = steering(site.array, site.grid, site.wavelength).numpy()
+    partner, places = mirror_elements(site.array), data.tx[rows]
+    core = covering(places, MOST_ROWS, seed)
+    images = to_real(training_targets(data, rows[core]), "spectrum")
+    tuned = tune(found.vectors[core], places[core], images, matrix, site.wavelength, partner, seed)
+    kernel = tuned.kernel
+    vectors = np.empty(found.vectors.shape, np.complex128)
+    vectors[core] = aligned_by(found.vectors[core], places[core], partner, kernel)
+    rest = np.setdiff1d(np.arange(len(rows)), core)
+    if len(rest):
+        log.info("array: %d of %d spectra, which cover the site, align the others", len(core), len(rows))
+        others = found.vectors[rest], places[rest]
+        vectors[rest] = aligned_to(*others, vectors[core], places[core], partner, kernel)
+    stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
+    features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
+    log.info(
+        "array: length %.3g m, noise %.2g of the field's variance, %d features of %d spectra",
+        kernel.length, kernel.noise, len(features.places), len(rows),
+    )  # fmt: skip
+    return Learned(
+        Prior(
+            features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
+        ),
+        features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
+        torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
+        tuned.error_model(),
+        tuned.left_out,
+        elapsed,
+        training,
+        bool(found.time_limited.any()),
+    )
+
+
+@torch.no_grad()
+def start(model: GaussianModel, found: Learned, receiver: Pose) -> None:
+    """Set what a fresh model emits, its mean spectrum and its errors to what was learned."""
+    response = model.response
+    assert isinstance(response, ArrayResponse)
+    view = seen_by_array(model, receiver)  # (N, M)
+    left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
+    damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(torch.finfo(size.dtype).tiny)
+    readout = found.weights @ ((right.mH * damped) @ left.mH)  # (E, N)
+    model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))
+    model.emission.bias2.zero_()
+    response.background = found.background
+    if model.error is not None:
+        model.error.set(*found.error)

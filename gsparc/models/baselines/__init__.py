@@ -1,0 +1,1 @@
+"""Plain methods: means, neighbours, interpolation, processes; what every model is read against."""

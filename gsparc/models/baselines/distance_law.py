@@ -1,0 +1,231 @@
+"""`model=distance_law`: received power falls with the logarithm of the distance, and with nothing else.
+
+The log-distance law of path loss, T. S. Rappaport, "Wireless Communications", 2nd ed. (2002), section 4.9,
+with residuals of Huber's density, Gaussian within `CORNER` scales and exponential beyond: an outlier bends
+little, and skewed shadowing is not cut off as Student's t cuts it (P. J. Huber, "Robust estimation of a
+location parameter", Ann. Math. Stat. 35 (1964)). Where nothing was heard the likelihood is that of a power
+below the level (J. Tobin, "Estimation of relationships for limited dependent variables", Econometrica 26
+(1958)).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.special import ndtr
+from torch import Tensor
+
+from gsparc.data.schema import Site
+from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.method import Prediction
+from gsparc.models.target_rows import entry_variance, to_real
+from gsparc.ops import Pose
+from gsparc.processes.powers import Rows
+from gsparc.processes.trend import TINY_M, Law, law_of_state
+from gsparc.processes.worker import stop_when_late
+
+EXPONENTS = (0.0, 8.0)  # bounds of n: 2 in free space, 6 through many walls
+USUAL, SPREAD = 3.0, 2.0  # mean and deviation of a prior on n, which only few rows notice
+CORNER = 3.0  # scales from which on the residuals' density is exponential
+FLOORS = 10  # candidates of d0
+SPREADS_DB = (0.05, 60.0)  # bounds of the scale of the residuals
+LOOKED_AT = 2_000  # rows that an unknown place is sought with
+STARTS = 6  # of that search, drawn at random, beside two that the powers suggest
+PARAMETERS = 3  # a, n and the scale
+
+
+def _moment(corner: float) -> tuple[float, float]:
+    """Integral of exp(-Huber's loss), and the variance of that density."""
+    edge, middle = math.exp(-(corner**2) / 2), math.sqrt(2 * math.pi) * math.erf(corner / math.sqrt(2))
+    mass = middle + 2 * edge / corner
+    return mass, (middle - 2 * corner * edge + 2 * edge * (corner + 2 / corner + 2 / corner**3)) / mass
+
+
+MASS, VARIANCE = _moment(CORNER)
+
+
+def law_variance(law: Law) -> float:
+    """Of a measurement about the law [dB^2]."""
+    return law.scale**2 * VARIANCE
+
+
+def log_below(z: np.ndarray) -> np.ndarray:
+    """Logarithm of the probability that a residual lies below z (n,) scales."""
+    tail = np.minimum(z, -CORNER)  # exponential: its logarithm is a line, however far out
+    far = CORNER**2 / 2 + CORNER * tail - math.log(CORNER)
+    edge = math.exp(-(CORNER**2) / 2) / CORNER
+    inside = ndtr(np.clip(z, -CORNER, CORNER)) - ndtr(-CORNER)
+    beyond = edge - np.exp(CORNER**2 / 2 - CORNER * np.maximum(z, CORNER)) / CORNER
+    near = edge + math.sqrt(2 * math.pi) * inside + beyond
+    return np.where(z < -CORNER, far, np.log(near)) - math.log(MASS)
+
+
+def misfit(residual: np.ndarray, silent: np.ndarray, scale: float) -> tuple[float, np.ndarray, float]:
+    """Negative log likelihood of residuals (n,) [dB], its slopes by each residual (n,) and by log(scale)."""
+    z = residual / scale
+    influence = np.clip(z, -CORNER, CORNER)
+    density = influence * (influence / 2 - z) - math.log(MASS)
+    below = log_below(z)
+    value = -float(np.where(silent, below, density - math.log(scale)).sum())
+    slope = np.where(silent, -np.exp(density - below), influence)
+    return value, slope / scale, float((~silent).sum() - (slope * z).sum())
+
+
+def _prior(exponent: float) -> tuple[float, float]:
+    """Negative logarithm of the exponent's prior and its slope."""
+    away = (exponent - USUAL) / SPREAD
+    return 0.5 * away**2, away / SPREAD
+
+
+def fit_line(decades: np.ndarray, rows: Rows, start: np.ndarray) -> tuple[float, np.ndarray]:
+    """Negative log posterior and its (level, exponent, log scale) for known decades (n,) of distance."""
+
+    def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
+        residual = rows.decibels - p[0] + 10 * p[1] * decades
+        value, slope, by_scale = misfit(residual, rows.silent, math.exp(p[2]))
+        prior, by_prior = _prior(p[1])
+        slopes = np.array([-slope.sum(), 10 * (slope * decades).sum() + by_prior, by_scale])
+        return value + prior, slopes
+
+    bounds = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB))]
+    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    return float(found.fun), found.x
+
+
+def _start(decades: np.ndarray, rows: Rows) -> np.ndarray:
+    """Level and scale by medians for the usual exponent, from what was heard where anything was."""
+    used = ~rows.silent if not rows.silent.all() else rows.silent
+    levels = rows.decibels[used] + 10 * USUAL * decades[used]
+    middle = float(np.median(levels))
+    scale = 1.5 * float(np.median(np.abs(levels - middle)))
+    return np.array([middle, USUAL, math.log(min(max(scale, 1.0), SPREADS_DB[1] / 2))])
+
+
+def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
+    """The law of largest likelihood; the floor is chosen by it too.
+
+    Args:
+        rows: at least one.
+        place: (3,) of the still end [m]; None where `rows.places` are of both ends.
+    """
+    at = None if place is None else (float(place[0]), float(place[1]), float(place[2]))
+    law = Law(0.0, USUAL, 0.0, 1.0, at)
+    places = torch.from_numpy(np.ascontiguousarray(rows.places, np.float64))
+    far = 10 ** law.decades(places).numpy()
+    # From the nearest row (no floor) to the median: beyond, half of the rows would tell nothing of n.
+    low, high = np.maximum(np.quantile(far, [0.0, 0.5]), TINY_M)
+    start = at_best = _start(np.log10(far), rows)
+    best = np.inf
+    for floor in np.unique(np.geomspace(low, high, FLOORS)):
+        value, found = fit_line(np.log10(np.maximum(far, floor)), rows, start)
+        if value < best:
+            best, at_best, law, start = value, found, replace(law, floor=float(floor)), found
+    count = int((~rows.silent).sum())
+    few = math.sqrt(count / max(count - PARAMETERS, 1)) if count else 1.0  # parameters swallow residuals
+    level, exponent, scale = (float(value) for value in at_best)
+    return replace(law, level=level, exponent=exponent, scale=math.exp(scale) * few)
+
+
+def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
+    """The place (3,) [m] of a still end that explains powers best, from several starts.
+
+    Heights above and below the places' own plane fit alike: one of the two is found.
+    """
+    rng = np.random.default_rng(seed)
+    if len(rows.places) > LOOKED_AT:
+        rows = rows.at(np.sort(rng.permutation(len(rows.places))[:LOOKED_AT]))
+    low, high = rows.places.min(0), rows.places.max(0)
+    size = max(float(np.linalg.norm(high - low)), TINY_M)
+    bounds = np.stack([low - size, high + size], 1)
+    loud = np.argsort(np.where(rows.silent, -np.inf, rows.decibels))[::-1]
+    starts = [rows.places[loud[0]], rows.places[loud[: max(1, len(loud) // 20)]].mean(0)]
+    starts += list(rng.uniform(low - size / 2, high + size / 2, (STARTS, 3)))
+    tiny = (1e-3 * size) ** 2  # a row on the very place must not decide alone
+
+    def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
+        towards = (p[3:] * size) - rows.places
+        squared = (towards**2).sum(1) + tiny
+        decades = 0.5 * np.log10(squared)
+        residual = rows.decibels - p[0] + 10 * p[1] * decades
+        value, slope, by_scale = misfit(residual, rows.silent, math.exp(p[2]))
+        prior, by_prior = _prior(p[1])
+        by_place = 10 * p[1] / math.log(10) * size * (slope / squared) @ towards
+        slopes = [-slope.sum(), 10 * (slope * decades).sum() + by_prior, by_scale, *by_place]
+        return value + prior, np.array(slopes)
+
+    limits = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB)), *(bounds / size)]
+    found = []
+    for place in starts:
+        place = place + 0.05 * size * (high - low <= 1e-3 * size)  # in the plane itself heights have no slope
+        decades = 0.5 * np.log10(((place - rows.places) ** 2).sum(1) + tiny)
+        start = np.concatenate([_start(decades, rows), place / size])
+        found.append(
+            minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late)
+        )
+    return min(found, key=lambda one: float(one.fun)).x[3:] * size
+
+
+def law_of(rows: Rows, site: Site) -> tuple[Law, tuple[str, ...]]:
+    """The law of powers at a site and what must be said of it: a place that nobody gave is estimated."""
+    if rows.places.shape[1] == 6:
+        return fit_law(rows, None), ()
+    if site.static_position is not None and np.isfinite(site.static_position).all():
+        return fit_law(rows, site.static_position), ()
+    place = seek_place(rows)
+    end = "transmitter" if site.static_end == "tx" else "receiver"
+    where = ", ".join(f"{value:.4g}" for value in place + site.origin)
+    return fit_law(rows, place), (f"the {end}'s place is not given; estimated from powers at ({where}) m",)
+
+
+class DistanceLaw(Interpolator):
+    """Powers by the distance between the moving and the still end, or between two moving ends."""
+
+    name = "distance_law"
+    uses_censored = True
+
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
+
+    def _learn_censored(
+        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+    ) -> tuple[str, ...]:
+        assert self.site is not None
+        if self.kind != "rssi":
+            raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
+        started = time.perf_counter()
+        decibels = to_real(targets, "rssi")[:, 0].astype(np.float64)
+        self.law, notes = law_of(Rows(positions, decibels, silent), self.site)
+        law = self.law
+        said = (
+            f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "
+            f"deviation {law_variance(law) ** 0.5:.3g} dB"
+            f" ({time.perf_counter() - started:.2g} s)"
+        )
+        return tuple(f"distance_law: {note}" for note in (said, *notes))
+
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        with torch.no_grad():
+            mean = self._mean(torch.from_numpy(queries))
+        variance = torch.full((len(queries),), law_variance(self.law))
+        return Prediction(mean, variance=entry_variance(variance, mean, self.kind))
+
+    def _mean(self, places: Tensor) -> Tensor:
+        return self._decode(self.law.mean(places)[:, None].float())
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean (B, 1) alone; see `Differentiable`."""
+        return self._mean(self._queries(tx, rx))
+
+    def _learned(self) -> dict[str, Any]:
+        return self.law.state()
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        found = law_of_state(state)
+        assert found is not None
+        self.law = found

@@ -1,0 +1,353 @@
+"""A Gaussian process on whole targets: one kernel shared by all entries, set by leave-one-out likelihood."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import eigh
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
+from torch import Tensor
+
+from gsparc.data.schema import Kind, Measurements
+from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.censored import silent
+from gsparc.models.coarse_grid import Filled
+from gsparc.models.haste import CHOSEN_ON
+from gsparc.models.method import Method, Prediction
+from gsparc.models.pareto import Settings
+from gsparc.models.powers.settings import MEANS, MeanName, fit_powers
+from gsparc.models.reduced import View
+from gsparc.models.target_rows import entry_variance, from_real, to_real, training_targets
+from gsparc.ops import Pose
+from gsparc.processes.covering import covering
+from gsparc.processes.density import by_left_out
+from gsparc.processes.kernel import Kernel, apart
+from gsparc.processes.nearest import Nearest, Sample, Values, given, most_likely
+from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
+from gsparc.processes.prior import Prior
+
+LOOKS = 40  # of a choice of settings
+LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
+STRONGEST = 32  # components that they are chosen by
+
+
+@dataclass(frozen=True)
+class Components:
+    """Principal components of n centred targets of D real numbers.
+
+    Attributes:
+        mean: (D,) float32, the mean target.
+        axes: (P, D) float32, orthonormal rows.
+        scores: (n, P) float64.
+        lost: mean square per real number that the P components leave out.
+    """
+
+    mean: np.ndarray
+    axes: np.ndarray
+    scores: np.ndarray
+    lost: float
+
+
+def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int = 2048) -> Components:
+    """All components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
+
+    Works through blocks of `block` entries, so that thousands of byte images never become floats at once.
+    """
+    n = len(targets)
+    flat = targets.reshape(n, -1)
+    blocks = [flat[:, i : i + block] for i in range(0, flat.shape[1], block)]
+    means, gram, energy = [], np.zeros((n, n)), 0.0
+    for part in blocks:
+        rows = to_real(part, kind).astype(np.float64)
+        means.append(rows.mean(0))
+        rows -= means[-1]
+        gram += rows @ rows.T
+        energy += float((rows**2).sum())
+    keep = max(1, min(limit, n - 1, sum(len(m) for m in means)))
+    values, vectors = eigh(gram, subset_by_index=[n - keep, n - 1])
+    solid = values > 1e-10 * max(values[-1], np.finfo(float).tiny)  # rounding noise has no axis
+    if not solid.any():  # one sample, or all alike
+        solid[-1] = True
+    values, vectors = values[solid], vectors[:, solid]
+    length = np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    axes = [(vectors / length).T @ (to_real(p, kind) - m) for p, m in zip(blocks, means, strict=True)]
+    mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
+    lost = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
+    return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
+
+
+def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
+    """Length and noise of largest leave-one-out likelihood, from three starting lengths.
+
+    Args:
+        positions: (n, 3) [m].
+        scores: (n, P) centred targets in an orthonormal basis.
+        entries: real numbers per target, P or more.
+    """
+    spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
+    if len(positions) < 3 or not scores.any():
+        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
+    bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
+    # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
+    starts = [Kernel.of_one(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
+    places, values = torch.from_numpy(positions), torch.from_numpy(scores)
+    distance = apart(places, places)
+    # The figures move by 1e-4 beyond so many looks.
+    return by_left_out(starts, distance, None, values, bounds, LOOKS, 1e-5, entries, bounded=False)[1]
+
+
+class GaussianProcess(Interpolator):
+    """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
+
+    Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows
+    where nothing was heard too (`gsparc.processes.powers`).
+
+    Args:
+        components: largest number of principal components kept; all of them when the training set is smaller.
+        mean: of powers: `constant`, `distance`, or `auto`, the one of larger leave-one-out likelihood.
+    """
+
+    name = "gp"
+    stored = ("mean", "axes", "lost")
+    uses_censored = True
+    powers: PowerProcess | None = None  # None: not powers
+    scores: Posterior | None = None  # of what is not
+
+    def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
+        if components < 1:
+            raise ValueError(f"gp: components must be at least 1, got {components}")
+        if mean not in MEANS:
+            raise ValueError(f"gp: mean={mean!r} is none of {', '.join(MEANS)}")
+        self.limit, self.about = components, mean
+
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        if self.kind == "rssi":
+            return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
+        if len(targets) > MOST_ROWS:
+            return self._learn_many(positions, targets)
+        self.powers = None
+        thinned: list[str] = []
+        parts = principal_components(targets, self.kind, self.limit)
+        looked_at: np.ndarray | slice = slice(None)
+        if len(targets) > CHOSEN_ON:
+            thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
+            looked_at = draw(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        kernel = choose_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
+        self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
+        self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
+        self.lost = parts.lost
+        notes = [f"gp: length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"]
+        if parts.lost > 0 and len(parts.axes) == self.limit < len(targets) - 1:
+            notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
+        return (*notes, *thinned)
+
+    def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        """Of rows too many for one factor: components of rows that cover the site, scores by the nearest."""
+        kept = covering(positions, CHOSEN_ON, 0)
+        parts = principal_components(targets[kept], self.kind, self.limit)
+        start = choose_kernel(positions[kept], parts.scores, len(parts.mean))
+        scores, self.lost = projected(targets, self.kind, parts.mean, parts.axes)
+        kernel, said = kernel_given_nearest(positions, scores, len(parts.mean), start, 0)
+        once = torch.ones(len(scores), dtype=torch.float64)
+        self.scores = given(Prior(kernel), Values(positions, torch.from_numpy(scores), once), 0)
+        self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
+        basis = f"{len(parts.axes)} components of {len(kept)} rows, mean square left out {self.lost:.2e}"
+        told_by = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
+        settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
+        return tuple(f"gp: {note}" for note in (settings, said, told_by, basis))
+
+    def _learn_censored(
+        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+    ) -> tuple[str, ...]:
+        assert self.site is not None
+        rows = Rows(positions, to_real(targets, self.kind)[:, 0].astype(np.float64), silent)
+        self.powers, notes = fit_powers(rows, self.site, self.about)
+        return tuple(f"gp: {note}" for note in notes)
+
+    @property
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return approximated(self.name, self.scores if self.powers is None else self.powers.posterior)
+
+    def process(self) -> PowerProcess | None:
+        """See `HasProcess`."""
+        return None if self.powers is None else self.powers.exact()
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """See `Reconditions`; of powers alone."""
+        if self.powers is None:
+            return None
+        decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
+        found = copy.copy(self)
+        seen = Rows(data.moving[rows], decibels, silent(data, rows))
+        found.powers, _ = conditioned(seen, self.powers.trend, self.powers.kernel, 0)
+        return found
+
+    @torch.no_grad()
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        places = torch.from_numpy(queries)
+        if self.powers is not None:
+            decibels, spread, share = self.powers.answer(places)
+            power = self._decode(decibels[:, None].float())
+            return Prediction(power, (1 - share).float(), entry_variance(spread.float(), power, self.kind))
+        assert self.scores is not None
+        found, kernel = self.scores.answer(places), self.scores.prior.kernel
+        mean = self._decode(torch.addmm(self.mean, found.mean.float(), self.axes))
+        variance = (kernel.amplitude * found.left + self.lost).float()
+        sure = (1 - found.left / (1 + kernel.noise)).float()
+        return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean (B, ...) alone; see `Differentiable`. The variance is most of a prediction."""
+        queries = self._queries(tx, rx)
+        if self.powers is not None:
+            return self._decode(self.powers.mean_at(queries)[:, None].float())
+        assert self.scores is not None
+        return self._decode(torch.addmm(self.mean, self.scores.mean_at(queries).float(), self.axes))
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        if not isinstance(self.scores, Exact):
+            return ("confidence",)
+        return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Nothing: what a component contributes stands in the process."""
+        return {}
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
+        assert self.site is not None
+        if set(settings) <= {"confidence"} and settings.get("confidence", True):
+            return self
+        if not isinstance(self.scores, Exact):
+            return MeanAlone(self)
+        stride, grid = int(settings.get("stride", 1)), self.site.grid
+        count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
+        kept: Tensor | slice = slice(
+            None
+        )  # a view: the axes of thousands of images are hundreds of megabytes
+        if count < len(self.axes):
+            kept = self.scores.weights.square().sum(0).topk(count).indices
+        mean, axes, shape = self.mean, self.axes[kept], self.shape
+        if stride > 1:
+            assert grid is not None
+            parts = [part.unflatten(-1, shape)[..., ::stride, ::stride] for part in (mean, axes)]
+            shape = tuple(parts[0].shape)
+            mean, axes = (part.flatten(-2).contiguous() for part in parts)
+        lean = ReducedMean(self, mean, axes, self.scores, kept, shape)
+        return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
+
+    def _learned(self) -> dict[str, Any]:
+        if self.powers is not None:
+            return {"powers": self.powers.state()}
+        assert self.scores is not None
+        return {**super()._learned(), "scores": self.scores.state()}
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        self.powers, self.scores = None, None
+        if "powers" in state:
+            self.powers = PowerProcess.read(state["powers"])
+            return
+        super()._relearn(state)
+        self.scores = (Nearest if "level" in state["scores"] else Exact).read(state["scores"])
+
+
+def projected(
+    targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray, block: int = 256
+) -> tuple[np.ndarray, float]:
+    """Scores (n, P) float32 of stored targets (n, ...), and the mean square per real number beyond them.
+
+    `block` targets are floats at a time.
+    """
+    scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
+    for start in range(0, len(targets), block):
+        rows = to_real(targets[start : start + block], kind) - mean
+        scores[start : start + block] = found = rows @ axes.T
+        beyond += float((rows.astype(np.float64) ** 2).sum()) - float((found.astype(np.float64) ** 2).sum())
+    return scores, max(beyond, 0.0) / (len(targets) * len(mean))
+
+
+def kernel_given_nearest(
+    places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
+) -> tuple[Kernel, str]:
+    """Length and noise most likely given the nearest rows, by the strongest components, and a note.
+
+    Args:
+        places, scores: (n, D) [m] and (n, P) float32.
+        entries: real numbers of a target.
+        start: a kernel of one length, chosen on few rows.
+        seed: of rows that are drawn.
+    """
+    row = covering(places, LOOKED_AT, seed)
+    near = cKDTree(places).query(places[row], k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))[1]
+    own = np.argsort(near == row[:, None], axis=1, kind="stable")[:, : near.shape[1] - 1]
+    rows = np.c_[row, np.take_along_axis(near, own, 1)]
+    strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
+    values = torch.from_numpy(scores[rows][..., strong]).double()
+    sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
+    found = most_likely([start], sample, pdist(places[row]))
+    share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
+    said = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
+    return replace(found, amplitude=found.amplitude * len(strong) / entries * share), said
+
+
+class MeanAlone(View):
+    """The mean, without its variance."""
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        assert isinstance(self.inner, GaussianProcess)
+        return Prediction(self.inner.mean_at(tx, rx))
+
+
+class ReducedMean(View):
+    """The mean of a Gaussian process, without its variance.
+
+    Args:
+        inner: fitted.
+        mean, axes: (P,) and (C, P), the basis of targets.
+        scores: what the rows say of components; `kept` of them.
+        kept: see there.
+        shape: of a target.
+    """
+
+    def __init__(
+        self,
+        inner: GaussianProcess,
+        mean: Tensor,
+        axes: Tensor,
+        scores: Exact,
+        kept: Tensor | slice,
+        shape: tuple[int, ...],
+    ) -> None:
+        super().__init__(inner)
+        assert inner.site is not None
+        self._kind, self._site, self._shape = inner.site.kind, inner.site, shape
+        self._mean, self._axes = mean, axes
+        self._weights = scores.weights[:, kept].float().contiguous()
+        self._middle = scores.rows.mean(0).float()
+        self._scale = math.sqrt(3) / float(scores.prior.kernel.length)
+        self._places = (scores.rows.float() - self._middle) * self._scale
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; Matern-3/2 in float32."""
+        where = self._site.moving(tx, rx).expand(len(tx), -1)
+        query = (where - self._middle) * self._scale
+        far = torch.linalg.vector_norm(query[:, None] - self._places, dim=-1)  # cdist: three times slower
+        scores = ((1 + far) * torch.exp(-far)) @ self._weights
+        return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
+
+    def size(self) -> int:
+        """Components kept."""
+        return len(self._axes)

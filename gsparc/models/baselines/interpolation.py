@@ -1,0 +1,116 @@
+"""What all interpolating baselines share: rows, query axis, encoding, state."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+from torch import Tensor
+
+from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.censored import heard, left_out_note, silent
+from gsparc.models.method import Method, Prediction
+from gsparc.models.target_rows import from_real, training_targets
+from gsparc.ops import Pose
+from gsparc.training.context import FitContext, FitReport
+
+
+def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
+    """What a reader must know of channels of several runs that are learned as if they were of one."""
+    count = 0 if data.run is None or data.site.kind != "csi" else len(np.unique(data.run[rows]))
+    said = (
+        f"channels of {count} runs, each with a factor of its own, are taken as one; dataset.runs=[...] keeps"
+    )
+    return (f"{said} some, model=complex_gp learns the factors",) if count > 1 else ()
+
+
+class Interpolator(Method):
+    """Learns from `fold.train` and `fold.val` together (nothing is chosen on `val`) and looks up positions.
+
+    The query is the position of the moving end; orientations are not used.
+    """
+
+    both_ends = True
+    stored: ClassVar[tuple[str, ...]] = ()  # attributes that are learned, by their names in a checkpoint
+    shape: tuple[int, ...] = ()
+    seen = 0
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Fit on train and val rows; `ValueError` when there are none, or what it learned is not stored."""
+        known = np.concatenate([fold.train, fold.val])
+        rows = known if self.uses_censored else heard(data, known)
+        if not len(rows):
+            raise ValueError(f"{self.name}: the training set is empty")
+        start = time.perf_counter()
+        self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
+        places, targets, unheard = data.moving[rows], training_targets(data, rows), silent(data, rows)
+        before = set(vars(self))
+        if unheard.any():
+            notes = self._learn_censored(places, targets, unheard)
+        else:
+            notes = (*self._learn(places, targets), *left_out_note(data, known))
+        lost = sorted(set(vars(self)) - before - set(self.stored))
+        if lost and type(self)._relearn is Interpolator._relearn:
+            raise ValueError(
+                f"{self.name}: its checkpoint loses {', '.join(lost)}: name it in `stored` (tensor, number, "
+                "string) or make it again in `_relearn(state)`"
+            )
+        return FitReport(time.perf_counter() - start, (*notes, *_runs_note(data, known)))
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; `ValueError` before `fit` or `restore`."""
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        return self._look_up(self._queries(tx, rx).detach().numpy())
+
+    def _queries(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Places (B, 3) float64 [m] of the moving end, or (B, 6) of both."""
+        assert self.site is not None
+        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
+
+    def state(self) -> dict[str, Any]:
+        """Target shape, number of rows, and what the subclass learned."""
+        return {"shape": list(self.shape), "seen": self.seen, **self._learned()}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self.shape, self.seen = site, tuple(state["shape"]), int(state["seen"])
+        self._relearn(state)
+
+    def size(self) -> int:
+        """Number of stored training samples."""
+        return self.seen
+
+    @property
+    def kind(self) -> Kind:
+        """Of the targets that were learned."""
+        assert self.site is not None
+        return self.site.kind
+
+    def _decode(self, rows: Tensor) -> Tensor:
+        return from_real(rows, self.kind, self.shape)
+
+    @abstractmethod
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        """From positions (n, 3) float64 [m] and stored targets (n, ...); returns notes for the report."""
+
+    def _learn_censored(
+        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+    ) -> tuple[str, ...]:
+        """The same where nothing was heard in the rows `silent` (n,), whose targets are levels."""
+        raise NotImplementedError(f"{self.name}: learns nothing from rows where nothing was heard")
+
+    @abstractmethod
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        """Predict at (B, 3) float64 [m]."""
+
+    def _learned(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.stored}
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        """Inverse of what `stored` names; what cannot be stored is made again by who overrides this."""
+        for name in self.stored:
+            setattr(self, name, state[name])

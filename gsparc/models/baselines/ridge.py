@@ -1,0 +1,95 @@
+"""Ridge regression from the uplink's tones to the downlink's: one linear map, learned from all places."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.method import Prediction
+from gsparc.models.uplink.interface import UplinkMethod, rms
+from gsparc.training.context import FitContext, FitReport
+
+PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+
+
+class Ridge(UplinkMethod):
+    """Complex ridge regression; penalty and scaling are chosen on validation rows, then both are learned.
+
+    Args:
+        inputs: `own`: each antenna's downlink from its own uplink (26 to 26); `all`: from all antennas'.
+    """
+
+    name = "ridge"
+
+    def __init__(self, inputs: Literal["own", "all"] = "own") -> None:
+        if inputs not in ("own", "all"):
+            raise ValueError(f"ridge: inputs={inputs!r} is none of own, all")
+        self.inputs = inputs
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Solve the normal equations for each penalty and scaling, keep what validates best."""
+        started = time.perf_counter()
+        self.site = self._need_uplink(data)
+        best: tuple[float, float, bool] | None = None
+        for unit in (True, False):
+            normal = self._normal(data, fold.train, unit)
+            for penalty in PENALTIES:
+                self.maps, self.unit = _solve(*normal, penalty), unit
+                batch = data.batch(fold.val if len(fold.val) else fold.train)
+                assert batch.uplink is not None
+                miss = self.from_uplink(batch.uplink).mean - batch.target
+                value = float((_power(miss) / _power(batch.target)).log10().mean())
+                if best is None or value < best[0]:
+                    best = value, penalty, unit
+        assert best is not None
+        every = np.concatenate([fold.train, fold.val])
+        self.unit = best[2]
+        self.maps = _solve(*self._normal(data, every, self.unit), best[1])
+        note = f"ridge: penalty {best[1]:g}, rows {'of unit power' if best[2] else 'as they are'}"
+        return FitReport(time.perf_counter() - started, (note,))
+
+    def _normal(self, data: Measurements, rows: np.ndarray, unit: bool) -> tuple[Tensor, Tensor]:
+        """Gram matrices (M, F, F) and products with the targets (M, F, O)."""
+        batch = data.batch(rows)
+        assert batch.uplink is not None
+        scale = rms(batch.uplink) if unit else torch.ones(len(rows))
+        targets = batch.target.flatten(1)[:, None] if self.inputs == "all" else batch.target
+        x = (self._inputs(batch.uplink) / scale[:, None, None]).transpose(0, 1)
+        y = (targets / scale[:, None, None]).transpose(0, 1)
+        adjoint = x.transpose(1, 2).conj()
+        return adjoint @ x, adjoint @ y
+
+    def _inputs(self, uplink: Tensor) -> Tensor:
+        """(B, M, F): M maps of F inputs each."""
+        return uplink.flatten(1)[:, None] if self.inputs == "all" else self.own(uplink)
+
+    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+        """See `UplinkMethod.from_uplink`."""
+        assert self.site is not None and self.site.antennas is not None
+        mean = torch.einsum("bmf,mfo->bmo", self._inputs(uplink), self.maps)
+        return Prediction(mean.reshape(len(uplink), len(self.site.antennas), -1))
+
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        return {"maps": self.maps, "unit": self.unit, "inputs": self.inputs}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self.maps, self.unit, self.inputs = site, state["maps"], state["unit"], state["inputs"]
+
+
+def _solve(gram: Tensor, product: Tensor, penalty: float) -> Tensor:
+    level = torch.diagonal(gram, dim1=1, dim2=2).real.mean(1)
+    level = torch.where(level > 0, penalty * level, 1.0)  # a dead antenna has nothing to solve for
+    ridge = level[:, None, None] * torch.eye(gram.shape[1])
+    return torch.linalg.solve(gram + ridge, product)
+
+
+def _power(channel: Tensor) -> Tensor:
+    return channel.abs().square().mean((1, 2)).clamp_min(1e-30)

@@ -1,0 +1,76 @@
+"""What static ends have in common, for one that nothing was learned from but its place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.models.channels.columns import Group, Slot
+from gsparc.models.channels.covariance import Shape, Values, direct_wave, image_waves, prior
+from gsparc.physics.mirror_planes import images
+
+
+@dataclass(frozen=True)
+class Common:
+    """Gains of the direct wave and of images in shared planes (J,), and the level of ends.
+
+    Attributes:
+        gain: (J,) complex128 [m], the ends' mean times distances to the places' middle; of images the smaller
+            the less sure it is: small where phases are unrelated.
+        explained: (J,) [m^2] what knowing it takes from the power.
+        level: [m^2] power that covariances are in units of.
+    """
+
+    gain: Tensor
+    explained: Tensor
+    level: float
+
+    @staticmethod
+    def of(shape: Shape, values: Values, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
+        """From groups, their inverse covariances times targets (n, D), and scales."""
+        gains, levels = [], []
+        for group, alpha, scale in known:
+            waves, power, away = _waves(shape, values, group.slot, group.places)
+            gains.append(away * power * (waves.conj() @ alpha).mean(1))
+            levels.append(scale * float(_away(shape, values, group.slot)) ** 2)
+        each = torch.stack(gains)
+        count, gain = len(each), each.mean(0)
+        whole, mean = each.abs().square().mean(0), gain.abs().square()
+        steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
+        spread = (whole - steady) / count
+        sure = steady / (steady + spread).clamp_min(1e-300)
+        explained = steady * sure
+        # The direct wave stays: unsure as its gain may be, its shape is right.
+        sure[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
+        return Common(gain * sure, explained, sum(levels) / count)
+
+    def at(self, shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
+        before = self.level / _away(shape, values, slot) ** 2 * prior(shape, values, slot, places)
+        waves, _, away = _waves(shape, values, slot, places)
+        waves = waves / away[:, None]
+        after = before - self.explained @ waves.abs().square()
+        return self.gain @ waves, after.clamp_min(0), before
+
+
+def _waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Waves (J, n) of an end and its images, their powers (J,) and distances to the middle (J,) [m]."""
+    if not shape.direct:
+        none = places.new_zeros(0)
+        return places.new_zeros(0, len(places), dtype=torch.complex128), none, none
+    end = slot.end + values.offset
+    placed = torch.cat([end[None], images(end, values.planes, shape.sequences)])
+    away = torch.linalg.vector_norm(placed - shape.middle, dim=-1)
+    mirrors = image_waves(shape, values, slot, places)
+    power = [shape.of("direct", values.power), shape.of("source", values.power)]
+    return torch.cat([direct_wave(shape, values, slot, places)[None], mirrors]), torch.cat(power), away
+
+
+def _away(shape: Shape, values: Values, slot: Slot) -> Tensor:
+    """Distance () [m] of the end to the places' middle; 1 where no wave of it is known."""
+    if not shape.direct:
+        return torch.ones((), dtype=torch.float64)
+    return torch.linalg.vector_norm(slot.end + values.offset - shape.middle)

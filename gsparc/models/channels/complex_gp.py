@@ -1,0 +1,253 @@
+"""`model=complex_gp`: a Gaussian process on complex channels from the carrier alone, without sources.
+
+Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R. K. Cook et al., "Measurement
+of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2
+envelope over distance bounds the correlation. Real and imaginary parts share one kernel: the circular complex
+process. Rows of a run (`Measurements.run`) share an unknown complex factor, estimated by likelihood;
+predictions at places are those of the largest run, those of measured rows their own run's where it is known.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.blocks import taken
+from gsparc.data.links.stations import numbered
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.image_sources.run_factors import RunFactors, run_factors
+from gsparc.models.method import LeftOut, Method, Prediction
+from gsparc.ops import Pose
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.covering import covering
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import WaveKernel
+from gsparc.processes.nearest import Nearest, Values, given, solved
+from gsparc.processes.neighbourhood import Neighbourhood
+from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.prior import Prior
+from gsparc.training.context import FitContext, FitReport
+
+LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
+NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
+CHOSEN_ON = 1_000  # rows that length and noise are chosen on: each look factors a matrix
+MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is told by the nearest
+NEAREST = 100  # rows that tell of a query: waves from all around are not screened as shadows are
+TRIED_ON = 300  # of these, rows whose density given their neighbours chooses the settings
+ENTRIES = 64  # of their channels
+NAMED = 6  # factors of runs that a note gives
+
+
+class ComplexGP(Method):
+    """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid.
+
+    Where both ends move the covariance is the product of both ends'.
+    """
+
+    name = "complex_gp"
+    both_ends = True
+
+    def __init__(self) -> None:
+        self.site: Site | None = None
+        self.posterior: Posterior | None = None
+
+    @property
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return approximated(self.name, self.posterior)
+
+    @property
+    def kernel(self) -> WaveKernel:
+        """Its length, noise and power."""
+        kernel = self._fitted().prior.kernel
+        assert isinstance(kernel, WaveKernel)
+        return kernel
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
+        started = time.monotonic()
+        if data.site.kind != "csi" or data.site.wavelength is None:
+            raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
+        known = np.concatenate([fold.train, fold.val])
+        self.site, self.shape = data.site, tuple(data.target.shape[1:])
+        self.first = torch.arange(len(known))
+        one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
+        many = len(known) > MOST_ROWS and one_run
+        notes = self._fit_many(data, known) if many else self._fit_whole(data, known)
+        length, noise = float(self.kernel.length), self.kernel.noise
+        envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
+        return FitReport(time.monotonic() - started, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
+
+    def _kernels(self) -> Iterator[WaveKernel]:
+        assert self.site is not None and self.site.wavelength is not None
+        for length in LENGTHS:
+            for noise in NOISES:
+                yield WaveKernel(2 * math.pi / self.site.wavelength, length * self.site.wavelength, noise)
+
+    def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
+        """Rows (n,) with one factor, settings chosen on some; factors of runs."""
+        places, notes = torch.from_numpy(data.moving[known]), []
+        target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
+        names, run = np.unique(
+            np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
+        )
+        some = torch.arange(len(known))
+        if len(known) > CHOSEN_ON:
+            some = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(known))[:CHOSEN_ON]))
+            notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
+        looked_at = places[some], target[some], run[some.numpy()]
+        kernel = min(self._kernels(), key=lambda one: _aligned(one, *looked_at)[0])
+        _, conditioned, aligning = _aligned(kernel, places, target, run)
+        power = max(float((target * aligning[:, None]).abs().square().mean()), 1e-30)
+        prior = Prior(replace(kernel, amplitude=power))
+        self.posterior = Exact.of(prior, places, conditioned.values, None, conditioned.factor)
+        self.turned = 1 / aligning
+        first = torch.from_numpy(np.unique(run, return_index=True)[1])
+        self.runs = RunFactors(names.astype(np.int64), self.turned[first])
+        if len(names) > 1:
+            notes.append(self._factors_note(names, run))
+        return notes
+
+    def _fit_many(self, data: Measurements, known: np.ndarray) -> list[str]:
+        """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours.
+
+        A hundred nearest rows of one place, where a robot waited, tell of no other: its mean is taken once.
+        """
+        targets = torch.from_numpy(taken(data.target, known).reshape(len(known), -1))
+        place = torch.from_numpy(numbered(data.moving[known]))
+        _, first, count = np.unique(place.numpy(), return_index=True, return_counts=True)
+        self.first, counts = torch.from_numpy(first), torch.from_numpy(count).double()
+        means, scatter = targets, torch.zeros(len(count), dtype=torch.float64)
+        if len(count) == len(known):  # no copy of what may be gigabytes
+            self.first = torch.arange(len(known))
+        else:
+            means = torch.zeros(len(count), targets.shape[1], dtype=targets.dtype).index_add_(
+                0, place, targets
+            )
+            means /= counts[:, None].float()
+            scatter.index_add_(0, place, targets.abs().square().mean(1).double())
+            scatter = (scatter - counts * means.abs().square().mean(1)).clamp_min(0)
+        values = Values(data.moving[known[self.first.numpy()]], means, counts)
+        near = Neighbourhood.of(values.places, 0)
+        row = covering(values.places, TRIED_ON, 0)
+        rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
+        entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
+        sample = torch.from_numpy(values.places[rows]), means[rows][..., entries], counts[rows], scatter[row]
+        kernel = min(self._kernels(), key=lambda one: _density(one, *sample))
+        power = max(float(sample[1][:, 0].abs().square().mean()), 1e-30)
+        prior = Prior(replace(kernel, amplitude=power))
+        self.posterior = given(prior, values, 0, most=NEAREST)
+        self.turned, self.runs = torch.ones(1, dtype=torch.complex128), RunFactors.none()
+        of = f"of {len(count)} places, of" if len(count) < len(known) else "of"
+        by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
+        return [by, f"settings chosen on {len(row)} of them, each given its nearest"]
+
+    def _factors_note(self, names: np.ndarray, run: np.ndarray) -> str:
+        """A note of the factors of runs (n,), numbers into `names` (runs,)."""
+        factors = self.runs.factors.numpy()[:NAMED]
+        listed = ", ".join(
+            f"{name:g}: {abs(factor):.3g} at {np.degrees(np.angle(factor)):.0f} degrees"
+            for name, factor in zip(names, factors, strict=False)
+        )
+        more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        return f"factors of runs, relative to run {names[np.bincount(run).argmax()]:g}: {listed}{more}"
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        found, kernel = self._fitted().answer(self._moving(tx, rx)), self.kernel
+        share = found.left / (1 + kernel.noise)
+        mean = found.mean.to(torch.complex64).reshape(-1, *self.shape)
+        return Prediction(mean, (1 - share).float().clamp(0, 1), (kernel.amplitude * share).float())
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
+        return self.runs.restored(self.predict(batch.tx, batch.rx), batch.run)
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean alone (B, A, K) complex64; see `Differentiable`."""
+        mean = self._fitted().mean_at(self._moving(tx, rx))
+        return mean.to(torch.complex64).reshape(-1, *self.shape)
+
+    def leave_one_out(self) -> LeftOut:
+        """See `LeaveOneOut`; rows are those of the fit, counted from 0; of visits to a place, the first."""
+        posterior = self._fitted()
+        if isinstance(posterior, Exact):
+            residual, _ = posterior.residual()
+        else:
+            assert isinstance(posterior, Nearest)
+            residual = (posterior.rest - posterior.left_out()[0]).to(torch.complex128)
+        return LeftOut(self.first.numpy(), self.turned[:, None] * residual)
+
+    def _moving(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Places (B, 3) float64 [m] of the moving end, (B, 6) of both."""
+        assert self.site is not None
+        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
+
+    def _fitted(self) -> Posterior:
+        if self.posterior is None:
+            raise ValueError("complex_gp: not fitted yet; call fit or restore first")
+        return self.posterior
+
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        own = {"posterior": self._fitted().state(), "turned": self.turned, "first": self.first}
+        return {**own, **self.runs.state(), "shape": list(self.shape)}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self.shape = site, tuple(int(n) for n in state["shape"])
+        self.posterior = (Nearest if "level" in state["posterior"] else Exact).read(state["posterior"])
+        self.turned, self.first, self.runs = state["turned"], state["first"], RunFactors.read(state)
+
+    def size(self) -> int:
+        """Training samples kept."""
+        return 0 if self.posterior is None else len(self.posterior.places)
+
+
+def _aligned(
+    kernel: WaveKernel, places: Tensor, target: Tensor, run: np.ndarray
+) -> tuple[float, Conditioned, Tensor]:
+    """Negative log likelihood of the best power and runs' factors, channels given these, what aligns rows.
+
+    Args:
+        kernel: of unit power.
+        places, target, run: (n, D) [m], (n, R) complex128 and (n,) numbers.
+    """
+    gram = kernel.between(places, places)
+    gram.diagonal().add_(kernel.noise)
+    factor, aligning = Factor.of(gram), torch.ones(len(places), dtype=torch.complex128)
+    if len(np.unique(run)) > 1:
+        number = np.unique(run, return_inverse=True)[1]
+        aligning = torch.from_numpy(run_factors(factor.inverse.numpy(), target.numpy(), number)[number])
+        target = target * aligning[:, None]
+    conditioned = Conditioned(factor, target, factor.solved(target))
+    nll = math.log(max(conditioned.scale / 2, 1e-300)) + float(factor.log_determinant) / len(places)
+    return 0.5 * nll - float(aligning.abs().log().mean()), conditioned, aligning
+
+
+def _density(kernel: WaveKernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
+    """Negative log density of rows given their neighbours at the best power, visits to one place included.
+
+    Args:
+        kernel: of unit power.
+        at, values, counts: (T, 1 + k, D) [m], (T, 1 + k, R) and (T, 1 + k): rows first, then neighbours.
+        scatter: (T,) squares of visits about their mean.
+    """
+    covariance, noise = kernel.between(at, at), kernel.noise / counts
+    gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:])
+    weights, known = solved(gram, covariance[:, 0, 1:])
+    missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
+    variance, again = 1 + noise[:, 0] - known, float((counts[:, 0] - 1).sum())
+    power = float((missed.abs().square().mean(1) / variance).sum()) + float(scatter.sum()) / kernel.noise
+    unsure = float(variance.log().sum()) + again * math.log(kernel.noise)
+    count = len(at) + again
+    return math.log(max(power / count, 1e-300)) + unsure / count

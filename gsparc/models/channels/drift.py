@@ -1,0 +1,118 @@
+"""Noise that is correlated over the order of rows: clocks, temperature and bodies drift while rows are taken.
+
+Its powers are found with those of all other terms held, on a stretch of rows, since correlation over the
+order needs neighbours in it. At queries nothing of it is known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from gsparc.models.channels.columns import Group
+from gsparc.models.channels.covariance import Shape, Values, diffuse_fields, specular, temporal
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.left_out import groups_of
+from gsparc.processes.worker import stop_when_late
+
+STRETCH = 400  # rows looked at
+COLUMNS = 3  # groups looked at
+STEPS = 15
+SHARES = (0.3, 0.3, 1.0)  # of the white noise, where noise, fast and drift start
+LOWEST = 1e-5  # of the white noise
+
+
+def stretches(groups: tuple[Group, ...]) -> tuple[Group, ...]:
+    """At most `COLUMNS` groups, of `STRETCH` rows that follow each other."""
+    found = []
+    for number in np.unique(np.linspace(0, len(groups) - 1, min(COLUMNS, len(groups))).round().astype(int)):
+        group = groups[number]
+        order = torch.argsort(group.order, stable=True)
+        start = max(len(order) - STRETCH, 0) // 2
+        found.append(group.take(order[start : start + STRETCH]))
+    return tuple(found)
+
+
+def with_drift(
+    groups: tuple[Group, ...], signals: list[Tensor], shape: Shape, values: Values
+) -> tuple[Shape, Values, float]:
+    """The shape and values with correlated noise, and what evidence gains on `groups` [nats].
+
+    Args:
+        groups: see `stretches`.
+        signals: covariances (n, n) of theirs, see `signals_of`.
+        shape, values: without correlated noise.
+    """
+    noise = float(shape.of("noise", values.power)[0])
+    eye = [torch.eye(len(group), dtype=torch.float64) for group in groups]
+    terms = [[one, *temporal(values.envelope, group)] for one, group in zip(eye, groups, strict=True)]
+    before = sum(
+        _likelihood(signal, [one], np.array([noise]), group)[0]
+        for signal, one, group in zip(signals, eye, groups, strict=True)
+    )
+
+    def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        power = np.exp(logs)
+        both = [
+            _likelihood(signal, three, power, group)
+            for signal, three, group in zip(signals, terms, groups, strict=True)
+        ]
+        return sum(nll for nll, _ in both), np.sum([slope for _, slope in both], axis=0) * power
+
+    start = np.log(noise * np.array(SHARES))
+    bounds = [(math.log(noise * LOWEST), math.log(noise) + 5)] * 3
+    found = minimize(
+        objective,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": STEPS},
+        callback=stop_when_late,
+    )
+    fresh = replace(shape, correlated=True)
+    power = torch.cat([values.power.clone(), torch.zeros(2, dtype=torch.float64)])
+    for name, level in zip(("noise", "fast", "drift"), np.exp(found.x), strict=True):
+        power[fresh.where(name)] = float(level)
+    return fresh, replace(values, power=power), before - float(found.fun)
+
+
+def left_out_cells(group: Group, signal: Tensor, other: Tensor, cells: list[np.ndarray]) -> list[Tensor]:
+    """Errors (n, D) of rows whose signal is predicted without any of their cell, for each of some cells (n,).
+
+    Args:
+        group: rows.
+        signal: (n, n) covariance of the signal.
+        other: (n, n) covariance of what disturbs it.
+        cells: numbers (n,) of cells.
+    """
+    other = other.to(torch.complex128)
+    given = Conditioned.of(signal + other, group.target)
+    own = [None if len(np.unique(cell)) == len(cell) else groups_of(cell) for cell in cells]
+    return [given.left_out_signal(other, groups)[0] for groups in own]
+
+
+def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+    """Covariances (n, n) of the groups' signals."""
+    fields = diffuse_fields(groups, shape, values)
+    return [
+        field + specular(shape, values, group.slot, group.places, group.places)
+        for field, group in zip(fields, groups, strict=True)
+    ]
+
+
+def _likelihood(
+    signal: Tensor, terms: list[Tensor], power: np.ndarray, group: Group
+) -> tuple[float, np.ndarray]:
+    """Negative log likelihood with the scale profiled, and its slope by the terms' powers."""
+    covariance = signal + sum(float(level) * term for level, term in zip(power, terms, strict=True))
+    given = Conditioned.of(covariance, group.target)
+    count, outputs = group.target.shape
+    nll = outputs * (count * math.log(given.scale) + float(given.factor.log_determinant))
+    weight = outputs * given.factor.inverse - given.weights @ given.weights.mH / given.scale
+    return nll, np.array([float((term * weight.mT).sum().real) for term in terms])

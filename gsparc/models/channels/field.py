@@ -1,0 +1,449 @@
+"""A channel's Gaussian field in closed form, conditioned on measured rows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
+from gsparc.models.channels.columns import Group, Slot, asked, gather, of_runs, static_place
+from gsparc.models.channels.common import Common
+from gsparc.models.channels.covariance import (
+    Shape,
+    Values,
+    diffuse_fields,
+    diffuse_of,
+    directional,
+    disturbance,
+    explained,
+    prior,
+    specular,
+)
+from gsparc.models.image_sources.run_factors import RunFactors, aligning, run_quadratic
+from gsparc.ops import Pose
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.factor import Factor
+from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
+
+CHUNK = 2_000_000  # entries of a covariance that are held at a time
+ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
+CHECKED = 64  # rows that this is tried at
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A group's rows, and what its predictions are made of.
+
+    Attributes:
+        group: with targets in the phase and level of the largest run.
+        given: the targets given their covariance (n, n) complex128.
+        scale: power that the covariance is in units of.
+        noise: least variance of a prediction, in these units.
+        is_real: whether the covariance is.
+    """
+
+    group: Group
+    given: Conditioned
+    scale: float
+    noise: float
+    is_real: bool
+
+    @cached_property
+    def root(self) -> Tensor:
+        """(n, n), inverse of `lower`: real where that is, in single precision where variances allow it.
+
+        A row's covariances c with all rows, its noise included, have c^H C^-1 c = C_ii: that tells the error.
+        """
+        whole = self.given.factor.lower
+        lower = whole.real.contiguous() if self.is_real else whole
+        root = Factor(lower).root
+        few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
+        short = root.to(torch.float32 if self.is_real else torch.complex64)
+        found = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)
+        error = (found - few.abs().square().sum(1)).abs().max()
+        return short if float(error) <= ROUNDED * self.noise else root
+
+    def learned(self, cross: Tensor) -> Tensor:
+        """Variance (m,) that the rows take away from places of covariances (m, n) with them."""
+        cross = (cross.real if self.is_real else cross).to(self.root.dtype)
+        return (cross.conj() @ self.root.T).abs().square().sum(1)
+
+
+class ChannelField(ConditionalField):
+    """Leakage, direct wave, images and a diffuse field of a static end and one that moves.
+
+    Args:
+        site: kind csi, of a known carrier; one end static, or several stations.
+        shape: which terms there are.
+        values: where learning starts.
+        channel: (A, K) of the targets.
+
+    Attributes:
+        log_power: (P,) of `Shape.names`, relative to each group's scale.
+        log_envelope, log_gain: lengths [log m].
+        offset: (3,) of static ends [m].
+        towards, planes: (J,), (W, 4) see `Values`.
+    """
+
+    kind = "diffuse"
+    reads_rows = True
+
+    def __init__(self, site: Site, shape: Shape, values: Values, channel: tuple[int, int]) -> None:
+        super().__init__()
+        self.site, self.shape, self.channel = site, shape, channel
+        self.log_power = nn.Parameter(values.power.log())
+        self.log_envelope = nn.Parameter(values.envelope.log())
+        self.log_gain = nn.Parameter(values.gain.log())
+        self.offset = nn.Parameter(values.offset.clone())
+        # An empty parameter would have no slope.
+        self.towards = nn.Parameter(values.towards.clone()) if len(values.towards) else values.towards
+        self.planes = nn.Parameter(values.planes.clone()) if len(values.planes) else values.planes
+        self.weights: tuple[Weights, ...] = ()
+        self.stations: dict[int, list[Weights]] = {}
+        self.common: Common | None = None
+        self.rows = np.zeros(0, np.int64)
+        self.runs = RunFactors.none()
+
+    @property
+    def values(self) -> Values:
+        """The parameters as they are, differentiable."""
+        lengths = self.log_envelope.exp(), self.log_gain.exp()
+        return Values(self.log_power.exp(), *lengths, self.offset, self.towards, self.planes)
+
+    @property
+    def _held(self) -> Values:
+        """The parameters as they are, as constants."""
+        return Values(**{name: value.detach() for name, value in vars(self.values).items()})
+
+    @property
+    def apart(self) -> bool:
+        """Whether antennas and tones have covariances of their own."""
+        return self.shape.direct or self.count > 0
+
+    @property
+    def count(self) -> int:
+        """Images."""
+        return self.shape.count
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `mirrors`, `drift`."""
+        shape = self.shape
+        on = {
+            "residual": True,
+            "directions": len(shape.angles) > 0,
+            "leakage": shape.constant,
+            "direct": shape.direct,
+            "mirrors": len(shape.sequences) > 0,
+            "drift": shape.correlated,
+        }
+        return tuple(name for name, is_on in on.items() if is_on)
+
+    def objects(self) -> SiteObjects:
+        """The mirror planes that static ends share."""
+        planes = self.planes.detach().numpy()
+        return SiteObjects.of(planes=planes if len(planes) else None)
+
+    def loss(self, batch: Batch) -> Tensor:
+        """See `ConditionalField`; needs `condition` first, for the scales.
+
+        Raises:
+            ValueError: not conditioned yet.
+        """
+        moving, _, turned, nearest = asked(self.site, batch.tx, batch.rx)
+        station = self._numbers(batch.station, nearest)
+        target = batch.target.cpu().to(torch.complex128) / self.runs.of(batch.run)[:, None, None]
+        shape, values = self.shape, self.values
+        total, entries = torch.zeros(len(moving), dtype=torch.float64), torch.zeros(len(moving))
+        for known in self._conditioned():
+            slot = known.group.slot
+            here = torch.nonzero(station == slot.station).flatten()
+            if batch.mask is not None and len(here):
+                here = here[_entries(batch.mask.cpu(), here, slot).all(1)]
+            if not len(here):
+                continue
+            order = batch.index[here].double().cpu()
+            run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
+            places = slot.places(moving[here], turned[here])
+            group = Group(slot, here, places, _entries(target, here, slot), run, order)
+            error, variance = Conditioned.of(
+                _covariances((group,), shape, values)[0], group.target
+            ).left_out()
+            variance = known.scale * variance
+            density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
+            outputs = group.target.shape[1]
+            total = total.index_add(0, here, density * outputs / 2)
+            entries = entries.index_add(0, here, torch.full((len(here),), float(outputs)))
+        return total / entries.clamp_min(1)
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`; factors of runs are estimated by likelihood where there are several.
+
+        Raises:
+            ValueError: channels of another shape than the field's.
+        """
+        if tuple(data.target.shape[1:]) != self.channel:
+            raise ValueError(
+                f"channels of shape {tuple(data.target.shape[1:])}, the field has {self.channel}"
+            )
+        self.rows = np.asarray(rows)
+        runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
+        groups = gather(data, self.rows, self.apart)
+        with torch.no_grad():
+            self._solve(groups, runs, None)
+
+    def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
+        """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
+        shape, values = self.shape, self.values
+        all_factors = [Factor.of(covariance) for covariance in _covariances(groups, shape, values)]
+        if factors is None:
+            factors = torch.ones(len(runs), dtype=torch.complex128)
+            if len(runs) > 1:
+                factors = of_runs(_factors(groups, all_factors, len(runs)), groups)
+        self.runs = RunFactors(runs, factors)
+        found, noise = [], float(shape.of("noise", values.power))
+        for group, factor in zip(groups, all_factors, strict=True):
+            aligned = replace(group, target=group.target / factors[group.run][:, None])
+            given = Conditioned(factor, aligned.target, factor.solved(aligned.target))
+            found.append(Weights(aligned, given, max(given.scale, 1e-300), noise, shape.is_real))
+        self.weights = tuple(found)
+        self.stations = {}
+        for known in found:
+            self.stations.setdefault(known.group.slot.station, []).append(known)
+        heard = [(known.group, known.given.weights, known.scale) for known in found]
+        self.common = Common.of(shape, self._held, heard) if len(self.stations) > 1 else None
+
+    def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
+        """See `ConditionalField`; in the phase and level of the largest run.
+
+        Differentiable in the places, not in the parameters, which the weights depend on as well.
+
+        Args:
+            tx, rx: see `ConditionalField`.
+            station: (B,) int64 static ends; None takes those at the static places, the first of several at
+                one. Of one that no row was learned of, what ends have in common answers (`Common`).
+        """
+        moving, static, turned, nearest = asked(self.site, tx, rx)
+        station = self._numbers(station, nearest)
+        count, longest = len(moving), max(len(each.group) for each in self._conditioned())
+        parts = [
+            self._answer(moving[part], static[part], turned[part], station[part])
+            for part in torch.arange(count).split(max(CHUNK // longest, 1))
+        ]
+        mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
+        device = tx.device
+        return Posterior(
+            mean.to(device),
+            after.float().to(device),
+            share.to(device) if self.count else None,
+            (after / before.clamp_min(1e-300)).clamp(0, 1).float().to(device),
+        )
+
+    def _numbers(self, station: Tensor | None, nearest: Tensor) -> Tensor:
+        """Stations (B,) by number; a site of one end keeps no numbers, whatever its rows carry."""
+        return nearest if station is None or self.site.stations is None else station.cpu()
+
+    def answer(self, batch: Batch) -> Posterior:
+        """Answer rows of known stations, in the phase and level of their runs."""
+        found = self(batch.tx, batch.rx, batch.station)
+        if len(self.runs) == 1:
+            return found
+        factor = self.runs.of(batch.run).to(found.mean.device)
+        turned = factor[:, None, None].to(found.mean.dtype)
+        explained = None if found.explained is None else found.explained * turned
+        variance = found.variance * factor.abs().square().float()
+        return replace(found, mean=found.mean * turned, variance=variance, explained=explained)
+
+    def _answer(
+        self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Mean and images' share of it (B, A, K), variance after and before learning (B,)."""
+        shape, values, size = self.shape, self._held, math.prod(self.channel)
+        mean = torch.zeros(len(moving), *self.channel, dtype=torch.complex64)
+        share = torch.zeros_like(mean) if self.count else mean
+        after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
+        disturbed = sum(shape.of(name, values.power).sum() for name in ("noise", "fast", "drift"))
+        for alike in self._by_places(moving, turned, station):
+            slots, places, learned = (
+                [one.group.slot for one, _, _ in alike],
+                alike[0][2],
+                alike[0][0].group.places,
+            )
+            powers = directional(shape, values, slots)
+            fields = diffuse_of(shape, values, slots[0].wavenumber, powers, places, learned)
+            for number, (known, here, _) in enumerate(alike):
+                slot = slots[number]
+                cross = fields[min(number, len(fields) - 1)] + specular(shape, values, slot, places, learned)
+                slot.put(mean, here, known.given.mean(cross))
+                if self.count:
+                    slot.put(share, here, known.given.mean(explained(shape, values, slot, places, learned)))
+                weight = known.scale * known.group.target.shape[1] / size
+                whole = prior(shape, values, slot, places) + disturbed
+                after.index_add_(0, here, weight * (whole - known.learned(cross)).clamp_min(0))
+                before.index_add_(0, here, weight * whole)
+        unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
+        for place in static[unheard].unique(dim=0):
+            here = torch.nonzero(unheard & (static == place).all(1)).flatten()
+            self._of_unheard(place, here, moving, turned, mean, after, before)
+        return mean, share, after, before
+
+    def _by_places(
+        self, moving: Tensor, turned: Tensor, station: Tensor
+    ) -> list[list[tuple[Weights, Tensor, Tensor]]]:
+        """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
+        found: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
+        for number in station.unique().tolist():
+            here = torch.nonzero(station == number).flatten()
+            for known in self.stations.get(number, ()):
+                slot, learned = known.group.slot, known.group
+                places = slot.places(moving[here], turned[here])
+                first = learned.places[0].numpy().tobytes()
+                asked_at = places.detach().numpy().tobytes()
+                key = (slot.wavenumber, learned.displacements, first, asked_at)
+                found.setdefault(key, []).append((known, here, places))
+        return list(found.values())
+
+    def _of_unheard(
+        self,
+        place: Tensor,
+        here: Tensor,
+        moving: Tensor,
+        turned: Tensor,
+        mean: Tensor,
+        after: Tensor,
+        before: Tensor,
+    ) -> None:
+        """Write what ends have in common for queries `here` of a static end at `place` (3,)."""
+        assert self.common is not None
+        size, values = math.prod(self.channel), self._held
+        for template in next(iter(self.stations.values())):
+            slot = template.group.slot
+            slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
+            places = slot.places(moving[here], turned[here])
+            found, variance, prior_variance = self.common.at(self.shape, values, slot, places)
+            outputs = template.group.target.shape[1]
+            slot.put(mean, here, found[:, None].expand(-1, outputs))
+            after.index_add_(0, here, variance * outputs / size)
+            before.index_add_(0, here, prior_variance * outputs / size)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`; in the phase and level of each row's own run.
+
+        What rows have in common by their order alone is not predicted: no query has it.
+        """
+        shape, values = self.shape, self.values
+        mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
+        variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
+        with torch.no_grad():
+            for known in self._conditioned():
+                group, outputs = known.group, known.group.target.shape[1]
+                other = disturbance(shape, values, group).to(torch.complex128)
+                residual, error = known.given.left_out_signal(other)
+                assert error is not None
+                predicted = group.target - residual
+                group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
+                level = known.scale * outputs * self.runs.factors[group.run].abs().square()
+                variance.index_add_(0, group.rows, error * level)
+                entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
+        return LeftOutRows(self.rows, mean, (variance / entries.clamp_min(1)).float())
+
+    def _conditioned(self) -> tuple[Weights, ...]:
+        if not self.weights:
+            raise ValueError(
+                "the field of channels is not conditioned yet; call condition or initialise first"
+            )
+        return self.weights
+
+    def state(self) -> dict[str, Any]:
+        """See `ConditionalField`; factors are computed again by `restored`."""
+        groups = [each.group for each in self._conditioned()]
+        values = {name: value.detach() for name, value in self.named_parameters()}
+        return {
+            "shape": self.shape.state(),
+            "values": values,
+            "channel": list(self.channel),
+            "rows": torch.from_numpy(self.rows),
+            **self.runs.state(),
+            "groups": [
+                {**_parts(group), "slot": _stored(group.slot), "target": group.target * self._turn(group)}
+                for group in groups
+            ],
+        }
+
+    def _turn(self, group: Group) -> Tensor:
+        return self.runs.factors[group.run][:, None]
+
+
+def restored(site: Site, state: dict[str, Any]) -> ChannelField:
+    """The field whose `state()` this was."""
+    shape, kept = dict(state["shape"]), state["values"]
+    shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
+    lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
+    some = {name: kept[name] for name in ("towards", "planes") if name in kept}  # what is learned
+    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], **some)
+    antennas, tones = (int(n) for n in state["channel"])
+    field = ChannelField(site, Shape(**shape), values, (antennas, tones))
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            parameter.copy_(kept[name])
+    field.rows, runs = state["rows"].numpy(), RunFactors.read(state)
+    groups = []
+    for each in state["groups"]:
+        groups.append(Group(**{**each, "slot": _read(each["slot"])}))
+    with torch.no_grad():
+        field._solve(tuple(groups), runs.runs, runs.factors)
+    return field
+
+
+def _covariances(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+    """(n, n) complex128 of each group's rows with what disturbs them, relative to its scale."""
+    return [
+        field
+        + specular(shape, values, group.slot, group.places, group.places)
+        + disturbance(shape, values, group)
+        for field, group in zip(diffuse_fields(groups, shape, values), groups, strict=True)
+    ]
+
+
+def _stored(slot: Slot) -> dict[str, Any]:
+    """What `_read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
+    unknown = bool(slot.end.isnan().any())
+    return {**vars(slot), "end": slot.end[:0] if unknown else slot.end}
+
+
+def _read(state: dict[str, Any]) -> Slot:
+    end = state["end"] if len(state["end"]) else torch.full((3,), torch.nan, dtype=torch.float64)
+    entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
+    return Slot(**{**state, **entries, "end": end})
+
+
+def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:
+    """Entries (n, D) of a slot, of `rows` of (B, A, K)."""
+    return whole[rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(rows), -1)
+
+
+def _factors(groups: tuple[Group, ...], solved: list[Factor], runs: int) -> Tensor:
+    """Factors of runs (runs,), as measured over the largest one's."""
+    quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
+    for group, factor in zip(groups, solved, strict=True):
+        inverse, run = factor.inverse.numpy(), group.run.numpy()
+        level = float(group.target.abs().square().mean())
+        own = run_quadratic(inverse, group.target.numpy(), run) / max(level, 1e-300)
+        quadratic[: len(own), : len(own)] += own
+        size += np.bincount(run, minlength=runs) * group.target.shape[1]
+    heard = size > 0
+    factors = np.ones(runs, np.complex128)
+    factors[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
+    return torch.from_numpy(factors)
+
+
+def _parts(group: Group) -> dict[str, Any]:
+    """The attributes, without what was computed from them."""
+    return {one.name: getattr(group, one.name) for one in fields(group)}

@@ -1,0 +1,440 @@
+"""Which terms a field of channels has, and their powers, from training rows.
+
+The isotropic process comes first, chosen as `model=complex_gp` chooses. Every further term is kept where the
+marginal likelihood gains more than its parameters are worth (G. Schwarz, "Estimating the dimension of a
+model", Ann. Statist. 6 (1978)) and rows are predicted better without their neighbours: each alone, in 32
+cells of nearby places and in 8. Powers of many directions fit any field: theirs are those of other cells.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.models.channels import drift
+from gsparc.models.channels.columns import Group, ends_of, gather, of_runs, thinned
+from gsparc.models.channels.complex_gp import CHOSEN_ON, LENGTHS, NOISES
+from gsparc.models.channels.covariance import BEYOND, Shape, Values, disturbance
+from gsparc.models.channels.evidence import (
+    Compressed,
+    Kept,
+    compressed,
+    compressible,
+    evidence,
+    fit_all,
+    fit_powers,
+    left_out_cells,
+    normalised,
+    without,
+)
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.kernels import cells, directions, plain
+from gsparc.models.channels.mirrors import find_mirrors
+from gsparc.models.channels.offset import best_offset
+from gsparc.models.channels.settings import ChannelSettings
+from gsparc.models.haste import factor_s
+from gsparc.models.image_sources.run_factors import aligning, run_quadratic
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.factor import Factor
+from gsparc.processes.worker import Ended, ended_by
+from gsparc.training.time_budget import TimeBudget
+
+COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on at most
+ENDS = 64  # of several static ends, those that powers are learned on in the end
+CONCENTRATION = 8.0  # of each direction, that of a von Mises-Fisher density
+SHRINKAGE = 0.5  # of directions' powers towards their mean, in rows of the inverse Gamma prior
+FOLDS = 4  # of cells, whose directions' powers are found from the others
+DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
+GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
+LEAST = 1e-3  # of all powers: sources below are dropped
+NEW = 0.2  # of the isotropic field's power, where that of a new term starts
+SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
+ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
+DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
+WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
+GRID_SHARE = 0.2  # of the seconds, for the grid of envelopes and noises, which has fewer rows if need be
+FEWEST = 150  # of them, that a look is timed with, too
+MIRRORS_SHARE = 0.25  # of the seconds that are left, for mirror planes: directions come after them
+WEIGHTS = 2.0  # factors of all rows that the weights in the end take
+LENGTHS_SHARE = 0.5  # of the seconds, after which no further length is tried
+BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
+NO_WORSE = 1.1  # largest of any one of them
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Terms with their powers, and how well they do.
+
+    Attributes:
+        nll: negative log marginal likelihood [nats], the same rows for all candidates, plus what the
+            parameters must gain.
+        errors: squared errors, left out one by one and in the cells of `DEPTHS`, relative to the power.
+    """
+
+    shape: Shape
+    values: Values
+    nll: float
+    errors: np.ndarray
+
+    def beats(self, other: Candidate) -> bool:
+        """Whether likelihood and left-out places prefer this one."""
+        ratio = self.errors / other.errors
+        return self.nll < other.nll and bool(np.exp(np.log(ratio).mean()) < BETTER and ratio.max() < NO_WORSE)
+
+
+def initialise(
+    data: Measurements,
+    rows: np.ndarray,
+    settings: ChannelSettings,
+    budget: TimeBudget | None = None,
+) -> tuple[ChannelField, tuple[str, ...]]:
+    """A field conditioned on the rows, and notes about it.
+
+    Args:
+        data: kind csi.
+        rows: (n,) measurements to learn from.
+        settings: terms.
+        budget: before it is over no further term is tried, so that there is time for the weights.
+
+    Raises:
+        ValueError: the data are no channels of a known carrier with one static end.
+    """
+    rows, budget = np.asarray(rows), budget or TimeBudget()
+    start, factors, notes = _isotropic(data, rows, budget)
+    search = _Search.of(data, rows, settings, start, factors)
+    best, more = search.run(budget)
+    channel = (int(data.target.shape[1]), int(data.target.shape[2]))
+    field = ChannelField(data.site, best.shape, best.values, channel)
+    field.condition(data, rows)
+    # Steps on a few rows of each end would find less than the likelihood of all of them has.
+    field.requires_grad_(ends_of(search.every) == 1)
+    return field, (*notes, *more)
+
+
+def _isotropic(
+    data: Measurements, rows: np.ndarray, budget: TimeBudget
+) -> tuple[tuple[Shape, Values], Tensor, list[str]]:
+    """Envelope and noise on the grid of `complex_gp`, and the factors of runs, as measured."""
+    groups = gather(data, rows, False)
+    looked = thinned(groups, 8, CHOSEN_ON)
+    runs = 1 if data.run is None else len(np.unique(data.run[rows]))
+    wavelength = 2 * math.pi / groups[0].slot.wavenumber
+    few, began = thinned(looked, 8, FEWEST), budget.spent
+    _grid_point(few, [plain(g.places, g.places, g.slot.wavenumber, wavelength) for g in few], 1.0, runs)
+    given = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
+    most = (
+        int(FEWEST * (given / max(budget.spent - began, 1e-6)) ** (1 / 3)) if given < math.inf else CHOSEN_ON
+    )
+    if most < max(len(group) for group in looked):
+        budget.limited = True
+        looked = thinned(groups, 8, max(most, FEWEST))
+    tried = []
+    for length in LENGTHS:
+        bounded = [plain(g.places, g.places, g.slot.wavenumber, length * wavelength) for g in looked]
+        for noise in NOISES:
+            tried.append((*_grid_point(looked, bounded, noise, runs), length * wavelength, noise))
+    _, factors, length, noise = min(tried, key=lambda t: t[0])
+    everywhere = torch.cat([group.places for group in groups])
+    extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
+    none, reach = torch.zeros(0, 3, dtype=torch.float64), BEYOND * max(extent, wavelength)
+    shape = Shape(none, CONCENTRATION, False, False, False, everywhere.mean(0), reach)
+    one = torch.tensor([1.0, noise], dtype=torch.float64)
+    lengths = torch.tensor(length).double(), torch.tensor(GAINS[0] * wavelength).double()
+    values = Values(one, *lengths, torch.zeros(3, dtype=torch.float64))
+    note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
+    return (shape, values), factors, [note]
+
+
+def _grid_point(
+    groups: tuple[Group, ...], kernels: list[Tensor], noise: float, runs: int
+) -> tuple[float, Tensor]:
+    """Negative log likelihood with profiled scales, and factors of runs as measured."""
+    solved, total, size = [], np.zeros((runs, runs), np.complex128), np.zeros(runs)
+    for group, kernel in zip(groups, kernels, strict=True):
+        covariance = kernel.clone()
+        covariance.diagonal().add_(noise)
+        solved.append(Factor.of(covariance))
+        if runs > 1:
+            level = float(group.target.abs().square().mean())
+            run = group.run.numpy()
+            own = run_quadratic(solved[-1].inverse.numpy(), group.target.numpy(), run)
+            total[: len(own), : len(own)] += own / max(level, 1e-300)
+            size += np.bincount(run, minlength=runs) * group.target.shape[1]
+    factors = np.ones(runs, np.complex128)
+    heard = size > 0
+    if runs > 1:
+        factors[heard] = aligning(total[np.ix_(heard, heard)], size[heard])
+    turn, nll = of_runs(torch.from_numpy(factors), groups), 0.0
+    for group, factor in zip(groups, solved, strict=True):
+        target = group.target * turn[group.run][:, None]
+        count, outputs = target.shape
+        fit = Conditioned(factor, target, factor.solved(target)).scale
+        nll += outputs * (count * math.log(max(fit, 1e-300)) + float(factor.log_determinant))
+        nll -= 2 * outputs * float(turn.abs().log()[group.run].sum())
+    return nll, 1 / turn
+
+
+def _strongest(shape: Shape, values: Values) -> tuple[Shape, Values]:
+    """What all directions have in common, and weak ones, made part of the isotropic field."""
+    power, numbers = values.power, shape.where("direction")
+    beyond = power[numbers] - power[numbers].min()
+    everywhere = power[shape.where("isotropic") + numbers].sum()
+    strong = beyond > WEAKEST * everywhere
+    isotropic_power = everywhere - beyond[strong].sum()
+    rest = power[len(numbers) + 1 :]
+    kept = torch.cat([isotropic_power[None], beyond[strong], rest])
+    return replace(shape, angles=shape.angles[strong]), replace(values, power=kept)
+
+
+def _left_out(part: Compressed, power: Tensor) -> np.ndarray:
+    """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
+    places = part.group.places.numpy()
+    grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
+    return np.stack([left_out_cells(part, power, cell).abs().square().mean(1).numpy() for cell in grouping])
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What every candidate of a fit has in common."""
+
+    settings: ChannelSettings
+    groups: tuple[Group, ...]
+    every: tuple[Group, ...]
+    start: tuple[Shape, Values]
+    wavelength: float
+    kept: Kept
+
+    @staticmethod
+    def of(
+        data: Measurements,
+        rows: np.ndarray,
+        settings: ChannelSettings,
+        start: tuple[Shape, Values],
+        factors: Tensor,
+    ) -> _Search:
+        every = gather(data, rows, True)
+        every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
+        groups = thinned(every, COLUMNS, settings.rows)
+        if not compressible(groups[0], *start):
+            groups = thinned(every, DENSE_COLUMNS, min(settings.rows, DENSE_ROWS))
+        wavelength = 2 * math.pi / every[0].slot.wavenumber
+        return _Search(settings, groups, every, start, wavelength, Kept())
+
+    def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
+        """The terms that are kept, and notes; what the seconds end is as if it had not been tried."""
+        notes: list[str] = []
+        kept = [self._measured(*self.start, self._compressed(*self.start))]
+        longest = max(len(group) for group in self.every)
+        reserve = WEIGHTS * len(self.every) * factor_s(longest)  # for the weights in the end
+        end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
+        try:
+            with ended_by(partial(budget.over, end)):
+                self._grow(kept, notes, budget)
+        except Ended:
+            notes.append("waves: the seconds ended the search for terms")
+        return kept[-1], notes
+
+    def _grow(self, kept: list[Candidate], notes: list[str], budget: TimeBudget) -> None:
+        """Append what each further term makes of the last of `kept`."""
+        wanted = self.settings
+
+        def step(after: Candidate, name: str) -> None:
+            kept.append(self._step(kept[-1], after, name, notes))
+
+        step(self._fitted(*self.start), "powers by likelihood")
+        one_end = (
+            self.every[0].places.shape[1] == 3
+        )  # where both move, what waves have in common is not known
+        known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
+        direct = (known or not one_end) and wanted.direct
+        if direct or (wanted.constant and one_end):
+            step(self._with_fixed(kept[-1], direct, budget), "leakage and direct wave")
+        if wanted.mirrors and kept[-1].shape.direct and ends_of(self.every) > 1:
+            mirrored = self._with_mirrors(kept[-1], budget)
+            if mirrored is not None:
+                step(mirrored, f"mirror planes of all ends ({len(mirrored.values.planes)})")
+        if wanted.directions and one_end:
+            step(self._with_directions(kept[-1]), "directions")
+        if ends_of(self.every) > 1:
+            self._of_all_ends(kept, known, notes)
+        if wanted.correlated:
+            kept.append(self._with_drift(kept[-1], notes))
+
+    def _step(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
+        keep = after.beats(before)
+        ratio = after.errors / before.errors
+        gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
+        notes.append(
+            f"waves: {name} {'kept' if keep else 'dropped'}: {gain:+.3f} nats per channel, left-out error of "
+            f"rows, small and large cells times {ratio[0]:.3f}, {ratio[1]:.3f}, {ratio[2]:.3f}"
+        )
+        return after if keep else before
+
+    def _compressed(self, shape: Shape, values: Values) -> tuple[Compressed, ...]:
+        return compressed(self.groups, shape, values, self.kept)
+
+    def _measured(self, shape: Shape, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
+        """With what left-out rows say."""
+        own = [part.own(values.power, values.towards) for part in parts]
+        errors = np.mean(
+            [_left_out(part, power).mean(1) for part, power in zip(parts, own, strict=True)], axis=0
+        )
+        nll = evidence(parts, values.power, values.towards) + self._worth(shape, values)
+        return Candidate(shape, values, nll, errors)
+
+    def _fitted(self, shape: Shape, values: Values) -> Candidate:
+        """With powers of largest evidence; measured."""
+        parts = self._compressed(shape, values)
+        power, towards, _ = fit_all(parts, shape, values.power, values.towards, SHRINKAGE)
+        return self._measured(shape, replace(values, power=power, towards=towards), parts)
+
+    def _worth(self, shape: Shape, values: Values) -> float:
+        """What the terms beside the isotropic field must gain [nats]."""
+        parameters = len(shape.names) - 2 + shape.direct + 3 * bool(values.offset.any()) + len(values.towards)
+        parameters += 3 * len(values.planes)
+        numbers = sum(2 * group.target.numel() for group in self.groups)
+        return 0.5 * parameters * math.log(numbers)
+
+    def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
+        """With leakage and the direct wave; the best of a few lengths."""
+        one_end = self.every[0].places.shape[1] == 3
+        shape = replace(before.shape, constant=self.settings.constant and one_end, direct=direct)
+        return self._moved(self._of_lengths(shape, before.values, before.shape, direct, budget))
+
+    def _of_lengths(
+        self, shape: Shape, values: Values, old: Shape, gains: bool, budget: TimeBudget
+    ) -> Candidate:
+        """Lengths of the envelope and of gains from a short fit each, then powers."""
+        powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
+        start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
+        values = replace(values, power=torch.tensor(start, dtype=torch.float64))
+        tried: list[tuple[float, Values]] = []
+        for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
+            for gain in GAINS if gains else GAINS[:1]:
+                if tried and budget.over(LENGTHS_SHARE):
+                    break
+                lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
+                trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
+                power, nll = fit_powers(self._compressed(shape, trial), shape, trial.power, 0.0, SHORT)
+                tried.append((nll, replace(trial, power=power)))
+        return self._fitted(shape, min(tried, key=lambda each: each[0])[1])
+
+    def _moved(self, found: Candidate) -> Candidate:
+        """With static ends where they really are."""
+        shape, values = found.shape, found.values
+        if not shape.direct or self.every[0].places.shape[1] > 3:
+            return found
+        offset = best_offset(self._compressed(shape, values), shape, values, self.wavelength)
+        if offset is None:
+            return found
+        moved = self._fitted(shape, replace(values, offset=offset))
+        return moved if moved.nll < found.nll else found
+
+    def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
+        """With images in planes that all ends share; None where none is found."""
+        shape, values = before.shape, before.values
+        late = budget.over
+        if math.isfinite(budget.seconds):
+            until = budget.spent + MIRRORS_SHARE * max(budget.seconds - budget.spent, 0.0)
+            late = partial(budget.over, until / max(budget.seconds, 1e-9))
+        rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(shape, values)
+        wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
+        parts = wide._compressed(shape, values)
+        planes, sequences = find_mirrors(
+            rough, parts, shape, values, self.wavelength, self.settings.mirrors, late
+        )
+        if not sequences:
+            return None
+        power, end = values.power, shape.where("noise")[0]
+        level = NEW * float(shape.of("isotropic", power)[0])
+        shape = replace(shape, sequences=sequences)
+        fresh = torch.full((len(shape.names) - len(power),), level, dtype=torch.float64)
+        power = torch.cat([power[:end], fresh, power[end:]])
+        return self._without_weak(self._fitted(shape, replace(values, planes=planes, power=power)))
+
+    def _without_weak(self, found: Candidate) -> Candidate:
+        """Without the images that have no power."""
+        shape, values, power = found.shape, found.values, found.values.power
+        fixed, varying = (torch.tensor(shape.where(name)) for name in ("source", "source_smooth"))
+        heard = power[fixed] + power[varying] > LEAST * power.sum()
+        if bool(heard.all()) or not bool(heard.any()):
+            return found
+        silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
+        rest = power[[i for i in range(len(power)) if i not in silent]]
+        seen = tuple(one for one, has in zip(shape.sequences, heard.tolist(), strict=True) if has)
+        return self._fitted(replace(shape, sequences=seen), replace(values, power=rest))
+
+    def _with_directions(self, before: Candidate) -> Candidate:
+        """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
+        group = max(self.groups, key=len)
+        angles = directions(group.places, group.slot.wavenumber, self.settings.angles)
+        shape = replace(before.shape, angles=angles, concentration=CONCENTRATION)
+        old = before.values.power
+        level = float(before.shape.of("isotropic", old)[0])
+        power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
+        values = replace(before.values, power=torch.cat([power, old[1:]]))
+        parts = self._compressed(shape, values)
+        errors = self._crossed(parts, shape, values)
+        power, _ = fit_powers(parts, shape, values.power, SHRINKAGE, 2 * SHORT)
+        found = self._fitted(*_strongest(shape, replace(values, power=power)))
+        return replace(found, errors=np.maximum(found.errors, errors))
+
+    def _of_all_ends(self, kept: list[Candidate], known: bool, notes: list[str]) -> None:
+        """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
+        wide, before = replace(self, groups=thinned(self.every, ENDS, self.settings.rows)), kept[-1]
+        kept.append(wide._fitted(before.shape, before.values))
+        kept.append(wide._moved(kept[-1]))
+        if known and self.settings.directions:
+            kept.append(
+                wide._step(kept[-1], wide._with_tied(kept[-1]), "directions by angles to ends", notes)
+            )
+
+    def _with_tied(self, before: Candidate) -> Candidate:
+        """With powers of directions that depend on room and angle to the end, all equal at first."""
+        group, old, wanted = max(self.groups, key=len), before.shape, self.settings
+        angles = directions(group.places, group.slot.wavenumber, wanted.tied)
+        shape = replace(old, angles=angles, concentration=wanted.narrow)
+        power = before.values.power
+        level = float(power[: 1 + len(old.angles)].sum())
+        fresh = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
+        power = torch.cat([fresh, power[1 + len(old.angles) :]])
+        towards = torch.zeros(wanted.knots, dtype=torch.float64)
+        return self._fitted(shape, replace(before.values, power=power, towards=towards))
+
+    def _crossed(self, parts: tuple[Compressed, ...], shape: Shape, values: Values) -> np.ndarray:
+        """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
+        number = [cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
+        errors = np.zeros(1 + len(DEPTHS))
+        for fold in range(FOLDS):
+            held = [np.equal(each, fold) for each in number]
+            rest = tuple(
+                without(part, torch.from_numpy(left)) for part, left in zip(parts, held, strict=True)
+            )
+            power, _ = fit_powers(rest, shape, values.power, SHRINKAGE, 2 * SHORT)
+            for part, left in zip(parts, held, strict=True):
+                errors += _left_out(part, power)[:, left].sum(1) / len(left) / len(parts)
+        return errors
+
+    def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
+        groups = drift.stretches(self.every)
+        signals = drift.signals_of(groups, before.shape, before.values)
+        shape, values, gain = drift.with_drift(groups, signals, before.shape, before.values)
+        errors = [np.zeros(1 + len(DEPTHS)), np.zeros(1 + len(DEPTHS))]
+        for group, signal in zip(groups, signals, strict=True):
+            places = group.places.numpy()
+            grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
+            for found, of, at in zip(errors, (before.shape, shape), (before.values, values), strict=True):
+                other = disturbance(of, at, group)
+                left = drift.left_out_cells(group, signal, other, grouping)
+                found += [float(error.abs().square().mean()) / len(groups) for error in left]
+        worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
+        known = replace(before, nll=0.0, errors=errors[0])
+        after = Candidate(shape, values, worth - gain, errors[1])
+        kept = self._step(known, after, "noise correlated over rows", notes)
+        return after if kept is after else before

@@ -1,0 +1,224 @@
+"""Mirror planes that several static ends share, by the likelihood of their images at all ends together.
+
+A plane mirrors every end, each image with a complex gain of its own whose power all ends share: a wall that
+one antenna hardly shows is seen by many. Upright and level planes are looked at on a grid, the best are moved
+to where the likelihood is largest, and one by one kept while it rises by more than their numbers are worth
+(G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978)); then images in two of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import torch
+from torch import Tensor
+
+from gsparc.models.channels.covariance import Shape, Values, image_waves
+from gsparc.models.channels.evidence import Compressed
+from gsparc.models.channels.probe import Probe
+from gsparc.physics.mirror_planes import Reflections, images
+
+LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
+MARGIN = 0.3  # how far beyond places and ends planes may be, of their extent
+LEAST_MARGIN_M = 2.0  # and at least
+TURN_RAD = 1.5  # phase across the places that a plane's azimuth may be off by
+STEP = 0.25  # wavelengths between offsets
+MOST_TURNS, MOST_OFFSETS = 96, 400  # of the grid
+PROMISING = 2000  # planes that are looked at again after the first was found
+STARTS = 3  # planes that are moved to their best, of which the best is tried
+APART = 1.0  # wavelengths between the images in two of them
+REFINED = 5  # halvings of the step
+LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
+PARAMETERS = 4  # of a plane: two angles, an offset and a power
+SAME = 0.25  # wavelengths between images of two sequences that are one
+CHUNK = 300_000  # entries of waves held at a time
+
+
+@dataclass(frozen=True)
+class _Searcher:
+    shape: Shape
+    values: Values
+    wavelength: float
+    late: Callable[[], bool]
+
+    def waves(self, probe: Probe, planes: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
+        """(W, n) of images in planes (P, 4)."""
+        values = replace(self.values, planes=planes)
+        return image_waves(
+            replace(self.shape, sequences=sequences), values, probe.group.slot, probe.group.places
+        )
+
+    def gains(
+        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...], exact: bool
+    ) -> Tensor:
+        """Rise of the log likelihood (W, levels) of each sequence alone."""
+        total = torch.zeros(len(sequences), len(LEVELS), dtype=torch.float64)
+        for probe in probes:
+            for chunk in torch.arange(len(sequences)).split(max(CHUNK // len(probe.group), 1)):
+                chosen = tuple(sequences[i] for i in chunk.tolist())
+                near = {index: i for i, index in enumerate(dict.fromkeys(sum(chosen, ())))}
+                renamed = tuple(tuple(near[index] for index in sequence) for sequence in chosen)
+                waves = self.waves(probe, planes[list(near)], renamed)
+                known = probe.known(waves) if exact else _about(probe, waves)
+                total[chunk] += torch.stack([probe.gain(waves, level, known) for level in LEVELS], 1)
+        return total
+
+    def best(
+        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...]
+    ) -> tuple[int, float, float]:
+        """Number of the best sequence, its level, and what it gains [nats]."""
+        gains = self.gains(probes, planes, sequences, True)
+        number = int(gains.argmax()) // len(LEVELS)
+        return number, LEVELS[int(gains[number].argmax())], float(gains[number].max())
+
+    def moved(self, probes: tuple[Probe, ...], plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
+        """A plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
+        middle, shift = self.shape.middle, STEP * self.wavelength / 2
+        across = torch.linalg.cross(plane[:3], torch.tensor([0.0, 0.0, 1.0]).double())
+        if float(across.norm()) < 0.5:
+            across = torch.tensor([1.0, 0.0, 0.0]).double()
+        level, gain = LEVELS[0], -math.inf
+        axes = torch.stack([across, torch.linalg.cross(plane[:3], across)])
+        for _ in range(REFINED):
+            steps = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
+            moves = torch.cartesian_prod(steps, steps, steps)
+            normal = plane[:3] + turn * moves[:, :2] @ axes
+            normal = normal / normal.norm(dim=1, keepdim=True)
+            away = plane[3] - plane[:3] @ middle + shift * moves[:, 2]
+            tried = torch.cat([normal, (away + normal @ middle)[:, None]], 1)
+            number, level, gain = self.best(probes, tried, _single(len(tried)))
+            plane = tried[number]
+            turn, shift = turn / 2, shift / 2
+        return plane, level, gain
+
+
+def find_mirrors(
+    coarse: tuple[Compressed, ...],
+    parts: tuple[Compressed, ...],
+    shape: Shape,
+    values: Values,
+    wavelength: float,
+    most: int,
+    late: Callable[[], bool] = lambda: False,
+) -> tuple[Tensor, tuple[Reflections, ...]]:
+    """Planes (W, 4) float64, local, and images in them; none where all together are not worth it.
+
+    Args:
+        coarse: few rows of few ends, for the grid.
+        parts: of all ends.
+        shape, values: the terms beside.
+        wavelength: [m].
+        most: planes.
+        late: asked again and again; nothing new is tried when it says so.
+    """
+    search = _Searcher(shape, values, wavelength, late)
+    rough, probes = (
+        tuple(Probe.of(part, part.own(values.power, values.towards)) for part in each)
+        for each in (coarse, parts)
+    )
+    numbers = sum(2 * probe.group.target.numel() for probe in probes)
+    worth = math.log(numbers) / 2
+    grid, turn = candidates(rough, shape, values, wavelength)
+    planes, sequences, risen = grid[:0], list[Reflections](), 0.0
+    while len(planes) < most and not late():
+        scores = search.gains(rough, grid, _single(len(grid)), False).max(1).values
+        if not len(planes):
+            kept = scores.topk(min(PROMISING, len(grid))).indices
+            grid, scores = grid[kept], scores[kept]
+        starts = _apart(grid, scores, probes, values, wavelength)
+        found = max((search.moved(probes, plane, turn / 2) for plane in starts), key=lambda each: each[2])
+        plane, level, gain = found
+        if gain < PARAMETERS * worth:
+            break
+        planes, risen = torch.cat([planes, plane[None]]), risen + gain
+        fresh = (len(planes) - 1,)
+        rough, probes = (_with(search, each, planes, fresh, level) for each in (rough, probes))
+        sequences.append(fresh)
+    pairs = [pair for pair in permutations(range(len(planes)), 2)]
+    while pairs and not late():
+        pairs = [pair for pair in pairs if not _known(probes, values, planes, sequences, pair, wavelength)]
+        if not pairs:
+            break
+        number, level, gain = search.best(probes, planes, tuple(pairs))
+        if gain < 2 * worth:
+            break
+        probes = _with(search, probes, planes, pairs[number], level)
+        sequences.append(pairs.pop(number))
+        risen += gain
+    return (planes, tuple(sequences)) if 2 * risen > LEAST * numbers else (planes[:0], ())
+
+
+def candidates(
+    probes: tuple[Probe, ...], shape: Shape, values: Values, wavelength: float
+) -> tuple[Tensor, float]:
+    """Upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
+    places = torch.cat([probe.group.places for probe in probes])
+    ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
+    points = torch.cat([places, ends])
+    extent = float(torch.linalg.vector_norm(places.amax(0) - places.amin(0)))
+    count = min(max(math.ceil(2 * math.pi**2 * extent / wavelength / TURN_RAD), 4), MOST_TURNS)
+    azimuth = torch.arange(4 * math.ceil(count / 4), dtype=torch.float64)
+    turn = math.pi / len(azimuth)
+    upright = torch.stack([(azimuth * turn).cos(), (azimuth * turn).sin(), 0 * azimuth], 1)
+    found = []
+    for normal in torch.cat([upright, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)]):
+        along = points @ normal
+        low, high = float(along.min()), float(along.max())
+        margin = max(MARGIN * (high - low), LEAST_MARGIN_M)
+        number = min(max(int((high - low + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
+        offsets = torch.linspace(low - margin, high + margin, number, dtype=torch.float64)
+        offsets = offsets[(offsets - shape.middle @ normal).abs() > STEP * wavelength]
+        found.append(torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1))
+    return torch.cat(found), turn
+
+
+def _single(count: int) -> tuple[Reflections, ...]:
+    return tuple((number,) for number in range(count))
+
+
+def _about(probe: Probe, waves: Tensor) -> Tensor:
+    """`Probe.known` by that of a few: an isotropic field knows waves from everywhere alike."""
+    size = waves.abs().square().sum(1)
+    few = torch.linspace(0, len(waves) - 1, min(32, len(waves))).long()
+    share = probe.known(waves[few]).sum() / size[few].sum().clamp_min(1e-30)
+    return size * share
+
+
+def _apart(
+    grid: Tensor, scores: Tensor, probes: tuple[Probe, ...], values: Values, wavelength: float
+) -> list[Tensor]:
+    """The best planes whose images of the ends are apart."""
+    ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
+    chosen: list[Tensor] = []
+    for number in scores.argsort(descending=True).tolist():
+        placed = images(ends, torch.stack([*chosen, grid[number]]), _single(len(chosen) + 1))
+        away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
+        if not bool((away < APART * wavelength).any()):
+            chosen.append(grid[number])
+        if len(chosen) == STARTS:
+            break
+    return chosen
+
+
+def _with(
+    search: _Searcher, probes: tuple[Probe, ...], planes: Tensor, sequence: Reflections, level: float
+) -> tuple[Probe, ...]:
+    return tuple(probe.added(search.waves(probe, planes, (sequence,))[0], level) for probe in probes)
+
+
+def _known(
+    probes: tuple[Probe, ...],
+    values: Values,
+    planes: Tensor,
+    sequences: list[Reflections],
+    pair: Reflections,
+    wavelength: float,
+) -> bool:
+    """Whether a sequence's images are those of another."""
+    ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
+    placed = images(ends, planes, [*sequences, pair])
+    away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
+    return bool((away < SAME * wavelength).any())

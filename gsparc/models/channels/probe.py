@@ -1,0 +1,69 @@
+"""What one more wave of known shape would gain in likelihood, beside the terms that a group has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsparc.models.channels.columns import Group
+from gsparc.models.channels.evidence import Compressed, solved
+from gsparc.processes.factor import Factor
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A group's inverse covariance for terms of rank one: (1 - B B^T) / noise + F F^H - T T^H.
+
+    Attributes:
+        group: whose, with targets of unit mean square.
+        basis: B (n, r) complex128, outside of which there is noise alone.
+        root: F (n, r) complex128.
+        taken: T (n, t) complex128, of the waves that were added.
+        alpha: (n, D) complex128, the inverse times the targets.
+        noise, scale: the group's own powers.
+    """
+
+    group: Group
+    basis: Tensor
+    root: Tensor
+    taken: Tensor
+    alpha: Tensor
+    noise: float
+    scale: float
+
+    @staticmethod
+    def of(part: Compressed, power: Tensor) -> Probe:
+        """With the group's own powers (P,)."""
+        at, basis = solved(part, power), part.basis.to(torch.complex128)
+        noise = float(power[len(part.room) + len(part.terms)])
+        alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
+        inverse = at.given.factor.inverse
+        root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
+        return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
+
+    def known(self, waves: Tensor) -> Tensor:
+        """f^H C^-1 f (m,) float64 of waves (m, n)."""
+        inside, basis, taken = (
+            (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.taken)
+        )
+        outside = waves.abs().square().sum(1) - basis
+        return (inside + outside.clamp_min(0) / self.noise - taken).clamp_min(0)
+
+    def gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
+        """Rise of the log likelihood (m,) [nats] with each of waves (m, n) complex128 alone, of some power.
+
+        `known` (m,) stands in for `known(waves)`.
+        """
+        inner = (waves.conj() @ self.alpha).abs().square().sum(1)
+        size = 1 + level * (self.known(waves) if known is None else known)
+        return level * inner / size / self.scale - self.alpha.shape[1] * size.log()
+
+    def added(self, wave: Tensor, level: float) -> Probe:
+        """With a wave (n,) of some power among the terms."""
+        own = self.root @ (self.root.mH @ wave) - self.taken @ (self.taken.mH @ wave)
+        own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
+        share = level / (1 + level * float((wave.conj() @ own).real))
+        alpha = self.alpha - share * own[:, None] * (wave.conj() @ self.alpha)[None]
+        return replace(self, alpha=alpha, taken=torch.cat([self.taken, share**0.5 * own[:, None]], 1))

@@ -1,0 +1,293 @@
+"""One file per trained method: everything needed to predict again, written atomically, read without code."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+
+from gsparc.data.files import whole_file
+from gsparc.data.raw import stored_archive
+from gsparc.data.schema import Site, Stations
+from gsparc.models.method import Method
+from gsparc.ops import SphereGrid
+
+SCHEMA_VERSION = 2  # of what a checkpoint holds; a file of another is refused
+FORMAT = "gsparc-checkpoint"
+DEEPEST = 50  # of containers in containers
+MODEL = "model.ckpt"  # of a run's folder
+SEARCHES = "searches"  # what `gsparc.models.image_sources.search_cache` calls its own in a last.ckpt
+
+
+class CheckpointError(ValueError):
+    """A file that is no readable checkpoint, or a state that cannot be written; one line, with the file."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a checkpoint file holds.
+
+    Attributes:
+        method: the method's name in tables.
+        target: its class, as an import path.
+        config: the run's configuration, YAML text ("" when there was none).
+        site: the dataset's fixed facts (normalisation, grid, origin, box, array, carrier).
+        state: what `Method.restore` needs.
+        extra: what a trainer or harness added (optimizer, random states, position in the data order, split).
+        path: the file.
+    """
+
+    method: str
+    target: str
+    config: str
+    site: Site
+    state: dict[str, Any]
+    extra: dict[str, Any] = field(default_factory=dict)
+    path: Path = Path()
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """The configuration as plain containers; empty when there was none.
+
+        Raises:
+            CheckpointError: it is not YAML, or has aliases.
+        """
+        try:
+            events = yaml.parse(self.config, yaml.SafeLoader) if "*" in self.config else ()
+            if any(isinstance(event, yaml.AliasEvent) for event in events):
+                raise CheckpointError(
+                    f"{self.path}: its configuration has YAML aliases, which gsparc never writes"
+                )
+            loaded = yaml.safe_load(self.config) or {}
+        except CheckpointError:
+            raise
+        except (yaml.YAMLError, RecursionError, ValueError):
+            damaged = f"{self.path}: its configuration is not YAML; the file is damaged"
+            raise CheckpointError(damaged) from None
+        return loaded if isinstance(loaded, dict) else {}
+
+
+def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str, Any] | None = None) -> None:
+    """Write `method` and its site; the file appears whole or not at all, also under a kill or a full disk.
+
+    Args:
+        path: file to write or replace.
+        method: fitted.
+        config: YAML text of the run's configuration, interpolations resolved.
+        extra: tensors, numbers, strings, None, nested dicts and lists.
+
+    Raises:
+        CheckpointError: something in the state is of another type, its place is named; or there is no room.
+    """
+    site = method.site
+    if site is None:
+        raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
+    kind = method.stored_as
+    content = {
+        "format": FORMAT,
+        "schema_version": SCHEMA_VERSION,
+        "method": method.name,
+        "target": f"{kind.__module__}.{kind.__qualname__}",
+        "config": config,
+        "site": _plain(asdict(site), "site"),
+        "state": _plain(method.state(), "state"),
+        "extra": _plain(dict(extra or {}), "extra"),
+    }
+    _write(Path(path), content)
+
+
+def amend(path: str | Path, extra: Mapping[str, Any]) -> None:
+    """Add to (or replace in) the `extra` of a checkpoint; everything else in the file stays as it is.
+
+    Raises:
+        CheckpointError: as `read` and `save` do; the file is then as it was.
+    """
+    path = Path(path)
+    content = _content(path)
+    _stored(content, path)  # refuses what is incomplete
+    content["extra"] = {**content["extra"], **_plain(dict(extra), "extra")}
+    _write(path, content)
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    try:
+        with whole_file(path) as partial, partial.open("wb") as file:
+            torch.save(content, file)
+    except (OSError, RuntimeError) as error:  # torch's writer makes the second of the first
+        raise CheckpointError(f"{path}: cannot be written ({_why(error)}); what was there is kept") from error
+
+
+def _why(error: BaseException | None) -> str:
+    """What the system said, under whatever a library wrapped around it."""
+    while error is not None and not isinstance(error, OSError):
+        error = error.__cause__ or error.__context__
+    return (error.strerror if error is not None else None) or "is the disk full?"
+
+
+def read(path: str | Path) -> Stored:
+    """Read a checkpoint onto the CPU; runs no code from the file.
+
+    Raises:
+        CheckpointError: missing, not a checkpoint, damaged, hostile, of another schema version, or holding
+            numbers that are NaN or infinite.
+    """
+    path = Path(path)
+    return _stored(_content(path), path)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """What the archive holds, of our format and of finite numbers (CheckpointError)."""
+    if path.is_dir():
+        inside = [*path.glob(MODEL), *sorted(path.glob(f"fold*/{MODEL}"))]
+        hint = f"say {inside[0]}" if inside else f"give the file itself, {MODEL} of a run"
+        raise CheckpointError(f"{path}: a folder; {hint}")
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such checkpoint")
+    try:
+        archive = stored_archive(path)
+    except ValueError as refused:
+        raise CheckpointError(f"{path}: {refused}") from None
+    try:
+        content = torch.load(archive, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:
+        raise CheckpointError(
+            f"{path}: holds Python objects that a checkpoint never holds; not loaded, it could run code"
+        ) from None
+    except Exception as error:  # whatever a damaged archive raises
+        reason = str(error).strip().splitlines()
+        why = reason[0] if reason else type(error).__name__
+        raise CheckpointError(f"{path}: cannot be read ({why})") from None
+    if isinstance(content, dict) and SEARCHES in content:
+        raise CheckpointError(
+            f"{path}: the finished searches of a run, to go on from with ckpt_path=; the model is {MODEL}"
+        )
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
+    version = content.get("schema_version")
+    if type(version) is not int or version != SCHEMA_VERSION:
+        found = "without a schema version" if version is None else f"in schema {version!r}"
+        raise CheckpointError(
+            f"{path}: written {found}, this gsparc reads {SCHEMA_VERSION} alone; "
+            "train again with this version"
+        )
+    if _overgrown(content):  # what walks over it would not end
+        raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")
+    for part in ("site", "state"):
+        where = non_finite(_without_unknown_places(content.get(part)), part)
+        if where is not None:  # its checksum is right: it was written like this
+            raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
+    return content
+
+
+def _without_unknown_places(part: Any) -> Any:
+    """A site with 0 for NaN in places of stations: what nobody knows; anything else as it is."""
+    stations = part.get("stations") if isinstance(part, Mapping) else None
+    place = stations.get("position") if isinstance(stations, Mapping) else None
+    if not isinstance(place, Tensor) or not place.is_floating_point():
+        return part
+    known = torch.where(torch.isnan(place), 0, place)
+    return {**part, "stations": {**stations, "position": known}}  # type: ignore[dict-item]
+
+
+def _stored(content: Mapping[str, Any], path: Path) -> Stored:
+    try:
+        return Stored(
+            method=str(content["method"]),
+            target=str(content["target"]),
+            config=str(content["config"]),
+            site=_site_from(content["site"]),
+            state=dict(content["state"]),
+            extra=dict(content["extra"]),
+            path=path,
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
+
+
+def _site_from(facts: Mapping[str, Any]) -> Site:
+    known = {f.name for f in fields(Site)}
+    values = {k: v for k, v in _as_numpy(facts).items() if k in known}
+    if values.get("grid") is not None:
+        values["grid"] = SphereGrid(**values["grid"])
+    if values.get("stations") is not None:
+        stations = values["stations"]
+        values["stations"] = Stations(**{**stations, "name": tuple(stations["name"])})
+    if values.get("georeference") is not None:
+        from gsparc.data.links.georeference import Georeference
+
+        values["georeference"] = Georeference(**values["georeference"])
+    return Site(**values)
+
+
+def _as_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        k: v.numpy() if isinstance(v, Tensor) else _as_numpy(v) if isinstance(v, Mapping) else v
+        for k, v in facts.items()
+    }
+
+
+def _overgrown(content: Any) -> bool:
+    """Whether a container is in it twice or too deep, or a tensor has more numbers than are stored."""
+    left, seen = [(content, 0)], set[int]()
+    while left:
+        value, depth = left.pop()
+        if isinstance(value, Tensor):
+            if value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
+                return True
+        elif isinstance(value, (Mapping, list, tuple)) and value:
+            if id(value) in seen or depth > DEEPEST:
+                return True
+            seen.add(id(value))
+            parts = value.values() if isinstance(value, Mapping) else value
+            left += [(part, depth + 1) for part in parts]
+    return False
+
+
+def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
+    """Where the first number is that is NaN or, unless it may be `infinite`, infinite; None: all are good."""
+    if isinstance(value, Tensor):
+        wrong = torch.isnan(value) if infinite else ~torch.isfinite(value)
+        return f"{where}{wrong.nonzero()[0].tolist()}" if wrong.any() else None
+    if isinstance(value, float):
+        return where if math.isnan(value) or (math.isinf(value) and not infinite) else None
+    parts: Iterable[tuple[str, Any]] = ()
+    if isinstance(value, Mapping):
+        parts = ((f"{where}.{key}", one) for key, one in value.items())
+    elif isinstance(value, (list, tuple)):
+        parts = ((f"{where}[{i}]", one) for i, one in enumerate(value))
+    each = (non_finite(one, name, infinite=infinite) for name, one in parts)
+    return next((found for found in each if found is not None), None)
+
+
+def _plain(value: Any, where: str) -> Any:
+    """The same value in types that weights-only unpickling accepts; views do not drag their storage along."""
+    if value is None or type(value) in (bool, int, float, str, bytes):
+        return value
+    if isinstance(value, Tensor):
+        tensor = value.detach().contiguous()
+        return tensor.clone() if tensor.untyped_storage().nbytes() > tensor.nbytes else tensor
+    if isinstance(value, np.ndarray):
+        return _plain(torch.from_numpy(np.ascontiguousarray(value)), where)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {_plain(k, where): _plain(v, f"{where}.{k}") for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        items = [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
+        return items if isinstance(value, list) else tuple(items)
+    if isinstance(value, Path):
+        return str(value)
+    for base in (bool, int, float, str):  # enums and other named subclasses
+        if isinstance(value, base):
+            return base(value)
+    raise CheckpointError(
+        f"{where} is a {type(value).__name__}; a checkpoint holds tensors, numbers, strings"
+    )

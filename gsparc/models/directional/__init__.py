@@ -1,0 +1,1 @@
+"""`model=directional_gp`: sources triangulated from directions of arrival."""

@@ -1,0 +1,364 @@
+"""`model=directional_gp`: sources triangulated from directions of arrival, channels by one regression.
+
+Rays of several receivers intersect at images of the transmitter, and the receivers with a ray to an image are
+those that see it. With positions and visibility known a channel is linear in the sources' gains:
+
+    h(x, f) = sum_k m_k(x) g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,   m_k(x) in {0, 1}
+
+with m known at the receivers. The gains are Gaussian processes as in `gp_likelihood.py`, nearly constant over
+places; each source's power and the shared kernel maximise the marginal likelihood. At a query m_k is a
+probability.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions, coherence
+from gsparc.models.directional.triangulation import Rays, triangulate
+from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse
+from gsparc.models.image_sources.gp_likelihood import steering, with_noise
+from gsparc.models.image_sources.rows import Rows, gather
+from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityGP, flips
+from gsparc.models.method import LeftOut, Prediction
+from gsparc.ops import Pose
+from gsparc.physics.waves import ranges, wave, wave_over_band
+from gsparc.processes.kernel import matern32_of_squares
+from gsparc.processes.left_out import left_out_group
+from gsparc.training.context import FitContext, FitReport
+
+# Receivers with a ray to a source; of more sources those seen by most are kept.
+MIN_SEEN, MAX_SOURCES = 2, 60
+MAX_RECEIVERS = 1000  # subsampled beyond: the cost of intersections grows with their square
+CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
+LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
+NOISES = (0.001, 0.01, 0.05)  # of the rows' power
+ROUNDS = 4  # of expectation maximisation of powers, and choice of the kernel
+REFINEMENT_ROWS = 400  # rows used for position refinement
+VISIBILITY_UPDATES, REFIT_EVERY = 9, 3  # rounds, each of which changes one entry per receiver at most
+SELECTION_ROWS = 700  # rows that the kernel is chosen on
+
+
+@dataclass(frozen=True)
+class GainKernel:
+    """Covariance of gains over places.
+
+    Attributes:
+        constant: share of the variance that is the same everywhere.
+        length: of the rest [m].
+        noise: variance, in units of the rows' power.
+    """
+
+    constant: float
+    length: float
+    noise: float
+
+    def correlation(self, first: Tensor, second: Tensor) -> Tensor:
+        """(n, m) float32 of places (n, 3) and (m, 3) float64 [m]."""
+        apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
+        squared = (apart / self.length).square()
+        return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).float()
+
+
+@dataclass(frozen=True)
+class QueryGeometry:
+    """Query places, `count` receivers times their antennas, and what depends on geometry alone.
+
+    Attributes:
+        places: (m, 3) float64 [m].
+        count: of the receivers.
+        away: (m, K) float64 [m], ranges to the sources.
+        probability: (m, K), of seeing them.
+        correlation: (m, n), of gains with the rows'.
+        retained: (K', m, n), coherence retained under position uncertainty, of uncertain sources.
+    """
+
+    places: Tensor
+    count: int
+    away: Tensor
+    probability: Tensor
+    correlation: Tensor
+    retained: Tensor
+
+
+KERNELS = tuple(GainKernel(c, length, noise) for c in CONSTANTS for length in LENGTHS_M for noise in NOISES)
+REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # during position refinement
+
+
+class DirectionalGP(FramedMethod):
+    """Gaussian process on channels of a moving receiver with measured directions; queries need none.
+
+    Args:
+        rows: largest number of receivers times tones in the regression.
+        seed: of the subsample.
+    """
+
+    name = "directional_gp"
+
+    def __init__(self, rows: int = 3000, seed: int = 0) -> None:
+        if rows < 8:
+            raise ValueError(f"directional_gp: rows must be at least 8, got {rows}")
+        self.row_limit, self.seed = rows, seed
+
+    # ---- fitting ----
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Learn from `train` and `val`.
+
+        Raises:
+            ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
+        """
+        started = time.monotonic()
+        refuse(data.site, self.name)
+        if data.directions is None:
+            raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
+        known = np.concatenate([fold.train, fold.val])
+        if len(known) > MAX_RECEIVERS:
+            known = np.sort(np.random.default_rng(self.seed).choice(known, MAX_RECEIVERS, replace=False))
+        places = data.rx_position[known].astype(np.float64)
+        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
+        found = Rays.of(places, rays)
+        clusters = triangulate(found, self.seed)
+        seen = torch.from_numpy(clusters.seen(found))
+        kept = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
+        if not len(kept):
+            raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
+        kept = kept[seen[:, kept].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
+        self.site, self.antennas = data.site, data.target.shape[1]
+        everything = gather(data, known, self.row_limit, self.seed)
+        self.frame = frame_of(data.site, everything)
+        points, covariance = (torch.from_numpy(v)[kept] for v in (clusters.points, clusters.covariance))
+        self.positions = UncertainPositions(points - self.frame.middle, covariance)
+        self.visibility = VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, kept])
+        self.rows = self.frame.inside(everything)
+        at = {int(row): k for k, row in enumerate(known)}
+        self.observer = torch.tensor([at[int(row)] for row in everything.receiver])
+        self._refine_positions()
+        self._refit()
+        changed = self._update_visibility()
+        note = (
+            f"directional_gp: {len(self.sources)} triangulated sources, direction error "
+            f"{math.degrees(clusters.error):.2g} degrees; {changed} visibility entries changed by channels; "
+            f"constant share of the gains' variance {self.kernel.constant:.1%}"
+        )
+        return FitReport(time.monotonic() - started, (note,))
+
+    @property
+    def sources(self) -> Tensor:
+        """Places (K, 3) float64 [m] in the regression's frame."""
+        return self.positions.points
+
+    def _few(self, limit: int) -> tuple[Tensor, Rows]:
+        """Every so many-th row, at most `limit`: indices and rows."""
+        some = torch.arange(0, len(self.rows), max(1, -(-len(self.rows) // limit)))
+        return some, self.rows.take(some)
+
+    def _refine_positions(self) -> None:
+        """Refine positions by the phases of the channels, where directions leave them uncertain."""
+        some, rows = self._few(REFINEMENT_ROWS)
+        correlation = REFINEMENT_KERNEL.correlation(rows.position, rows.position)
+        self.positions = PositionRefinement(
+            rows, self.visibility.seen[self.observer[some]].float(), self.positions, correlation
+        ).run()
+
+    def _refit(self) -> None:
+        """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
+        some, rows = self._few(SELECTION_ROWS)
+        waves = self._visible_waves(rows, self.observer[some])
+        uncertain = self.positions.uncertain(rows.position, rows.frequency)
+        mean_power = float(waves.abs().square().sum(1).mean())
+        self.power = torch.full((len(self.sources),), 1 / max(mean_power, 1e-30))
+        correlation = {kernel: kernel.correlation(rows.position, rows.position) for kernel in KERNELS}
+        phase_vectors = self.positions.only(uncertain).phase_vectors(rows.position, rows.frequency)
+        retained = coherence(phase_vectors, phase_vectors)
+        for _ in range(ROUNDS):
+            covariance = _covariance(waves, waves, self.power, uncertain, retained)
+            tried = {
+                kernel: with_noise(covariance * each, kernel.noise, rows.target)
+                for kernel, each in correlation.items()
+            }
+            self.kernel, conditioned = min(tried.items(), key=lambda one: one[1].nll)
+            # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
+            prior = self.power * self.kernel.constant
+            mean = prior[:, None] * (waves.mH @ conditioned.weights)
+            known = (conditioned.factor.root @ waves).abs().square().sum(0)
+            self.power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Quantities derived from the state that queries need."""
+        rows = self.rows
+        self.waves = self._visible_waves(rows, self.observer)
+        self.uncertain = self.positions.uncertain(rows.position, rows.frequency)
+        self.phase_vectors = self.positions.only(self.uncertain).phase_vectors(rows.position, rows.frequency)
+        correlation = self.kernel.correlation(rows.position, rows.position)
+        retained = coherence(self.phase_vectors, self.phase_vectors)
+        covariance = _covariance(self.waves, self.waves, self.power, self.uncertain, retained)
+        self.conditioned = with_noise(covariance * correlation, self.kernel.noise, rows.target)
+
+        # (n, K, R, 2), real and imaginary: what each row adds to each source's gain
+        dual_weights = (self.power * self.waves.conj())[:, :, None] * self.conditioned.weights[:, None]
+        self.dual_weights = torch.view_as_real(dual_weights).contiguous()
+
+    def _update_visibility(self) -> int:
+        """Update visibility by the channels (see `flips`); returns how many entries changed.
+
+        Only with one row per receiver: more of them determine the gains of their own receiver.
+        """
+        if len(self.observer.unique()) < len(self.observer):
+            return 0
+        rays = self.visibility.seen.float()
+        probability = self.visibility.left_out.float()
+        rates, rows = RayErrorRates.first(rays), self.observer
+        for turn in range(VISIBILITY_UPDATES):
+            if turn % REFIT_EVERY == REFIT_EVERY - 1:
+                self._refit()
+            places = self.rows.position
+            query = QueryGeometry(
+                places,
+                len(rows),
+                ranges(places, self.sources),
+                probability[rows],
+                self.kernel.correlation(places, places),
+                coherence(self.phase_vectors, self.phase_vectors),
+            )
+            one = self._gains(query) * steering(self.rows, self.sources)[:, :, None]
+            seen, odds = self.visibility.seen.float(), rates.odds(rays, probability)
+            flip = flips(seen[rows], odds[rows], *self.conditioned.left_out(), one)
+            if not bool(flip.any()):
+                break
+            seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])
+            rates = RayErrorRates.of(rays, seen)
+            self.visibility = replace(self.visibility, seen=seen.double())
+            self._prepare()
+        changed = int((self.visibility.seen.float() != rays).sum())
+        if changed:
+            self.visibility = VisibilityGP.of(self.visibility.places, self.visibility.seen)
+            self._refit()
+        return changed
+
+    def _visible_waves(self, rows: Rows, observer: Tensor) -> Tensor:
+        """Waves (n, K) complex64 of the sources at every row, zero where its receiver does not see them."""
+        return steering(rows, self.sources) * self.visibility.seen[observer].float()
+
+    # ---- predicting ----
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; the variance includes gains, noise and visibility."""
+        query = self._query(tx, rx)
+        return self._prediction(self._sum(query), *self._variance(query))
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean alone (B, A, K) complex64."""
+        return self._sum(self._query(tx, rx))
+
+    def _sum(self, query: QueryGeometry) -> Tensor:
+        """Predicted mean channels (B, A, K) of a query's receivers."""
+        tones = torch.from_numpy(self._fitted().tones())
+        gains = query.probability[:, :, None] * self._gains(query)
+        return self._stored(gains.mT @ wave_over_band(query.away, tones), tones)
+
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+        """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""
+        query = self._query(tx, rx)
+        gain = query.probability * wave(query.away, self.frame.carrier_hz)
+        gain = self._gains(query) * gain[:, :, None]
+        towards = self.sources - query.places.view(query.count, -1, 3).mean(1)[:, None]
+        return self._stored_paths(gain.movedim(1, -1), query.away, towards)
+
+    def _query(self, tx: Tensor, rx: Pose) -> QueryGeometry:
+        """Query geometry of receivers, their antennas in the regression's frame."""
+        flat, count = self._places(tx, rx)
+        retained = torch.zeros(0, len(flat), len(self.rows))
+        if len(self.uncertain):
+            unsure, carrier = self.positions.only(self.uncertain), torch.tensor(self.frame.carrier_hz)
+            retained = coherence(unsure.phase_vectors(flat, carrier), self.phase_vectors)
+        return QueryGeometry(
+            flat,
+            count,
+            ranges(flat, self.sources),
+            self.visibility.probability(flat).float(),
+            self.kernel.correlation(flat, self.rows.position),
+            retained,
+        )
+
+    def _gains(self, query: QueryGeometry) -> Tensor:
+        """Posterior mean gains (m, K, R) at a query's places."""
+        weights = self.dual_weights
+        gain = (query.correlation @ weights.flatten(1)).unflatten(1, weights.shape[1:])
+        if len(self.uncertain):
+            retained = query.retained * query.correlation
+            gain[:, self.uncertain] = torch.einsum("kmn,nkrc->mkrc", retained, weights[:, self.uncertain])
+        return torch.view_as_complex(gain)
+
+    def _variance(self, query: QueryGeometry) -> tuple[Tensor, Tensor]:
+        """Expected squared error and expected power (m,) at a query's places."""
+        probability, arriving = query.probability, wave(query.away, self.frame.carrier_hz)
+        powers = arriving.abs().square() * self.power
+        cross = _covariance(arriving * probability, self.waves, self.power, self.uncertain, query.retained)
+        cross = cross * query.correlation
+        gains = (powers * probability.square()).sum(1) - self.conditioned.known(cross)
+        visibility_variance = (powers * probability * (1 - probability)).sum(1)
+        power = (powers * probability).sum(1)
+        return gains.clamp_min(0) + visibility_variance + self.kernel.noise, power + self.kernel.noise
+
+    def leave_one_out(self) -> LeftOut:
+        """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`.
+
+        A receiver's own visibility of the sources is left out, too.
+        """
+        self._fitted()
+        probability = self.visibility.left_out[self.observer].float()
+        expected = steering(self.rows, self.sources) * probability
+        retained = coherence(self.phase_vectors, self.phase_vectors)
+        cross = _covariance(expected, self.waves, self.power, self.uncertain, retained)
+        cross = cross * self.kernel.correlation(self.rows.position, self.rows.position)
+        predicted = self.conditioned.mean(cross)
+        inverse = self.conditioned.factor.inverse
+        for one in self.observer.unique():
+            group = torch.nonzero(self.observer == one).flatten()
+            own, _ = left_out_group(inverse, self.conditioned.weights, group)
+            predicted[group] -= cross[group] @ (inverse[:, group] @ own)
+        return self._left_out(self.rows, predicted)
+
+    # ---- state ----
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        self._fitted()
+        return {
+            **self._frame_state(self.rows),
+            "observer": self.observer,
+            "sources": self.sources,
+            "open": self.positions.covariance,
+            "power": self.power,
+            "law": [*vars(self.kernel).values()],
+            "sightings": [getattr(self.visibility, each.name) for each in fields(self.visibility)],
+        }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.rows = self._restore_frame(site, state)
+        self.observer, self.power, points = state["observer"], state["power"], state["sources"]
+        self.positions = UncertainPositions(points, state["open"])
+        self.kernel, self.visibility = GainKernel(*state["law"]), VisibilityGP(*state["sightings"])
+        self._prepare()
+
+    def size(self) -> int:
+        """Sources."""
+        return len(self.sources) if self.site is not None else 0
+
+
+def _covariance(first: Tensor, second: Tensor, power: Tensor, uncertain: Tensor, retained: Tensor) -> Tensor:
+    """Covariance (m, n) of waves (m, K) and (n, K); (K',) uncertain sources have coherence (K', m, n)."""
+    exact = power.index_fill(0, uncertain, 0.0) if len(uncertain) else power
+    total = (first * exact) @ second.mH
+    for k, coherent in zip(uncertain.tolist(), retained, strict=True):
+        total += (power[k] * first[:, k])[:, None] * second[:, k].conj() * coherent
+    return total

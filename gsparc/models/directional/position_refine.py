@@ -1,0 +1,272 @@
+"""Uncertain positions of triangulated sources, refined to a fraction of a wavelength by phases of channels.
+
+A source at an uncertain position has an unknown relative phase at receivers far apart. Averaged over a
+position of covariance S, signals received in directions u and u' have the covariance of a known position
+times
+
+    exp(-|L^T (v - v')|^2 / 2),   v = 2 pi f u / c,   S = L L^T .
+
+Sources are refined one after the other under the likelihood in which all others keep their current position
+uncertainty: many positions are drawn from the triangulation's posterior, the best
+are refined by Gauss-Newton steps, and a source is resolved where one optimum is clearly the best. One with
+several similar optima stays uncertain until others are resolved.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources.gp_likelihood import steering, with_noise
+from gsparc.models.image_sources.rows import Rows
+from gsparc.physics.waves import LIGHT
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.factor import Factor
+
+SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
+DRAWS_PER_CELL, MIN_DRAWS, MAX_DRAWS = 6, 32, 768  # positions per (quarter wavelength)^3 of the prior
+REFINED, STEPS = 6, 8  # best draws, and Gauss-Newton steps for each
+MIN_PROBABILITY = 0.8  # of one optimum, to resolve a source
+SAME_SIGMAS = 4.0  # standard deviations within which two optima are the same
+SWEEPS = 8  # over all sources
+TOLERANCE_M = 1e-3  # [m], largest move of a sweep that ends the refinement
+NOISE, MIN_NOISE = 0.1, 1e-3  # of the rows' power
+POWER_UPDATES, MAX_RATIO = 3, 8.0  # fixed-point iterations, and largest change in each
+MAX_POWER = 4.0  # of a source, times the median
+
+
+@dataclass(frozen=True)
+class UncertainPositions:
+    """K sources with Gaussian position uncertainty.
+
+    Attributes:
+        points: (K, 3) float64 [m].
+        covariance: (K, 3, 3) float64 [m^2].
+    """
+
+    points: Tensor
+    covariance: Tensor
+
+    @cached_property
+    def lower(self) -> Tensor:
+        """(K, 3, 3), Cholesky factors of the covariances."""
+        return Factor.of(self.covariance + 1e-14 * torch.eye(3, dtype=torch.float64), "raise").lower
+
+    def phase_vectors(self, places: Tensor, frequency: Tensor) -> Tensor:
+        """(K, n, 3) float32 [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
+        slope = wave_vectors(self.points, places, frequency)
+        return (slope @ self.lower).float()
+
+    def only(self, kept: Tensor) -> UncertainPositions:
+        """A subset of the sources."""
+        return UncertainPositions(self.points[kept], self.covariance[kept])
+
+    def uncertain(self, places: Tensor, frequency: Tensor) -> Tensor:
+        """Indices of the sources that are not coherent over these places."""
+        phase_vectors = self.phase_vectors(places, frequency)
+        spread = (phase_vectors - phase_vectors.mean(1, keepdim=True)).square().sum(-1).amax(1).sqrt()
+        return torch.nonzero(spread > SHARP_RAD).flatten()
+
+
+def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
+    """(K, n, 3) float64 [rad/m], gradients of the received phases by the sources' positions, up to a sign."""
+    towards = points[:, None] - places[None]
+    away = torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-3)
+    hertz = torch.as_tensor(frequency, dtype=torch.float64).reshape(-1, 1)
+    return towards / away * (2 * math.pi / LIGHT * hertz)
+
+
+def coherence(first: Tensor, second: Tensor) -> Tensor:
+    """(K, m, n) float32, of `phase_vectors` (K, m, 3) and (K, n, 3)."""
+    # rounding of expanded squares would make covariances indefinite
+    apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
+    return apart.square_().mul_(-0.5).exp_()
+
+
+@dataclass
+class PositionRefinement:
+    """Positions from the triangulation's posterior to that of rays and channels.
+
+    Attributes:
+        rows: of unit power.
+        visible: (n, K) float32, of each row's receiver.
+        prior: by triangulation.
+        correlation: (n, n) float32, correlation of gains.
+    """
+
+    rows: Rows
+    visible: Tensor
+    prior: UncertainPositions
+    correlation: Tensor
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(self.seed)
+        self.current, self.noise = self.prior, NOISE
+        self.wavelength = LIGHT / float(self.rows.frequency.mean())
+
+    def run(self) -> UncertainPositions:
+        """Positions and covariances given rays and channels."""
+        uncertain = self.prior.uncertain(self.rows.position, self.rows.frequency)
+        if not len(uncertain):
+            return self.current  # directions were exact: nothing to refine
+        self.terms = torch.stack([self._covariance_of(k) for k in range(len(self.prior.points))])
+        mean_power = float(self.terms.diagonal(dim1=1, dim2=2).real.sum(0).mean())
+        self.power = torch.full((len(self.terms),), 1 / max(mean_power, 1e-30))
+        self.resolved = torch.zeros(len(self.terms), dtype=torch.bool)
+        size = torch.linalg.det(self.prior.covariance)
+        order = uncertain[size[uncertain].argsort()].tolist()
+        for _ in range(SWEEPS):
+            self._update_powers()
+            before = self.current.points
+            for k in order:
+                self._refine(k)
+            if float((self.current.points - before).norm(dim=1).max()) < TOLERANCE_M:
+                break
+        return self.current
+
+    def _covariance_of(self, k: int) -> Tensor:
+        """Covariance (n, n) of the rows by source k of unit power."""
+        one = self.current.only(torch.tensor([k]))
+        wave = steering(self.rows, one.points)[:, 0] * self.visible[:, k]
+        phase_vectors = one.phase_vectors(self.rows.position, self.rows.frequency)
+        return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
+
+    def _total(self, without: int | None = None) -> Tensor:
+        """Covariance (n, n) of the rows by all sources but one."""
+        power = self.power.to(self.terms.dtype)
+        if without is not None:  # a difference of covariances need not be positive definite
+            power[without] = 0
+        return (power @ self.terms.flatten(1)).unflatten(0, self.terms.shape[1:])
+
+    def _update_powers(self) -> None:
+        """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
+        outputs = self.rows.target.shape[1]
+        for _ in range(POWER_UPDATES):
+            given = with_noise(self._total(), self.noise, self.rows.target)
+            explained = (given.weights.conj() * (self.terms @ given.weights)).real.sum((1, 2))
+            due = outputs * (given.factor.inverse.conj() * self.terms).real.sum((1, 2))
+            self.power = self.power * (explained / due.clamp_min(1e-12)).clamp(1 / MAX_RATIO, MAX_RATIO)
+            self.power = self.power.clamp_max(MAX_POWER * float(self.power.median())).clamp_min(1e-9)
+            residual = float(given.weights.abs().square().sum())
+            ratio = residual / max(outputs * float(given.factor.inverse.diagonal().real.sum()), 1e-12)
+            self.noise = max(self.noise * min(max(ratio, 1 / MAX_RATIO), MAX_RATIO), MIN_NOISE)
+
+    def _refine(self, k: int) -> None:
+        """Position and covariance of source k given its rays, the channels and all other sources."""
+        conditional = ConditionalLikelihood.of(
+            self, k, with_noise(self._total(without=k), self.noise, self.rows.target)
+        )
+        if self.resolved[k]:
+            places = self.current.points[k][None]
+        else:
+            places = conditional.separated(self._draws(k), self.wavelength / 8)
+        places, spreads = conditional.refined(places)
+        log_posterior = conditional.log_posterior(places) + 0.5 * torch.linalg.slogdet(spreads)[1]
+        best = int(log_posterior.argmax())
+        offset = places - places[best]
+        same = ((offset @ torch.linalg.inv(spreads[best])) * offset).sum(1) < SAME_SIGMAS**2
+        same |= offset.norm(dim=1) < self.wavelength / 8
+        if 1 / (1 + float((log_posterior[~same] - log_posterior[best]).exp().sum())) < MIN_PROBABILITY:
+            return
+        points, covariance = self.current.points.clone(), self.current.covariance.clone()
+        points[k], covariance[k], self.resolved[k] = places[best], spreads[best], True
+        self.current = UncertainPositions(points, covariance)
+        self.terms[k] = self._covariance_of(k)
+
+    def _draws(self, k: int) -> Tensor:
+        """Draws (m, 3) from the prior of source k, its mean first."""
+        width = torch.linalg.eigvalsh(self.prior.covariance[k]).clamp_min(0).sqrt()
+        cells = float((1 + 16 * width / self.wavelength).prod())
+        count = int(min(max(DRAWS_PER_CELL * cells, MIN_DRAWS), MAX_DRAWS))
+        draw = torch.randn(count, 3, generator=self.generator, dtype=torch.float64)
+        draw[0] = 0
+        return self.prior.points[k] + draw @ self.prior.lower[k].T
+
+
+@dataclass(frozen=True)
+class ConditionalLikelihood:
+    """Likelihood of one source's position given all others, at the n rows that see it.
+
+    Attributes:
+        rows: these.
+        inverse: (n, n), of their covariance by the others and noise.
+        alpha: (n, R), its product with the targets.
+        power: of the source.
+        centre, precision: mean (3,) [m] and inverse covariance (3, 3) of its prior.
+    """
+
+    rows: Rows
+    inverse: Tensor
+    alpha: Tensor
+    power: float
+    centre: Tensor
+    precision: Tensor
+
+    @staticmethod
+    def of(refinement: PositionRefinement, k: int, given: Conditioned) -> ConditionalLikelihood:
+        """Of source k, with the factor of the covariance without it."""
+        rows_in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
+        return ConditionalLikelihood(
+            refinement.rows.take(rows_in_view),
+            given.factor.inverse[rows_in_view[:, None], rows_in_view],
+            given.weights[rows_in_view],
+            float(refinement.power[k]),
+            refinement.prior.points[k],
+            torch.linalg.inv(refinement.prior.covariance[k]),
+        )
+
+    def log_posterior(self, points: Tensor) -> Tensor:
+        """Log posterior (m,) float64 of places (m, 3), up to a constant."""
+        waves = steering(self.rows, points)
+        matched = (waves.mH @ self.alpha).abs().square().sum(1)
+        scale = 1 + self.power * (waves.conj() * (self.inverse @ waves)).real.sum(0)
+        offset = points - self.centre
+        rays = 0.5 * ((offset @ self.precision) * offset).sum(1)
+        return (self.power * matched / scale - self.alpha.shape[1] * scale.log()).double() - rays
+
+    def separated(self, points: Tensor, distance: float) -> Tensor:
+        """The best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
+        log_posterior = self.log_posterior(points)
+        best: list[Tensor] = []
+        while len(best) < REFINED and float(log_posterior.max()) > -torch.inf:
+            best.append(points[int(log_posterior.argmax())])
+            log_posterior[(points - best[-1]).norm(dim=1) < distance] = -torch.inf
+        return torch.stack(best)
+
+    def refined(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (m, 3) after Gauss-Newton steps under the best gain, and covariances (m, 3, 3)."""
+        best, step_scale = self.log_posterior(points), torch.ones(len(points), dtype=torch.float64)
+        for _ in range(STEPS):
+            step, _ = self._step(points)
+            tried = points + step_scale[:, None] * step
+            log_posterior = self.log_posterior(tried)
+            better = log_posterior > best
+            points, best = (
+                torch.where(better[:, None], tried, points),
+                torch.where(better, log_posterior, best),
+            )
+            step_scale = torch.where(better, 1.0, step_scale / 3)
+        return points, self._step(points)[1]
+
+    def _step(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Gauss-Newton steps (m, 3) at positions (m, 3), and covariances (m, 3, 3) by Fisher information."""
+        waves = steering(self.rows, points)  # (n, m)
+        whitened = self.inverse @ waves
+        known = (waves.conj() * whitened).real.sum(0) + 1 / self.power
+        gain = (waves.mH @ self.alpha) / known[:, None]  # (m, R)
+        phase_vectors = wave_vectors(points, self.rows.position, self.rows.frequency).float()  # (m, n, 3)
+        slope = waves.T[:, :, None] * phase_vectors * -1j
+        along = torch.einsum("nm,mnc->mc", whitened.conj(), slope)
+        visible = self.inverse @ slope - whitened.T[:, :, None] * (along / known[:, None])[:, None]
+        power = gain.abs().square().sum(1)[:, None, None]
+        fisher = 2 * (power * (slope.mH @ visible).real).double()
+        residual = self.alpha - whitened.T[:, :, None] * gain[:, None]  # K^-1 (y - a g), (m, n, R)
+        pull = 2 * torch.einsum("mnc,mnr,mr->mc", slope.conj(), residual, gain.conj()).real.double()
+        pull = pull - (points - self.centre) @ self.precision
+        covariance = torch.linalg.inv(fisher + self.precision)
+        return torch.einsum("mcd,md->mc", covariance, pull), covariance

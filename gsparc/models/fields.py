@@ -1,0 +1,193 @@
+"""Fields whose weights are in closed form: what makes each of measurements, and of a stored state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.data.walls import read_walls
+from gsparc.field.initial import InitSettings
+from gsparc.models.censored import heard
+from gsparc.models.channels import field as channels
+from gsparc.models.channels import initial as waves
+from gsparc.models.channels.settings import ChannelSettings
+from gsparc.models.directional.method import DirectionalGP
+from gsparc.models.haste import factor_s
+from gsparc.models.image_sources import source_field
+from gsparc.models.image_sources.known.method import KnownWallsGP
+from gsparc.models.image_sources.known.mirrors import counted
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.source_field import RayField, SourceField
+from gsparc.models.mixture import process_field
+from gsparc.models.moving_array import bearing_field
+from gsparc.models.moving_array.bearing_field import BearingField
+from gsparc.models.moving_array.method import MovingArrayField
+from gsparc.models.moving_array.triangulate import SearchSettings
+from gsparc.models.powers import field as power_field
+from gsparc.models.powers.together import field as joint_field
+from gsparc.training.conditional import CompletedField, ConditionalField, residuals
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget, less_repeatable
+
+COMPLETION_SHARE = 0.15  # of the seconds of sources, for that process
+FACTORS = 4.0  # covariances of all rows that it needs at least
+LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
+
+
+def sources(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Image sources of several searches, and a process on what they leave within the same seconds."""
+    budget = context.time_budget()
+    method = ImageSourceGP(
+        searches=init.searches, search_rows=init.search_rows, rows=init.rows, margin=init.margin,
+        max_sources=init.max_sources, order=init.order, clutter=clutter,
+        offsets=init.snapshot, seed=context.seed,
+    )  # fmt: skip
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
+    return _completed(SourceField(method), data, report, budget)
+
+
+def scene(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Images of the static end in the walls of `init.file`; of powers, walls in the way of paths.
+
+    Raises:
+        DataError: no such file, or walls that cannot be.
+    """
+    if data.site.kind == "rssi":
+        return powers(data, rows, init, clutter, context)
+    budget = context.time_budget()
+    method = KnownWallsGP(
+        read_walls(init.file), search_rows=init.search_rows, rows=init.rows, max_sources=init.max_sources,
+        order=init.order, clutter=clutter, offsets=init.snapshot, seed=context.seed,
+    )  # fmt: skip
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
+    return _completed(SourceField(method), data, report, budget)
+
+
+def rays(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Sources where measured directions meet."""
+    method = DirectionalGP(rows=init.rows, seed=context.seed)
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    return RayField(method), report
+
+
+def diffuse(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Leakage, a direct wave and waves from all around, without Gaussians."""
+    budget = context.time_budget()
+    field, notes = waves.initialise(data, rows, ChannelSettings(), budget)
+    return field, FitReport(budget.counted.wall, notes, budget.limited_by)
+
+
+def powers(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Coherent waves, or what the path loses in walls of a file (`init=scene`), and a process of the rest.
+
+    Raises:
+        DataError: `init=scene` without a file, or walls that cannot be.
+    """
+    budget = context.time_budget()
+    known, site = None, data.site
+    if init.name == "scene":
+        known = counted(read_walls(init.file), site.origin, site.static_position)
+    field, notes = power_field.initialise(data, rows, init.name != "diffuse", context.seed, budget, known)
+    field.condition(data, rows)
+    return field, FitReport(budget.counted.wall, notes, budget.limited_by)
+
+
+def joint_powers(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Powers of several stations in one field; without `clutter` they share their law alone."""
+    budget = context.time_budget()
+    shared = clutter and init.name != "diffuse"
+    field, notes = joint_field.initialise(data, rows, shared=shared, seed=context.seed, budget=budget)
+    field.condition(data, rows)
+    return field, FitReport(budget.counted.wall, notes, budget.limited_by)
+
+
+def bearings(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Sources where bearings cross, of at most `init.searches` searches.
+
+    With seconds in the context, searches end when the left-out error no longer falls; without, one is made.
+    Of `init`, `searches` and `max_sources` are heeded; `clutter` means nothing to spectra.
+
+    Raises:
+        ValueError: not spectra of a moving receiver with a declared array that keeps its orientation.
+    """
+    search = replace(SearchSettings(), sources=init.max_sources)
+    method = MovingArrayField(search=search, seed=context.seed, most_searches=init.searches)
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    return BearingField(method, heard(data, rows)), report
+
+
+def _searching(data: Measurements, context: FitContext) -> FitContext:
+    """The seconds of a search: without those for `_completed`."""
+    share = 1.0 if context.budget_s is None or data.target[0].size > 1 else 1 - COMPLETION_SHARE
+    return replace(context, budget_s=None if context.budget_s is None else share * context.budget_s)
+
+
+def _completed(
+    field: ConditionalField, data: Measurements, report: FitReport, budget: TimeBudget
+) -> tuple[ConditionalField, FitReport]:
+    """With a process on what the sources leave, where leaving rows out says that it pays."""
+    if data.target[0].size > 1:
+        return field, report
+    began = budget.counted.wall
+    left = field.left_out()
+    if budget.seconds - budget.spent < FACTORS * factor_s(len(left.rows)):
+        budget.limited = True
+        note = "no time for a process on what the sources leave"
+        return field, replace(report, notes=(*report.notes, note), limited_by=budget.clock)
+    remainder = residuals(field, data)
+    settings = ChannelSettings(direct=False, constant=False)
+    residual, _ = waves.initialise(remainder, left.rows, settings, budget)
+    missed = torch.from_numpy(data.target[left.rows]).flatten() - left.mean.flatten()
+    predicted = residual.left_out().mean.flatten()
+    overlap = float((predicted.conj() * missed).real.sum())
+    weight = min(max(overlap / max(float(predicted.abs().square().sum()), 1e-30), 0.0), 1.0)
+    gain = 1 - float((missed - weight * predicted).abs().square().sum() / missed.abs().square().sum())
+    note = f"a process explains {max(gain, 0):.0%} of what the sources leave, left out one by one"
+    limited = less_repeatable(report.limited_by, budget.limited_by)
+    seconds = report.seconds + budget.counted.wall - began
+    report = FitReport(seconds, (*report.notes, note), limited)
+    return (CompletedField(field, residual, weight) if gain >= LEAST_GAIN else field), report
+
+
+# `(data, rows, init, clutter, context) -> (field, report)` by name.
+INITIALISERS: dict[str, Callable[..., tuple[ConditionalField, FitReport]]] = {
+    "sources": sources,
+    "scene": scene,
+    "rays": rays,
+    "diffuse": diffuse,
+    "powers": powers,
+    "joint_powers": joint_powers,
+    "bearings": bearings,
+    "process": process_field.initialise,
+}
+# `(site, state) -> field` by the kind that a state names.
+RESTORED: dict[str, Callable[[Site, dict[str, Any]], ConditionalField]] = {
+    "sources": source_field.restored_sources,
+    "scene": source_field.restored_sources,
+    "rays": source_field.restored_rays,
+    "diffuse": channels.restored,
+    "powers": power_field.restored,
+    "joint_powers": joint_field.restored,
+    "bearings": bearing_field.restored,
+    "process": process_field.restored,
+}

@@ -1,0 +1,203 @@
+"""Occlusion of path legs by boxes and patches.
+
+A box blocks legs with a chord of more than a few centimetres. A patch is a rectangle on a mirror plane: a
+plane with patches reflects only inside them, and a patch blocks all other legs. Edges are soft, so that they
+can be moved by gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources.clutter.unfold import Paths
+
+MARGIN = 0.03  # [m], chord that is not blocked: legs end on the faces that reflect them
+SOFT = 0.02  # [m], width of a soft edge
+NEAR_PLANE = 0.02  # [m]; a leg that ends this close to a patch is reflected by it, not blocked
+
+
+@dataclass(frozen=True)
+class Clutter:
+    """Boxes and patches of one scene, in its frame.
+
+    Attributes:
+        boxes: (B, 6) float32 [m], lower then upper corners.
+        patches: (Q, 4) float32 [m], lower then upper corners along the plane's `tangents`.
+        plane: Q indices of planes of the scene.
+    """
+
+    boxes: Tensor
+    patches: Tensor
+    plane: tuple[int, ...]
+
+    @staticmethod
+    def none() -> Clutter:
+        """No boxes, infinite mirrors."""
+        return Clutter(torch.zeros(0, 6), torch.zeros(0, 4), ())
+
+    def __len__(self) -> int:
+        return len(self.boxes) + len(self.patches)
+
+    def with_box(self, box: Tensor, at: int | None = None) -> Clutter:
+        """One more box (6,), in place `at`."""
+        at = len(self.boxes) if at is None else at
+        return replace(self, boxes=torch.cat([self.boxes[:at], box[None], self.boxes[at:]]))
+
+    def with_patch(self, patch: Tensor, plane: int) -> Clutter:
+        """One more patch (4,)."""
+        patches = torch.cat([self.patches, patch[None]])
+        return replace(self, patches=patches, plane=(*self.plane, plane))
+
+    def without(self, number: int) -> Clutter:
+        """One piece less; boxes count before patches."""
+        boxes = [i for i in range(len(self.boxes)) if i != number]
+        kept = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
+        return Clutter(self.boxes[boxes], self.patches[kept], tuple(self.plane[i] for i in kept))
+
+    def renamed(self, new: dict[int, int]) -> Clutter:
+        """Planes of new indices; patches of planes without one are dropped."""
+        kept = [i for i, plane in enumerate(self.plane) if plane in new]
+        return replace(self, patches=self.patches[kept], plane=tuple(new[self.plane[i]] for i in kept))
+
+
+def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
+    """Visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
+    return Obstacles.of(clutter, planes, paths.valid.shape[0]).visible_share(paths, soft)
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Clutter of one or more scenes, prepared for paths of all their K sources.
+
+    Attributes:
+        boxes: (B, 6).
+        box_mask: (B, K, 1) bool, sources that a box applies to.
+        patches: (Q, 4).
+        patch_mask: (Q, K, 1) bool, sources that a patch applies to.
+        plane: (Q, 1, 1, 1) planes of the patches.
+        axes: (3, Q, 3), normals and both tangents of these planes.
+        offset: (Q, 1, 1, 1) of these planes.
+        ends: (P + 1,) bool, which planes have patches; the last is no plane.
+    """
+
+    boxes: Tensor
+    box_mask: Tensor
+    patches: Tensor
+    patch_mask: Tensor
+    plane: Tensor
+    axes: Tensor
+    offset: Tensor
+    ends: Tensor
+
+    @staticmethod
+    def of(clutter: Clutter, planes: Tensor, sources: int) -> Obstacles:
+        """From one scene's clutter, planes (P, 4) and number of sources."""
+        plane = torch.tensor(clutter.plane, dtype=torch.long)
+        ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
+        ends[plane] = True
+        used = planes[plane]
+        axes = [torch.cat([_units(plane[None]), tangents(plane)]) for plane in used]
+        return Obstacles(
+            clutter.boxes,
+            torch.ones(len(clutter.boxes), sources, 1, dtype=torch.bool),
+            clutter.patches,
+            torch.ones(len(plane), sources, 1, dtype=torch.bool),
+            plane.view(-1, 1, 1, 1),
+            torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3),
+            used[:, 3].float().view(-1, 1, 1, 1),
+            ends,
+        )
+
+    @staticmethod
+    def concatenate(many: list[Obstacles]) -> Obstacles:
+        """Of several scenes, with consecutive indices of sources and planes."""
+        planes = torch.tensor([0] + [len(s.ends) - 1 for s in many]).cumsum(0).tolist()
+        names = ("boxes", "patches", "offset")
+        return Obstacles(
+            **{name: torch.cat([getattr(s, name) for s in many]) for name in names},
+            box_mask=_blocks([s.box_mask for s in many]),
+            patch_mask=_blocks([s.patch_mask for s in many]),
+            plane=torch.cat([s.plane + first for s, first in zip(many, planes, strict=False)]),
+            axes=torch.cat([s.axes for s in many], 1),
+            ends=torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
+        )
+
+    def visible_share(self, paths: Paths, soft: float = SOFT) -> Tensor:
+        """Visible share (K, n) in [0, 1] of each source."""
+        seen = torch.ones(paths.valid.shape)
+        if len(self.boxes):
+            passed = torch.where(self.box_mask, past_boxes(paths, self.boxes, soft), 1.0)
+            seen = seen * passed.prod(0)
+        if len(self.patches):
+            seen = seen * self._past_patches(paths, soft)
+        return seen
+
+    def _past_patches(self, paths: Paths, soft: float) -> Tensor:
+        mine = (self.patch_mask & paths.valid)[..., None]  # (Q, K, n, 1)
+        turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
+        height, *place = turned.unflatten(0, (3, -1))  # each (Q, K, n, L + 1)
+        height = height - self.offset
+        away, (above, below) = height.abs() > NEAR_PLANE, (height[..., :-1], height[..., 1:])
+        ends_here = paths.plane == self.plane
+        crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
+        share = torch.where(crosses, above / (above - below), 1.0)
+        met = [each[..., :-1] + share * each.diff() for each in place]
+        outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & mine)
+        passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
+        reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
+        bounded = self.ends[paths.plane]
+        seen = passed * torch.where(bounded, reflected, 1.0).prod(-1)
+        # the sequences of a finite mirror are invisible where their path is not valid
+        return torch.where(paths.valid | ~bounded.any(-1), seen, 0.0)
+
+
+def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
+    """Share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
+    along = paths.end - paths.start
+    along = torch.where(along.abs() < 1e-6, 1e-6, along)
+    inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
+    enter, leave = torch.zeros(()), torch.ones(())
+    for axis in range(3):
+        low, high = boxes[:, axis::3].T.reshape(2, -1, 1, 1, 1)
+        one = (low - paths.start[..., axis]) * inverse[..., axis]
+        other = (high - paths.start[..., axis]) * inverse[..., axis]
+        enter = torch.maximum(enter, torch.minimum(one, other))
+        leave = torch.minimum(leave, torch.maximum(one, other))
+    chord = ((leave - enter) * length).amax(-1)  # negative for legs that miss
+    passed = torch.sigmoid((MARGIN - chord) / soft)
+    return torch.where(paths.valid, passed, 1.0)
+
+
+def within(points: Tensor, patches: Tensor) -> Tensor:
+    """Soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
+    return _inside([points[None, ..., 0], points[None, ..., 1]], patches, SOFT)
+
+
+def _inside(place: list[Tensor], patches: Tensor, soft: float) -> Tensor:
+    """Patches (Q, 4) against coordinates (1, ...), or (Q, ...), each against its own."""
+    u, v = place
+    low_u, low_v, high_u, high_v = patches.T.reshape(4, -1, *[1] * (u.dim() - 1))
+    inner = torch.minimum(torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v))
+    return torch.sigmoid(inner / soft)
+
+
+def _blocks(owned: list[Tensor]) -> Tensor:
+    """(B_i, K_i, 1) side by side on a diagonal."""
+    return torch.block_diag(*[o[..., 0].float() for o in owned])[..., None] > 0
+
+
+def tangents(plane: Tensor) -> Tensor:
+    """Two axes (2, 3) float32 along a plane (4,): level where they can be."""
+    normal = _units(plane[None])[0]
+    up, ahead = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
+    first = ahead if normal[2].abs() > 0.7 else torch.linalg.cross(up, normal)
+    first = first - (first @ normal) * normal
+    first = first / first.norm()
+    return torch.stack([first, torch.linalg.cross(normal, first)])
+
+
+def _units(planes: Tensor) -> Tensor:
+    return (planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)).float()

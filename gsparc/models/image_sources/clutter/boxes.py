@@ -1,0 +1,101 @@
+"""Find the box that would explain most of the residual: random candidates, then an evolution strategy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources.clutter.blocking import past_boxes
+from gsparc.models.image_sources.clutter.residual import CandidateScorer
+from gsparc.models.image_sources.clutter.unfold import Paths
+
+THINNEST = 0.03  # [m]
+SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
+TABLES, FLOOR = 0.35, 0.6  # of random boxes: shares that are thin plates, that do not stand on the floor
+CHILDREN = 6  # of each parent and round of the evolution strategy
+SPREAD, FALL = 0.3, 0.82  # first standard deviation of a mutation [m], and factor from round to round
+HALVED = (4, 8)  # rounds after which only the better half is kept
+STRONGEST = 24  # number of sources that a box is searched with
+
+
+def evolve(
+    parents: Tensor,
+    score: Callable[[Tensor], Tensor],
+    repaired: Callable[[Tensor], Tensor],
+    generator: torch.Generator,
+    rounds: int = 14,
+) -> tuple[Tensor, float]:
+    """The best descendant (d,) of parents (m, d), and its score, by a (mu, lambda) evolution strategy."""
+    best, spread = score(parents), SPREAD
+    for number in range(rounds):
+        born = parents.repeat_interleave(CHILDREN, 0)
+        which = torch.rand(born.shape, generator=generator) < 0.5
+        born = repaired(born + spread * torch.randn(born.shape, generator=generator) * which)
+        scores, chosen = score(born).view(len(parents), -1).max(1)
+        better = scores > best
+        heirs = born.view(len(parents), -1, born.shape[1])[torch.arange(len(parents)), chosen]
+        parents = torch.where(better[:, None], heirs, parents)
+        best, spread = torch.maximum(best, scores), spread * FALL
+        if number in HALVED:
+            kept = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
+            parents, best = parents[kept], best[kept]
+    first = int(best.argmax())
+    return parents[first], float(best[first])
+
+
+def find_box(
+    scorer: CandidateScorer,
+    paths: Paths,
+    visible_waves: Tensor,
+    room: Tensor,
+    generator: torch.Generator,
+    *,
+    draws: int = 1000,
+    parents: int = 12,
+    seeds: Tensor | None = None,
+) -> tuple[Tensor, float]:
+    """The box (6,) whose shadow explains most, and its gain [nats].
+
+    Args:
+        scorer: what is left.
+        paths: of all K sources.
+        visible_waves: (n, K) complex, waves of the sources under the present clutter.
+        room: (2, 3) [m], where boxes may be.
+        generator: of the candidates.
+        draws, parents: random boxes, and how many of them evolve.
+        seeds: (s, 6) more parents.
+    """
+    waves = visible_waves * scorer.gains
+    chosen = waves.abs().square().sum(0).topk(min(STRONGEST, waves.shape[1])).indices
+    few, waves = paths.take(chosen), waves[:, chosen]
+
+    def score(boxes: Tensor) -> Tensor:
+        return scorer.score_shares(boxes, lambda part: past_boxes(few, part) - 1, waves)
+
+    def repaired(boxes: Tensor) -> Tensor:
+        return inside_out(boxes, room)
+
+    drawn = repaired(_random(draws, room, generator))
+    drawn = drawn[score(drawn).topk(min(parents, draws)).indices]
+    if seeds is not None:
+        drawn = torch.cat([drawn, repaired(seeds)])
+    return evolve(drawn, score, repaired, generator)
+
+
+def inside_out(boxes: Tensor, room: Tensor) -> Tensor:
+    """Boxes (m, 6) cut to the room, their corners in order."""
+    low = torch.minimum(boxes[:, :3], boxes[:, 3:] - THINNEST)
+    return torch.cat([torch.maximum(low, room[0]), torch.minimum(boxes[:, 3:], room[1])], 1)
+
+
+def _random(count: int, room: Tensor, generator: torch.Generator) -> Tensor:
+    middle = room[0] + (room[1] - room[0]) * torch.rand(count, 3, generator=generator)
+    kind = torch.rand(count, generator=generator)
+    size = SMALLEST * torch.exp(torch.rand(count, 3, generator=generator) * math.log(LARGEST / SMALLEST))
+    size[kind < TABLES, 2] = 2 * THINNEST
+    low, high = middle - size / 2, middle + size / 2
+    low[kind > FLOOR, 2] = room[0, 2]
+    return torch.cat([low, high], 1)

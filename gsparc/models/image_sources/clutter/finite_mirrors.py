@@ -1,0 +1,271 @@
+"""Finite mirrors: the best patch on a known plane, and small mirrors parallel to known walls.
+
+Few receivers see a reflection in a table top: as a source visible to all it stays below the noise. As a
+patch, only receivers whose reflection point lies on it are summed.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources.clutter.blocking import tangents, within
+from gsparc.models.image_sources.clutter.boxes import evolve
+from gsparc.models.image_sources.clutter.residual import CandidateScorer
+from gsparc.models.image_sources.clutter.unfold import Paths
+from gsparc.models.image_sources.rows import Rows
+from gsparc.physics.mirror_planes import Reflections, reflect
+from gsparc.physics.waves import LIGHT, NEAR_M, wave
+from gsparc.processes.worker import ask
+
+log = logging.getLogger(__name__)
+
+SMALLEST, LARGEST = 0.2, 3.0  # [m] sides of random patches
+MIN_SIDE = 0.05  # [m]
+PARALLEL = 0.999  # cosine of normals that are taken as equal
+CELL = 0.35  # [m], of the raster that small mirrors are searched on; larger where it has more than MOST_CELLS
+STEP = 0.08  # of a wavelength, between candidate planes
+BEHIND = 0.4  # [m], how far behind the receivers' box planes are tried
+MAX_SPAN = 6  # cells along each side of a rectangle
+MAX_CELLS = 2e8  # of all rasters along one wall's normal; larger sites are not searched
+MOST_CELLS = 1e7  # of them that are looked at, a microsecond each
+BLOCK_CELLS = 1e6  # of the rasters held at a time, four numbers each
+MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
+
+
+def find_patch(
+    scorer: CandidateScorer,
+    paths: Paths,
+    sequences: tuple[Reflections, ...],
+    number: int,
+    plane: Tensor,
+    visible_waves: Tensor,
+    room: Tensor,
+    generator: torch.Generator,
+    draws: int = 300,
+) -> tuple[Tensor, float]:
+    """The patch (4,) on plane `number` that, were its sequences seen only in it, explains most; and its nats.
+
+    Args:
+        scorer: what is left.
+        paths: of all K sources.
+        sequences: of the sources.
+        number, plane: (4,) which.
+        visible_waves: (n, K) complex, waves of the sources as they are seen now.
+        room: (2, 3) [m].
+        generator: of the candidates.
+        draws: random patches, of which the best evolve.
+    """
+    mine = [k for k, sequence in enumerate(sequences) if number in sequence]
+    few, waves = paths.take(mine), visible_waves[:, mine]
+    along = tangents(plane)
+    met, here = few.end @ along.T, few.plane == number
+    ends = room @ along.T
+    low, high = ends.amin(0), ends.amax(0)
+
+    def score(patches: Tensor) -> Tensor:
+        return scorer.score_shares(
+            patches, lambda part: torch.where(here, within(met, part), 1.0).prod(-1), waves
+        )
+
+    def repaired(patches: Tensor) -> Tensor:
+        lower = torch.minimum(patches[:, :2], patches[:, 2:] - MIN_SIDE)
+        return torch.cat([torch.maximum(lower, low), torch.minimum(patches[:, 2:], high)], 1)
+
+    middle = low + (high - low) * torch.rand(draws, 2, generator=generator)
+    side = SMALLEST * torch.exp(torch.rand(draws, 2, generator=generator) * math.log(LARGEST / SMALLEST))
+    drawn = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
+    drawn = drawn[score(drawn).topk(8).indices]
+    return evolve(drawn, score, repaired, generator, rounds=10)
+
+
+@dataclass(frozen=True)
+class SmallMirror:
+    """A patch on a plane of its own.
+
+    Attributes:
+        plane: (4,) float64.
+        patch: (4,) float32, along its tangents.
+        score: approximate gain of its sequences together [nats].
+    """
+
+    plane: Tensor
+    patch: Tensor
+    score: float
+
+
+def walls(planes: Tensor, sequences: tuple[Reflections, ...]) -> list[int]:
+    """Numbers of planes that make a source of one reflection."""
+    return [i for i in range(len(planes)) if (i,) in sequences]
+
+
+def find_mirrors(
+    rows: Rows,
+    scorer: CandidateScorer,
+    transmitter: Tensor,
+    planes: Tensor,
+    numbers: list[int],
+    room: Tensor,
+    most: int,
+) -> list[SmallMirror]:
+    """Small mirrors parallel to walls, best first.
+
+    For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
+    and before each wall) are collected in a raster of where it is met; integral images give every rectangle.
+    Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
+    `MOST_CELLS` are larger. Whether to go on is asked (`ask`) after each size of rectangle.
+
+    Args:
+        rows: n.
+        scorer: what is left.
+        transmitter: (3,) float64 [m].
+        planes, numbers: (P, 4), and which of them are walls.
+        room: (2, 3) [m], where mirrors may be.
+        most: of them.
+    """
+    wavelength = LIGHT / float(rows.frequency.mean())
+    alpha, known = scorer.alpha, planes[numbers]
+    found: list[SmallMirror] = []
+    scale = scorer.root.square().sum(0).view(2, -1).mean(0)  # of rows, diagonal of K^-1
+    normals: list[Tensor] = []
+    for plane in known:
+        normal = plane[:3] / plane[:3].norm()
+        if any((normal @ other).abs() >= PARALLEL for other in normals):
+            continue
+        normals.append(normal)
+        ends = (room.double() @ normal).sort().values
+        offsets = torch.arange(
+            float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
+        )
+        candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
+        many = 1 + 2 * len(known)
+        count = math.prod(_cells(room, tangents(candidates[0]), CELL)) * many * len(candidates)
+        if count > MAX_CELLS:
+            log.info("no search for small mirrors: %.0e raster cells at this site and wavelength", count)
+            continue
+        cell = CELL * math.sqrt(max(count / MOST_CELLS, 1.0))
+        each = max(math.prod(_cells(room, tangents(candidates[0]), cell)), len(rows)) * many
+        parts = [
+            _raster(rows, alpha, scale, transmitter, block, known, room, cell)
+            for block in candidates.split(max(1, int(BLOCK_CELLS / each)))
+        ]
+        total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
+        for number in total.topk(min(2 * most, len(total))).indices.tolist():
+            found.append(SmallMirror(candidates[number], corners[number], float(total[number])))
+    return _apart(found, 0.5 * wavelength)[:most]
+
+
+def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
+    """Whether two mirrors are parallel, closer than `apart` [m] and overlap."""
+    if (one.plane[:3] @ other.plane[:3]).abs() < PARALLEL or (one.plane[3] - other.plane[3]).abs() > apart:
+        return False
+    low, high = torch.maximum(one.patch, other.patch)[:2], torch.minimum(one.patch, other.patch)[2:]
+    return bool((high > low).all())
+
+
+def _apart(found: list[SmallMirror], least: float) -> list[SmallMirror]:
+    kept: list[SmallMirror] = []
+    for mirror in sorted(found, key=lambda m: -m.score):
+        if not any(same_mirror(mirror, other, least) for other in kept):
+            kept.append(mirror)
+    return kept
+
+
+def _raster(
+    rows: Rows,
+    alpha: Tensor,
+    scale: Tensor,
+    transmitter: Tensor,
+    candidates: Tensor,
+    known: Tensor,
+    room: Tensor,
+    cell: float,
+) -> tuple[Tensor, Tensor]:
+    """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
+    along = tangents(candidates[0])
+    low, cells = (room @ along.T).amin(0), _cells(room, along, cell)
+    tables = []
+    for arriving, met in _sources(rows, transmitter, candidates, known):
+        ask()
+        at = ((met @ along.T - low) / cell).floor().long()
+        inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
+        index = (at[..., 0] * cells[1] + at[..., 1]).clamp(0, cells[0] * cells[1] - 1)
+        own, blank = arriving.conj() * alpha, torch.zeros(len(candidates), cells[0] * cells[1])
+        values = (own.real, own.imag, arriving.abs().square() * scale, torch.ones(()))
+        binned = [blank.scatter_add(1, index, (value * inside).float()).view(-1, *cells) for value in values]
+        tables.append(binned)
+    stacked = (torch.stack(each).cumsum(-1).cumsum(-2) for each in zip(*tables, strict=True))
+    sums = [torch.nn.functional.pad(each, (1, 0, 1, 0)) for each in stacked]  # integral images
+    total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
+    # a few cells, or all there are: a wall that was missed
+    sizes = [sorted({*range(1, min(MAX_SPAN, count) + 1), count}) for count in cells]
+    for wide, high_by in product(*sizes):
+        ask()
+        if high_by == sizes[1][0]:
+            strips = [s[..., wide:, :] - s[..., :-wide, :] for s in sums]
+        real, imag, energy, count = (s[..., high_by:] - s[..., :-high_by] for s in strips)
+        score = (real.square() + imag.square()) / energy.clamp_min(1e-3) / 2
+        summed = ((score - 1).clamp_min(0) * (count >= MIN_SERVED)).sum(0)  # sequences add up: (C, u, v)
+        value, at = summed.flatten(1).max(1)
+        first = torch.stack([at // summed.shape[2], at % summed.shape[2]], 1)
+        span = torch.tensor([wide, high_by])
+        corners = torch.cat([low + cell * first, low + cell * (first + span)], 1)
+        better = value > total
+        total = torch.where(better, value, total)
+        best = torch.where(better[:, None], corners, best)
+    return total, best
+
+
+def _cells(room: Tensor, along: Tensor, cell: float) -> list[int]:
+    """Cells of that side [m] in a raster along each of two tangents (2, 3)."""
+    ends = room @ along.T
+    return ((ends.amax(0) - ends.amin(0)) / cell).ceil().long().clamp_min(1).tolist()
+
+
+def _sources(
+    rows: Rows, transmitter: Tensor, candidates: Tensor, known: Tensor
+) -> list[tuple[Tensor, Tensor]]:
+    """Waves (C, n) of every sequence over a candidate, and where it is met (C, n, 3), NaN if not."""
+    places = rows.position.float()
+    once, *more = _images(transmitter, candidates, known)
+    found = [_meeting(places, once, candidates)]
+    for wall, after, before in zip(known, more[::2], more[1::2], strict=True):
+        found.append(_meeting(places, after, candidates))
+        first = _meeting(places, before, wall[None].expand(len(candidates), 4))
+        found.append(_meeting(first, once, candidates))
+    sources = (
+        [once, *more] if rows.array is None else _images(rows.static_ends(transmitter), candidates, known)
+    )
+    away = ((_distance(rows, source), met) for source, met in zip(sources, found, strict=True))
+    return [(wave(distance, rows.frequency), met) for distance, met in away]
+
+
+def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
+    """Images (..., C, 3) of (..., 3) in each candidate, then after and before each wall."""
+    start = static[..., None, :]
+    once = reflect(start, candidates)
+    pairs = ((reflect(reflect(start, wall), candidates), reflect(once, wall)) for wall in known)
+    return [once, *(image for pair in pairs for image in pair)]
+
+
+def _distance(rows: Rows, sources: Tensor) -> Tensor:
+    """Distances (C, n) [m] from sources (C, 3), or (E, C, 3) of the static end's antennas."""
+    if rows.element is None:
+        return torch.cdist(sources, rows.position).clamp_min(NEAR_M)
+    apart = sources.index_select(0, rows.element) - rows.position[:, None]
+    return torch.linalg.vector_norm(apart, dim=-1).T.clamp_min(NEAR_M)
+
+
+def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
+    """Where lines from (n, 3) or (C, n, 3) to (C, 3) meet planes (C, 4); NaN where not between."""
+    normal, offset = planes[:, None, :3].float(), planes[:, None, 3].float()
+    end = end[:, None].float()
+    above, below = (start * normal).sum(-1) - offset, (end * normal).sum(-1) - offset
+    share = above / torch.where((above - below).abs() < 1e-6, torch.ones_like(above), above - below)
+    share = torch.where((above * below < 0), share, torch.full_like(share, math.nan))
+    return start + share[..., None] * (end - start)

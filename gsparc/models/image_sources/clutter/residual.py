@@ -1,0 +1,200 @@
+"""Residual of a scene, and the gain of another box, patch or source.
+
+The process of `phased_gp` with its covariance in two parts: varying gains and noise,
+factored once and held, and the sources' constant gains, a low-rank part that changes with every move of a box
+and is added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources.gp_likelihood import JITTER
+from gsparc.models.image_sources.phased_gp import PhasedScene, add_source, shares, stacked
+from gsparc.models.image_sources.rows import Rows
+from gsparc.processes.factor import Factor
+from gsparc.processes.worker import ask
+
+TRIED = 1.5  # factor between two candidates of the noise variance
+LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
+BLOCK = 64  # candidates at a time
+CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # candidates
+
+
+class Residual:
+    """Rows of one output against a phased scene; n rows are 2 n real numbers.
+
+    Args:
+        rows: R = 1.
+        phased: its clutter attenuates the varying part; callers pass the visible shares of the constant part.
+        noise_floor: known variance of the noise, in units of the rows' power.
+
+    Attributes:
+        phased: as given, constant share and noise chosen by likelihood.
+    """
+
+    def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
+        self.rows, self.noise_floor = rows, noise_floor
+        self.target = stacked(rows.target)[0][:, 0]
+        self.waves = phased.unobstructed(rows)
+        self._cached = self._parts(phased)
+        self.phased = self._tuned(phased)
+        constant = float(self.phased.scene.visibility.constant)
+        self._factor(constant, self.phased.scene.log_noise, phased.quadrature)
+        self.share = self._constant(constant, phased.quadrature)
+        self.root = self._own.root
+        self.white = self.root @ self.target
+        del self._cached, self._own
+
+    def _parts(self, phased: PhasedScene) -> tuple[Tensor, Tensor]:
+        """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
+        n, scene = len(self.rows), phased.scene
+        scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
+        varying, kernel = torch.zeros(2, n, 2, n), replace(scene.visibility, constant=0.0)
+        for k, source in enumerate(scene.sources):
+            correlation = kernel.correlation(self.rows.places, source)
+            add_source(varying, scaled[:, k], phased.quadrature, correlation)
+        across = stacked(scaled)[1]
+        return varying.view(2 * n, 2 * n), shares(phased.quadrature)[1] * (across @ across.T)
+
+    def _tuned(self, phased: PhasedScene) -> PhasedScene:
+        """Constant share and noise by likelihood, in turn on a grid."""
+        columns = stacked(phased.waves(self.rows) * phased.scene.log_amplitude.exp())[0]
+        kernel, noise = phased.scene.visibility, phased.scene.log_noise
+        constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
+
+        def cost(constant: float, noise: float) -> float:
+            self._factor(constant, noise, phased.quadrature)
+            whitened = self._own.whitened(columns * self._constant(constant, phased.quadrature))
+            white = self._own.whitened(self.target[:, None])[:, 0]
+            return _cost(whitened, white, self._determinant).item()
+
+        best = cost(constant, noise)
+        for _ in range(2):
+            place = CONSTANTS.index(constant)
+            for direction in (-1, 1):
+                at = place + direction
+                while 0 <= at < len(CONSTANTS) and (new := cost(CONSTANTS[at], noise)) < best:
+                    best, constant, at = new, CONSTANTS[at], at + direction
+            for step in (-math.log(TRIED), math.log(TRIED)):
+                while noise + step > math.log(LEAST_NOISE) and (new := cost(constant, noise + step)) < best:
+                    best, noise = new, noise + step
+        scene = replace(phased.scene, visibility=replace(kernel, constant=constant), log_noise=noise)
+        return replace(phased, scene=scene)
+
+    def _factor(self, constant: float, noise: float, quadrature: float) -> None:
+        varying, across = self._cached
+        covariance = (1 - constant) * varying + constant * across
+        covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
+        self._own = Factor.of(covariance)
+        self._determinant = 0.5 * float(self._own.log_determinant)
+
+    @staticmethod
+    def _constant(constant: float, quadrature: float) -> float:
+        return math.sqrt(constant * (1 - quadrature / 2))
+
+    # ---- the constant part ----
+    def columns(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+        """Constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
+        scaled = (self.waves if waves is None else waves) * (
+            visible_share.T * log_amplitude.exp() * self.share
+        )
+        return self.root @ torch.cat([scaled.real, scaled.imag])
+
+    def nll(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+        """Negative log likelihood (), in nats; differentiable."""
+        return _cost(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
+
+    def nats_per_source(self, visible_share: Tensor, log_amplitude: Tensor) -> Tensor:
+        """Log likelihood lost without each source's constant part (K,) [nats]."""
+        columns = self.columns(visible_share, log_amplitude)
+        inner, seen = _inner(columns, self.white)
+        inverse = Factor.of(inner).inverse
+        mean, spread = inverse @ seen, inverse.diagonal()
+        return (0.5 * (mean.square() / spread + spread.log())).float()
+
+    def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
+        """Scorer of candidates, with the constant parts at their posterior means removed."""
+        columns = self.columns(visible_share, log_amplitude)
+        inner, seen = _inner(columns, self.white)
+        own = Factor.of(inner)
+        mean, projection = own.solved(seen[:, None])[:, 0].float(), own.whitened(columns.T.double()).float()
+        gains = mean * self.share * log_amplitude.exp()
+        return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
+
+
+class CandidateScorer:
+    """Residual after the constant parts, and gains of candidate changes.
+
+    Attributes:
+        gains: (K,) float32, posterior mean of each source's constant gain along its phase.
+    """
+
+    def __init__(self, root: Tensor, projection: Tensor, residual: Tensor, gains: Tensor) -> None:
+        self.root, self.projection, self.residual, self.gains = root, projection, residual, gains
+
+    @property
+    def alpha(self) -> Tensor:
+        """K^-1 y (n,) complex64, constant parts removed."""
+        n = len(self.residual) // 2
+        both = self.root.T @ self.residual
+        return torch.complex(both[:n], both[n:])
+
+    def score(self, change: Tensor) -> Tensor:
+        """Nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
+        return self.score_positive(change)[0]
+
+    def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
+        """Nats (m,) of adding waves (n, K), each times its `share` (b, K, n) under b of m candidates."""
+        scores = []
+        for part in candidates.split(BLOCK):
+            ask()
+            each = share(part)
+            change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
+            scores.append(self.score(torch.complex(*change)))
+        return torch.cat(scores)
+
+    def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
+        """The same, and the multiples (M,)."""
+        whitened = self.root @ torch.cat([change.real, change.imag])
+        power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
+        matched = (self.residual @ whitened).clamp_min(0)
+        multiple = torch.where(power > 1e-2, matched / power.clamp_min(1e-2), 0.0)
+        return multiple * matched / 2, multiple
+
+    def score_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
+        """Nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
+        parts = [self.root @ part for part in stacked(waves)]
+        seen = [self.projection @ part for part in parts]
+        dot = [
+            [(parts[i] * parts[j]).sum(0) - (seen[i] * seen[j]).sum(0) for j in range(2)] for i in range(2)
+        ]
+        along, across = (self.residual @ part for part in parts)
+        determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(1e-9)
+        gain = torch.complex(
+            (dot[1][1] * along - dot[0][1] * across) / determinant,
+            (dot[0][0] * across - dot[0][1] * along) / determinant,
+        )
+        return (along * gain.real + across * gain.imag) / 2, gain
+
+
+def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
+    """`I + C^T C` (K, K) and `C^T y` (K,), float64, of whitened columns (2 n, K) and targets (2 n,).
+
+    Entries of C^T C are rows over noise, 1e7 where there is hardly any: float32 would round the I away.
+    """
+    ask()
+    exact = columns.double()
+    return exact.T @ exact + torch.eye(columns.shape[1], dtype=torch.float64), exact.T @ white.double()
+
+
+def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
+    inner, seen = _inner(columns, white)
+    own = Factor.of(inner)
+    explained = white.double().square().sum() - own.whitened(seen[:, None]).square().sum()
+    return determinant + 0.5 * (own.log_determinant + explained)

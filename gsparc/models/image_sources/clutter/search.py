@@ -1,0 +1,391 @@
+"""Greedy search for clutter: finite mirrors, occluding boxes and reflections in them, kept by likelihood."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources import refine_phase
+from gsparc.models.image_sources.backprojection import pick_apart
+from gsparc.models.image_sources.clutter.blocking import SOFT, Clutter, tangents, visible_share, within
+from gsparc.models.image_sources.clutter.boxes import find_box, inside_out
+from gsparc.models.image_sources.clutter.finite_mirrors import (
+    SmallMirror,
+    find_mirrors,
+    find_patch,
+    same_mirror,
+    walls,
+)
+from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
+from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual
+from gsparc.models.image_sources.gp_likelihood import JITTER, Scene
+from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.physics.mirror_planes import Reflections, all_sequences
+from gsparc.physics.waves import LIGHT
+from gsparc.processes.worker import Ended, ask, ended_by
+
+log = logging.getLogger(__name__)
+
+BOX, PATCH, MIRROR, WALL = 6, 4, 5, 3  # parameters of a box, a patch, a patch on a new plane, a new plane
+INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
+MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
+SAME_FACE_M = 0.03  # [m]; a box face that has moved less is not tried again as a mirror
+NEAR_WALL_M = 0.25  # [m]; faces closer to the end of the room are not tried as mirrors
+EPOCHS = 6  # rounds of everything, softer edges first
+SOFT_EDGES = (0.08, 0.05, 0.03)  # [m] width of edges in each epoch, the last for all that follow
+STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
+PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
+MIN_GAIN, MIRROR_SCORE = 12.0, 8.0  # least [nats] of a candidate, predicted; of a mirror, offset searched
+BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
+BEYOND = 0.15  # [m] margin of clutter around the receivers' box
+SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
+
+
+def find_clutter(
+    rows: Rows,
+    phased: PhasedScene,
+    generator: torch.Generator,
+    late: Callable[[], bool] = lambda: False,
+    noise_floor: float = JITTER,
+) -> PhasedScene:
+    """The phased scene with clutter, or unchanged when the likelihood gains too little.
+
+    A piece must gain half the logarithm of the number of real observations per parameter:
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
+
+    Args:
+        rows: of one output, as many as in a search.
+        phased: from the final refinement of a search.
+        generator: of the candidates.
+        late: asked again and again; what was found so far is the result when it says so.
+        noise_floor: known variance of the noise, in units of the rows' power.
+    """
+    # The kernel learned without clutter explains it: reset
+    bare, quadrature = replace(phased.scene, visibility=INITIAL_KERNEL), min(phased.quadrature, QUADRATURE)
+    fresh = replace(phased, scene=bare, quadrature=quadrature)
+    found = _ClutterSearcher(rows, fresh, generator, noise_floor).run(late)
+    before, after = (PhasedPosterior(rows, each, noise_floor).conditioned.nll for each in (phased, found))
+    return found if after < before - PROGRESS else phased
+
+
+class _ClutterSearcher:
+    def __init__(
+        self,
+        rows: Rows,
+        phased: PhasedScene,
+        generator: torch.Generator,
+        noise_floor: float,
+    ) -> None:
+        self.rows, self.generator = rows, generator
+        self.noise_floor, self.wavelength = noise_floor, LIGHT / float(rows.frequency.mean())
+        self.parameter_cost = math.log(2 * len(rows)) / 2  # cost of a parameter [nats]
+        self.tried: list[SmallMirror] = []
+        ends = torch.stack([rows.position.amin(0) - BEYOND, rows.position.amax(0) + BEYOND])
+        self.room = ends.float()
+        self._refactor(phased)
+
+    # ---- state ----
+    def _refactor(self, phased: PhasedScene) -> None:
+        """Factor the residual's covariance at a scene."""
+        self.residual = Residual(self.rows, phased, self.noise_floor)
+        self.phase_prior = ReflectionPhasePrior.of(phased)
+        self._set_scene(self.residual.phased)
+
+    def _set_scene(self, phased: PhasedScene) -> None:
+        """Set the scene, with the varying part still that of the residual."""
+        self.phased, self.paths = phased, phased.scene.unfolding.paths(self.rows.position)
+        self.waves = phased.unobstructed(self.rows)
+        self.visible = visible_share(self.paths, phased.scene.clutter, phased.scene.planes)
+        self.residual.waves = self.waves
+        self.nll = self.residual.nll(self.visible, phased.scene.log_amplitude).item()
+
+    @property
+    def scene(self) -> Scene:
+        return self.phased.scene
+
+    def _scorer(self) -> CandidateScorer:
+        return self.residual.scorer(self.visible, self.scene.log_amplitude)
+
+    def _try(self, scene: Scene, least: float, phase: Tensor | None = None, exact: bool = False) -> bool:
+        """Accept a scene after a few steps of descent, when it gains at least `least` nats.
+
+        Varying part and noise are those last factored; with `exact` they are the new scene's own, since the
+        old ones would explain what the new scene occludes.
+        """
+        residual, before, nll = self.residual, self.phased, self.nll
+        self._set_scene(replace(before, scene=scene, phase=before.phase if phase is None else phase))
+        self._descend(6)
+        if self.nll < nll - least:
+            if exact:
+                self._refactor(self.phased)
+            if self.nll < nll - least:
+                return True
+        self.residual = residual
+        self._set_scene(before)
+        return False
+
+    def _descend(self, steps: int, soft: float = SOFT) -> None:
+        found = descend(self.residual, self.phased, self.paths, steps, soft, self.phase_prior)
+        clutter = found.scene.clutter
+        tidy = replace(clutter, boxes=inside_out(clutter.boxes, self.room))
+        self._set_scene(replace(found, scene=replace(found.scene, clutter=tidy)))
+
+    # ---- the loop ----
+    def run(self, late: Callable[[], bool]) -> PhasedScene:
+        start = self.nll
+        best = self.whole = start, self.phased
+        try:
+            with ended_by(late):  # within a step, too
+                for epoch in range(EPOCHS):
+                    before = self.nll
+                    self._improve(SOFT_EDGES[min(epoch, len(SOFT_EDGES) - 1)])
+                    best = min(best, self.whole, key=lambda b: b[0])
+                    log.debug(
+                        "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
+                        epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches),
+                        len(self.scene.sequences), self.nll, start, math.exp(self.scene.log_noise),
+                        self.scene.visibility,
+                    )  # fmt: skip
+                    if self.nll > before - PROGRESS:
+                        break
+        except Ended:
+            ask()  # by the clock alone: what was found so far is the result
+            best = min(best, self.whole, key=lambda b: b[0])
+        return best[1]
+
+    def _improve(self, soft: float) -> None:
+        """One round of everything; what each step leaves is `whole`."""
+        steps = (
+            self._mirrors, self._patches, self._boxes, self._sequences, partial(self._settle, soft),
+            self._settle_boxes,
+        )  # fmt: skip
+        for step in steps:
+            step()
+            self.whole = self.nll, self.phased
+
+    def _settle(self, soft: float) -> None:
+        self._descend_soft(soft)
+        self._drop()
+        self._refactor(self.phased)
+
+    def _settle_boxes(self) -> None:
+        self._relocate_boxes()
+        self._descend(10)
+        self._drop()
+        self._refactor(self.phased)
+        self._drop_sequences()
+        cost = partial(self.phase_prior.cost, sequences=self.scene.sequences)
+        self._refactor(refine_phase.refine(self.rows, self.phased, STEPS, self.noise_floor, cost))
+
+    def _descend_soft(self, soft: float) -> None:
+        """Descend with softer edges, whose gradients reach farther, then with sharp ones."""
+        before, nll = self.phased, self.nll
+        self._descend(16, soft)
+        self._descend(10)
+        if self.nll > nll:
+            self._set_scene(before)
+            self._descend(10)
+
+    def _mirrors(self) -> None:
+        scene = self.scene
+        found = find_mirrors(
+            self.rows, self._scorer(), scene.transmitter, scene.planes,
+            walls(scene.planes, scene.sequences), self.room, 2 * MIRRORS,
+        )  # fmt: skip
+        found = [mirror for mirror in found if mirror.score > MIN_GAIN]
+        scorer = self._scorer()
+        placed = [self._placed(mirror, scorer) for mirror in [*found, *self._mirrors_on_boxes()]]
+        added: list[SmallMirror] = []
+        for mirror in sorted(placed, key=lambda m: -m.score):
+            if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
+                break
+            double = any(same_mirror(mirror, other, self.wavelength) for other in added)
+            if not double and self._add_mirror(mirror):
+                added.append(mirror)
+
+    def _mirrors_on_boxes(self) -> list[SmallMirror]:
+        """Faces of boxes that are not on floor or walls, as mirrors."""
+        found = []
+        for box in self.scene.clutter.boxes:
+            for axis in range(3):
+                for end in (0, 3):
+                    offset = float(box[axis + end])
+                    if min(offset - self.room[0, axis], self.room[1, axis] - offset) < NEAR_WALL_M:
+                        continue
+                    plane = torch.zeros(4, dtype=torch.float64)
+                    plane[axis], plane[3] = 1.0, offset
+                    corners = box.view(2, 3) @ tangents(plane).T
+                    patch = torch.cat([corners.amin(0), corners.amax(0)])
+                    mirror = SmallMirror(plane, patch, 0.0)
+                    if not any(same_mirror(mirror, other, SAME_FACE_M) for other in self.tried):
+                        found.append(mirror)
+        self.tried += found
+        return found
+
+    def _placed(self, mirror: SmallMirror, scorer: CandidateScorer) -> SmallMirror:
+        """The mirror at the offset along its normal that fits the phase prior best."""
+        if self.phase_prior.concentration < MIN_CONCENTRATION:
+            return mirror
+        moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
+        planes = mirror.plane.repeat(len(moves), 1)
+        planes[:, 3] += moves
+        scene, known = self.scene, walls(self.scene.planes, self.scene.sequences)
+        first = len(scene.planes)
+        sequences = [sequence for i in range(len(moves)) for sequence in _sequences_over(first + i, known)]
+        trial = replace(scene, planes=torch.cat([scene.planes, planes]), sequences=tuple(sequences))
+        paths = trial.unfolding.paths(self.rows.position)
+        inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
+        inside = torch.where(paths.plane >= first, inside, 1.0).prod(-1)
+        seen = visible_share(paths, scene.clutter, trial.planes) * inside * paths.valid
+        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], trial.sequences))
+        scores = scorer.score(trial.unobstructed(self.rows) * seen.T * turn)
+        total = scores.view(len(moves), -1).sum(1)
+        best = int(total.argmax())
+        return SmallMirror(planes[best], mirror.patch, float(total[best]))
+
+    def _add_mirror(self, mirror: SmallMirror) -> bool:
+        """Try a small mirror with its best sequences; a wide one as an infinite wall first."""
+        scene, number = self.scene, len(self.scene.planes)
+        sequences = _sequences_over(number, walls(scene.planes, scene.sequences))
+        endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
+        trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
+        if self._wide(mirror) and self._add(
+            endless, sequences, 1.5, WALL * self.parameter_cost, len(sequences)
+        ):
+            return True
+        return self._add(trial, sequences, 1.5, MIRROR * self.parameter_cost, len(sequences))
+
+    def _wide(self, mirror: SmallMirror) -> bool:
+        """Whether a mirror covers most of the room."""
+        ends = self.room @ tangents(mirror.plane).T
+        return bool((mirror.patch[2:] - mirror.patch[:2] > 0.7 * (ends[1] - ends[0]).abs()).all())
+
+    def _sequence_scores(
+        self, scene: Scene, sequences: list[Reflections], scorer: CandidateScorer
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of sequences over planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
+        candidates = replace(scene, sequences=tuple(sequences))
+        paths = candidates.unfolding.paths(self.rows.position)
+        seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
+        waves = candidates.unobstructed(self.rows) * seen.T
+        if self.phase_prior.concentration < MIN_CONCENTRATION:
+            return *scorer.score_waves(waves), candidates.sources
+        turn = torch.polar(
+            torch.ones(()), self.phase_prior.expected(self.phased.phase[0], candidates.sequences)
+        )
+        scores, gains = scorer.score_positive(waves * turn)
+        return scores, gains * turn, candidates.sources
+
+    def _add(
+        self, scene: Scene, sequences: list[Reflections], min_score: float, least: float, most: int
+    ) -> bool:
+        """Try sequences of at least `min_score` nats, on a scene that may have more planes and patches."""
+        # new patches occlude present sequences, too
+        hidden = visible_share(self.paths, scene.clutter, scene.planes)
+        scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
+        scores, gains, sources = self._sequence_scores(scene, sequences, scorer)
+        clear = torch.cdist(sources, self.scene.sources).amin(1) > 0.5 * self.wavelength
+        chosen = pick_apart(sources, scores * clear, 0.5 * self.wavelength, most, min_score)
+        if not chosen:
+            return False
+        strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
+        phase = torch.cat([self.phased.phase, gains[chosen].angle()])
+        return self._try(scene.with_sequences([sequences[i] for i in chosen], strong), least, phase)
+
+    def _patches(self) -> None:
+        """Try patches on infinite mirrors."""
+        scene, scorer = self.scene, self._scorer()
+        visible_waves, found = self.waves * self.visible.T, []
+        for number in set(range(len(scene.planes))) - set(scene.clutter.plane):
+            patch, score = find_patch(
+                scorer, self.paths, scene.sequences, number, scene.planes[number], visible_waves, self.room,
+                self.generator,
+            )  # fmt: skip
+            found.append((score, number, patch))
+        for score, number, patch in sorted(found, key=lambda f: -f[0]):
+            if score < MIN_GAIN:
+                break
+            own = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
+            louder = self.scene.log_amplitude.clone()
+            louder[own] = louder[own].clamp_min(float(louder.median()))
+            clutter = self.scene.clutter.with_patch(patch, number)
+            trial = replace(self.scene, log_amplitude=louder, clutter=clutter)
+            self._try(trial, PATCH * self.parameter_cost, exact=True)
+
+    def _boxes(self) -> None:
+        for _ in range(BOXES):
+            box, score = find_box(
+                self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator
+            )
+            if score < MIN_GAIN:
+                break
+            clutter = self.scene.clutter.with_box(box)
+            if not self._try(replace(self.scene, clutter=clutter), BOX * self.parameter_cost):
+                break
+
+    def _sequences(self) -> None:
+        """Try more sequences over the present planes."""
+        scene, known = self.scene, set(self.scene.sequences)
+        indices = list(range(len(scene.planes)))
+        longer = [(*w, i) for w in scene.sequences if 0 < len(w) < 3 for i in indices if w[-1] != i]
+        sequences = [w for w in dict.fromkeys(all_sequences(indices, 2) + longer) if w not in known]
+        if not sequences:
+            return
+        scores, _ = self._scorer().score_waves(
+            replace(scene, sequences=tuple(sequences)).unobstructed(self.rows)
+        )
+        best = scores.topk(min(60, len(sequences))).indices.tolist()
+        self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, SEQUENCES)
+
+    def _relocate_boxes(self) -> None:
+        """Search for every box anew, given the others."""
+        for number in range(len(self.scene.clutter.boxes)):
+            before, own = self.phased, self.scene.clutter.boxes[number]
+            nll = self.nll
+            self._set_scene(self._with_clutter(self.scene.clutter.without(number)))
+            near = own + 0.1 * torch.randn(4, 6, generator=self.generator)
+            box, _ = find_box(
+                self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator,
+                draws=400, parents=8, seeds=torch.cat([own[None], near]),
+            )  # fmt: skip
+            self._set_scene(self._with_clutter(self.scene.clutter.with_box(box, number)))
+            if self.nll > nll - 0.5:
+                self._set_scene(before)
+
+    def _with_clutter(self, clutter: Clutter) -> PhasedScene:
+        return replace(self.phased, scene=replace(self.scene, clutter=clutter))
+
+    def _drop(self) -> None:
+        """Remove clutter that the likelihood no longer supports."""
+        number = 0
+        while number < len(clutter := self.scene.clutter):
+            parameters, before, nll = BOX if number < len(clutter.boxes) else PATCH, self.phased, self.nll
+            self._set_scene(self._with_clutter(clutter.without(number)))
+            if self.nll > nll + parameters * self.parameter_cost:
+                self._set_scene(before)
+                number += 1
+
+    def _drop_sequences(self) -> None:
+        """Remove sources whose constant and varying parts both gain too little."""
+        gains = self.residual.nats_per_source(self.visible, self.scene.log_amplitude)
+        kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
+        dropped = len(gains) - len(kept)
+        if dropped:
+            residual, before, nll = self.residual, self.phased, self.nll
+            self._refactor(replace(before, scene=self.scene.only(kept), phase=before.phase[kept]))
+            if self.nll > nll + dropped * self.parameter_cost:
+                self.residual = residual
+                self._set_scene(before)
+
+
+def _sequences_over(number: int, known: list[int]) -> list[Reflections]:
+    """Words over a plane: itself, after and before each wall."""
+    return [(number,), *((wall, number) for wall in known), *((number, wall) for wall in known)]

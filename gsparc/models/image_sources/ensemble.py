@@ -1,0 +1,186 @@
+"""Ensemble of searches within a time budget, in parallel on the available threads."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources import refine_phase
+from gsparc.models.image_sources.clutter.search import find_clutter
+from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.search import Search, SearchSettings
+from gsparc.models.image_sources.search_cache import Member, SearchCache
+from gsparc.processes.worker import Ended, ended_by
+from gsparc.training.time_budget import TimeBudget
+
+log = logging.getLogger(__name__)
+
+QUADRATURE = 0.4  # initial `PhasedScene.quadrature`
+SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
+CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
+# Of the budget: no search starts, none adds sources, none goes on after; the rest is for the final process.
+LAST_START, ROUNDS_END, SEARCH_END = 0.6, 0.8, 0.9
+FINAL_SHARE = 0.1  # least share of the budget for the final process
+PROGRESS_S = 10.0  # [s] between two lines about progress
+COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
+
+
+def search_many(
+    row_sets: list[Rows],
+    transmitter: Tensor,
+    settings: SearchSettings,
+    seed: int,
+    noise_floor: float,
+    budget: TimeBudget,
+    clutter: bool,
+    cache: SearchCache,
+    stage: str = "search",
+) -> list[Member]:
+    """One search per set of rows, best first; at least one, others while the budget lasts.
+
+    Once two have reached the noise floor no further search starts, and those under way end without a result.
+
+    Args:
+        row_sets: rows of each search, unit mean power, about the middle of the scene.
+        transmitter: (3,) float64 [m], in the same frame.
+        settings: of every search.
+        seed: of the first search; the others count on.
+        noise_floor: known variance of the noise, in units of the rows' power.
+        budget: of all together; see `LAST_START`, `ROUNDS_END` and `SEARCH_END`.
+        clutter: search for occluding boxes and finite mirrors, too.
+        cache: of finished searches, under the name of `stage`.
+        stage: distinguishes searches of one fit.
+
+    Raises:
+        KeyboardInterrupt: by the user, within a step of each search.
+    """
+    errors: list[float] = []
+    stopped = threading.Event()
+
+    def unwanted() -> bool:
+        return stopped.is_set() or at_noise_floor(errors, noise_floor)
+
+    def search(number: int) -> Member | None:
+        if done := cache.find(stage, number):
+            errors.append(done.left_out)
+            return done
+        if unwanted() or (number > 0 and budget.over(LAST_START)):
+            return None
+        try:
+            with ended_by(unwanted):
+                member = _search(
+                    row_sets[number], transmitter, settings, seed, number, noise_floor, budget, clutter
+                )
+        except Ended:
+            return None
+        scene = member.phased.scene
+        log.info(
+            "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
+            number + 1, len(row_sets), len(scene.sequences), len(scene.planes), member.left_out,
+            budget.spent, budget.seconds,
+        )  # fmt: skip
+        errors.append(member.left_out)
+        cache.put(stage, member, budget.limited_by)
+        return member
+
+    threads = torch.get_num_threads()
+    # Parallel searches scale better than threaded factorisations of a few hundred rows.
+    torch.set_num_threads(1)
+    pool = ThreadPoolExecutor(max(1, min(threads, len(row_sets))))
+    try:
+        running = [pool.submit(search, number) for number in range(len(row_sets))]
+        _watch(running, budget)
+        found = [member for each in running if (member := each.result()) is not None]
+    finally:
+        stopped.set()
+        pool.shutdown(cancel_futures=True)  # waits for the step of each search
+        torch.set_num_threads(threads)
+    return sorted(found, key=lambda member: member.left_out)
+
+
+def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
+    """Wait for the searches; say every `PROGRESS_S` how long they may still take."""
+    waiting = set(running)
+    while waiting:
+        done, waiting = wait(waiting, PROGRESS_S, FIRST_EXCEPTION)
+        if any(each.exception() for each in done):
+            return
+        if waiting:
+            finished = sum(each.done() and each.result() is not None for each in running)
+            left = max(SEARCH_END * budget.seconds - budget.spent, 0.0)
+            log.info(
+                "%d of %d searches finished, %.0f of %.0f s, at most about %.0f s left",
+                finished, len(running), budget.spent, budget.seconds, left,
+            )  # fmt: skip
+
+
+def _search(
+    rows: Rows,
+    transmitter: Tensor,
+    settings: SearchSettings,
+    seed: int,
+    number: int,
+    noise_floor: float,
+    budget: TimeBudget,
+    clutter: bool,
+) -> Member:
+    """Search `number`, its phases, and the clutter that the noise does not hide."""
+    seed += number
+    over = partial(budget.over, SEARCH_END)
+    scene = Search(rows, transmitter, settings, seed, partial(budget.over, ROUNDS_END), over).run()
+    phased = PhasedScene.of(rows, scene, QUADRATURE)
+    phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor, over)
+    phased = refine_phase.refine(rows, phased, 20, noise_floor, late=over)
+    error = left_out_error(rows, phased, noise_floor)
+    if clutter and phased.quadrature < 1 and not at_noise_floor([error], noise_floor, 1) and compact(rows):
+        generator = torch.Generator().manual_seed(seed)
+        phased = find_clutter(rows, phased, generator, late=over, noise_floor=noise_floor)
+        error = left_out_error(rows, phased, noise_floor)
+    return Member(phased, error, number)
+
+
+def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
+    """A search's result on rows that have changed a little."""
+    phased = refine_phase.refine(rows, member.phased, 20, noise_floor)
+    return Member(phased, left_out_error(rows, phased, noise_floor), member.number)
+
+
+def left_out_error(rows: Rows, phased: PhasedScene, noise_floor: float) -> float:
+    """NMSE of the rows, each receiver predicted from the others."""
+    error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
+    return float(error.abs().square().sum() / rows.target.abs().square().sum())
+
+
+def compact(rows: Rows) -> bool:
+    """Whether the static end's antennas are near enough to be occluded alike."""
+    return rows.array is None or float((rows.array.amax(0) - rows.array.amin(0)).norm()) < COMPACT_M
+
+
+def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2) -> bool:
+    """Whether `least` searches have reached the noise floor."""
+    return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
+
+
+def affordable_rows(rows: Rows, found: list[Member], noise_floor: float, budget: TimeBudget) -> int:
+    """Rows of final processes that fit into the rest of the budget; all of one search at least.
+
+    A covariance of n rows takes n^3; that of a search's rows is timed.
+    """
+    started = budget.spent
+    assert PhasedPosterior(rows, found[0].phased, noise_floor).conditioned
+    each = max(budget.spent - started, 1e-6)
+    rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
+    return max(int(len(rows) * (rest / (each * len(found))) ** (1 / 3)), len(rows))
+
+
+def ensemble_weights(members: list[Member]) -> Tensor:
+    """Weights of the searches in the average, (M,) float32 of sum 1."""
+    error = torch.tensor([max(member.left_out, 1e-6) for member in members])
+    return torch.softmax(-SHARPNESS * error.log(), 0)

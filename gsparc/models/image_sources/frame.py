@@ -1,0 +1,145 @@
+"""Normalisation of positions and targets for fitting, and back; what methods fitted in a frame share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.models.image_sources.rows import Rows, query_elements, static_array
+from gsparc.models.method import LeftOut, Method, Prediction
+from gsparc.ops import Pose
+from gsparc.physics.waves import LIGHT
+
+SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Offset and scale between local metres and stored units, and those of the fit.
+
+    Attributes:
+        middle: (3,) float64 [m], local; origin of the fit.
+        scale: stored target = scale * normalised target.
+        carrier_hz: amplitude goes with wavelength, so targets are multiplied by f / carrier first [Hz].
+    """
+
+    middle: Tensor
+    scale: float
+    carrier_hz: float
+
+    def inside(self, rows: Rows) -> Rows:
+        """Rows in local metres and stored units, normalised."""
+        flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
+        return replace(rows, position=rows.position - self.middle, target=flat)
+
+
+class FramedMethod(Method):
+    """A process on channels that is fitted in a frame.
+
+    Attributes:
+        site: None before `fit` and `restore`.
+        antennas: A, outputs of a measurement.
+        frame: of the fit.
+    """
+
+    site: Site | None = None
+    antennas: int
+    frame: Frame
+
+    def _fitted(self) -> Site:
+        if self.site is None or not self.size():
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.site
+
+    def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
+        """Antennas of the moving end (B E, 3) float64 in the frame, and B.
+
+        With E antennas of the static end (B E, 6): see `Rows.places`.
+        """
+        site = self._fitted()
+        if site.moving_end == "rx":
+            places = query_elements(site, rx, len(tx), self.antennas)
+            return places.reshape(-1, 3) - self.frame.middle, len(places)
+        places = tx.cpu().double() - self.frame.middle
+        array = static_array(site, self.antennas)
+        if array is None:
+            return places, len(places)
+        each = torch.repeat_interleave(places, len(array), 0)
+        return torch.cat([each, torch.from_numpy(array).repeat(len(places), 1)], 1), len(places)
+
+    def _stored(self, mean: Tensor, tones: Tensor) -> Tensor:
+        """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""
+        tone_scale = (self.frame.carrier_hz / tones).float()
+        return (mean * (tone_scale * self.frame.scale)).reshape(-1, self.antennas, len(tones))
+
+    def _prediction(self, mean: Tensor, variance: Tensor, prior: Tensor) -> Prediction:
+        """From the mean (B, A, K), and expected squared error and power (B E,), normalised."""
+        variance, prior = (v.reshape(len(mean), -1).mean(1) for v in (variance, prior))
+        confidence = (1 - variance / prior).clamp(0, 1)
+        return Prediction(mean, confidence=confidence, variance=variance * self.frame.scale**2)
+
+    def _stored_paths(
+        self, gain: Tensor, away: Tensor, towards: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, float]:
+        """See `ImageSourceGP.paths`; of gains (B E, R, N), ranges (B E, N) [m], offsets (B, N, 3) [m]."""
+        count = len(towards)
+        gain = (gain * self.frame.scale).reshape(count, self.antennas, -1)
+        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
+        unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        return gain, delay, unit, self.frame.carrier_hz
+
+    def _left_out(self, rows: Rows, predicted: Tensor) -> LeftOut:
+        """See `LeaveOneOut`; of normalised predictions (n, R) of the rows."""
+        scale = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
+        return LeftOut(rows.receiver.numpy(), (rows.target - predicted) * scale)
+
+    def _frame_state(self, rows: Rows) -> dict[str, Any]:
+        """Antennas, frame and rows."""
+        frame, columns = ([*vars(each).values()] for each in (self.frame, rows))
+        return {"antennas": self.antennas, "frame": frame, "rows": columns}
+
+    def _restore_frame(self, site: Site, state: dict[str, Any]) -> Rows:
+        self.site, self.antennas, self.frame = site, int(state["antennas"]), Frame(*state["frame"])
+        return Rows(*state["rows"])
+
+
+def frame_of(site: Site, rows: Rows) -> Frame:
+    """Frame in which these rows have zero mean position and unit power.
+
+    Raises:
+        ValueError: every channel is zero.
+    """
+    frequency = site.tones()
+    carrier = float(frequency.mean()) if site.carrier_hz is None else float(site.carrier_hz)
+    power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
+    if not power > 0:
+        raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
+    return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
+
+
+def refuse(site: Site, name: str) -> None:
+    """`ValueError`, in the name of a method, for data that sources with carrier phase cannot explain."""
+    if site.kind != "csi":
+        raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
+    if site.static_position is None:
+        raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
+
+
+def refuse_turning(data: Measurements) -> None:
+    """`ValueError` where a static receiver of several antennas turns between measurements."""
+    antennas = data.target.shape[1]
+    if static_array(data.site, antennas) is None:
+        return
+    turned = np.abs(data.rx_rotation - data.rx_rotation[:1]).max(axis=(1, 2)) > SAME_ROTATION
+    if turned.any():
+        row = int(np.flatnonzero(turned)[0])
+        raise ValueError(
+            f"{data.site.name}: row {row}: the static receiver of {antennas} antennas is turned otherwise "
+            "than in row 0; give the rows of each rotation as a file of their own"
+        )

@@ -1,0 +1,133 @@
+"""Image sources in known walls: no search, the planes move by likelihood as far as the rows want."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsparc.data.walls import SceneWalls
+from gsparc.models.image_sources import refine_phase
+from gsparc.models.image_sources.clutter.blocking import Clutter
+from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
+from gsparc.models.image_sources.ensemble import SEARCH_END, compact, left_out_error
+from gsparc.models.image_sources.gp_likelihood import Scene, steering
+from gsparc.models.image_sources.known.images import affordable, hiding, start_amplitudes, visible_sequences
+from gsparc.models.image_sources.known.mirrors import MOST_PATCHES, Mirrors
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.phased_gp import PhasedScene
+from gsparc.models.image_sources.refine import refine
+from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.search import SearchSettings
+from gsparc.models.image_sources.search_cache import Member, SearchCache
+from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.physics.mirror_planes import Reflections
+from gsparc.physics.waves import LIGHT
+from gsparc.training.time_budget import TimeBudget
+
+log = logging.getLogger(__name__)
+
+LEAST_SIDE = 2.0  # wavelengths; smaller rectangles hide, but mirror nothing
+MOVED_M, TURNED = 0.02, 0.01  # standard deviations of walls about those of the file [m], [rad]
+LOUDER = 0.1  # of log amplitudes about a factor per reflection
+KERNEL, QUADRATURE = KernelVisibility(0.95, 0.6, 1.5), 0.1  # where walls say who sees what
+STEPS = (40, 10, 20)  # of descent on planes and amplitudes, on the visibility kernel, on phases with them
+
+
+class KnownWallsGP(ImageSourceGP):
+    """See `ImageSourceGP`; sources are the images in walls of a file, whose numbers are not searched for.
+
+    Args:
+        walls: in the coordinates of the measurements.
+        **rest: of `ImageSourceGP`; `clutter` says whether walls end and hide.
+
+    Raises:
+        ValueError: the data are not channels, or their phase means nothing.
+    """
+
+    name = "known_walls"
+
+    def __init__(self, walls: SceneWalls, **rest: Any) -> None:
+        super().__init__(**{**rest, "searches": 1})
+        self.walls = walls
+        if self.clutter:
+            self.settings = replace(self.settings, visibility=KERNEL)
+
+    def _search(
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
+        cache: SearchCache, stage: str = "search",
+    ) -> list[Member]:  # fmt: skip
+        """The images in the walls, refined; no search."""
+        rows, floor, over = row_sets[0], self.noise_floor, partial(budget.over, SEARCH_END)
+        start = self._scene(rows, settings, clutter)
+        near = partial(walls_cost, start.planes, start.sequences)
+        scene = refine(rows, start, STEPS[0], floor, over, near)
+        phased = PhasedScene.of(rows, scene, QUADRATURE)
+        phased = refine_phase.learn_visibility(rows, phased, STEPS[1], settings.visibility, floor, over)
+        prior = ReflectionPhasePrior.of(phased)
+        cost = partial(prior.cost, sequences=phased.scene.sequences)
+        phased = refine_phase.refine(rows, phased, STEPS[2], floor, cost, over, near)
+        error = left_out_error(rows, phased, floor)
+        log.info(
+            "known walls: %d sources over %d planes, error %.3f",
+            len(scene.sequences), len(scene.planes), error,
+        )  # fmt: skip
+        return [Member(phased, error)]
+
+    def _scene(self, rows: Rows, settings: SearchSettings, clutter: bool) -> Scene:
+        """The static end and its images that some receiver sees, with amplitudes to start from."""
+        assert self.site is not None
+        transmitter = self._transmitter()
+        mirrors = Mirrors.of(self.walls, self.site.origin + self.frame.middle.numpy())
+        if mirrors.left_out:
+            log.info(
+                "the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES
+            )
+        indices = mirrors.mirroring(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
+        order = settings.order
+        if order > 1 and affordable(len(indices), order) < len(indices):
+            few = affordable(len(indices), order)
+            log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
+        hidden = clutter and compact(rows)
+        sequences = visible_sequences(
+            mirrors, indices, transmitter, rows.position, order, settings.max_sources, hidden
+        )
+        held = hiding(mirrors, sequences, transmitter, rows.position) if hidden else Clutter.none()
+        direct = self._direct(rows, transmitter)
+        bare = Scene(
+            transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
+            math.log(settings.noise), settings.visibility,
+        )  # fmt: skip
+        return _without_idle(replace(bare, clutter=held))
+
+    @staticmethod
+    def _direct(rows: Rows, transmitter: Tensor) -> float:
+        """Amplitude of the direct wave if it were all there is."""
+        waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
+        return float((waves.mH @ rows.target).abs().mean() / waves.abs().square().sum())
+
+
+def walls_cost(
+    known: Tensor, sequences: tuple[Reflections, ...], planes: Tensor, log_amplitude: Tensor
+) -> Tensor:
+    """Negative log prior [nats]: planes (P, 4) about the known ones, amplitudes (K,) about a law."""
+    normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
+    moved = (planes[:, 3] - known[:, 3]).square().sum() / MOVED_M**2
+    turned = (normal - known[:, :3]).square().sum() / TURNED**2
+    order = torch.tensor([float(len(sequence)) for sequence in sequences])
+    law = torch.stack([torch.ones_like(order), order], 1)
+    left = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)
+    return (moved + turned + left.square().sum() / LOUDER**2) / 2
+
+
+def _without_idle(scene: Scene) -> Scene:
+    """The same without planes that neither mirror nor hide."""
+    used = sorted({index for sequence in scene.sequences for index in sequence} | set(scene.clutter.plane))
+    new = {old: i for i, old in enumerate(used)}
+    sequences = tuple(tuple(new[index] for index in sequence) for sequence in scene.sequences)
+    return replace(scene, planes=scene.planes[used], sequences=sequences, clutter=scene.clutter.renamed(new))

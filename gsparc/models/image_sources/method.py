@@ -1,0 +1,398 @@
+"""`model=image_source_gp`: channels from an ensemble of image-source searches, with a variance."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+from collections import Counter
+from dataclasses import replace
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.assemble import identity
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.image_sources.element_factors import direct_path, element_factors
+from gsparc.models.image_sources.ensemble import (
+    affordable_rows,
+    at_noise_floor,
+    ensemble_weights,
+    refined,
+    search_many,
+)
+from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse, refuse_turning
+from gsparc.models.image_sources.gp_likelihood import Scene
+from gsparc.models.image_sources.phase_offsets import KINDS, Offsets, estimate
+from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at
+from gsparc.models.image_sources.search import SearchSettings
+from gsparc.models.image_sources.search_cache import Member, SearchCache
+from gsparc.models.image_sources.source_types import SourceKind, box_of, kinds
+from gsparc.models.method import LeftOut, Method, Prediction
+from gsparc.models.pareto import Settings
+from gsparc.models.reduced import MeanOnly
+from gsparc.ops import Pose
+from gsparc.physics.mirror_planes import orientations
+from gsparc.physics.waves import wave, wave_over_band
+from gsparc.training.conditional import LeftOutRows
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget, less_repeatable
+
+log = logging.getLogger(__name__)
+
+SECONDS_PER_ROW = 0.02  # [s], times measurements^1.5: 130 s for 350 in a conference room, 370 s for 700
+MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
+ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
+ALIGNMENT_SHARE = 0.25  # of the budget, for each of these searches
+ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
+
+
+class ImageSourceGP(FramedMethod):
+    """Image-source Gaussian process; one end stands still, both may have antennas of known places.
+
+    Args:
+        searches: how many, with different seeds; their predictions are averaged.
+        budget_s: approximate time of all searches [s]; None: 120 to 400 s by the number of measurements.
+        search_rows: receivers times tones of a search.
+        rows: receivers times tones of the final process.
+        margin, max_sources, order: see `SearchSettings`.
+        offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or `phase_timing`.
+        clutter: search for occluding boxes and finite mirrors, shared by all sources.
+        seed: of everything random.
+
+    Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
+
+    Raises:
+        ValueError: the data are not channels, or their phase means nothing.
+    """
+
+    name = "image_source_gp"
+    held: LeftOutRows | None = None  # rows of `FitContext.leave_out`, by searches without them
+    _groups: tuple[np.ndarray, ...] = ()
+    resumable = True  # finished searches are kept in `last.ckpt`
+    takes_budget = True
+
+    def __init__(
+        self,
+        searches: int = 6,
+        budget_s: float | None = None,
+        search_rows: int = 700,
+        rows: int = 3000,
+        margin: float = 8.0,
+        max_sources: int = 60,
+        order: int = 3,
+        offsets: Offsets = "none",
+        clutter: bool = True,
+        seed: int = 0,
+    ) -> None:
+        if offsets not in KINDS:
+            raise ValueError(f"{self.name}: offsets={offsets!r} is none of {', '.join(KINDS)}")
+        if searches < 1:
+            raise ValueError(f"{self.name}: searches must be at least 1, got {searches}")
+        if search_rows < 8 or rows < 8:
+            raise ValueError(f"{self.name}: search_rows={search_rows}, rows={rows}: at least 8 are needed")
+        self.searches, self.budget_s, self.seed = searches, budget_s, seed
+        self.offsets, self.clutter = offsets, clutter
+        self.search_rows, self.row_limit = search_rows, rows
+        self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
+        self.members: list[PhasedPosterior] = []
+
+    # ---- fitting ----
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Search on `train` and `val` together: the number of sources is chosen by likelihood.
+
+        Raises:
+            ValueError: the data are not channels, or their phase means nothing.
+            KeyboardInterrupt: by the user; the message names the file to go on from.
+        """
+        refuse(data.site, self.name)
+        refuse_turning(data)
+        known = np.concatenate([fold.train, fold.val])
+        self._groups = context.leave_out
+        cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
+        try:
+            return self._fit(data, known, context, cache)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(cache.interrupted()) from None
+
+    def _fit(
+        self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
+    ) -> FitReport:
+        budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
+        self.site, self.antennas = data.site, data.target.shape[1]
+        everything = gather(data, known, self.row_limit, self.seed)
+        self.frame = frame_of(data.site, everything)
+        noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
+        self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
+        held = self.frame.inside(everything)
+        notes: list[str] = []
+        self.factors = torch.ones(self.antennas, dtype=torch.complex64)
+        if held.array is not None and self.offsets == "none":
+            start = self._row_sets(data, known, 1)[0]
+            data = self._calibrated(data, start, direct_path(start, self._transmitter()))
+            held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+        if self.offsets != "none":
+            data = self._without_offsets(data, known, budget)
+            held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+            notes.append(
+                f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
+            )
+        row_sets = self._row_sets(data, known, self.searches)
+        found = self._search(row_sets, self.settings, budget, self.clutter, cache)
+        if held.array is not None and self.offsets == "none":
+            again = self._calibrated(data, row_sets[found[0].number], found[0].phased.scene)
+            if again is not data:
+                data, row_sets = again, self._row_sets(again, known, self.searches)
+                held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+                found = [refined(row_sets[one.number], one, self.noise_floor) for one in found]
+        self.weights = ensemble_weights(found)
+        affordable = affordable_rows(row_sets[0], found, self.noise_floor, budget)
+        if affordable < len(held):
+            budget.limited = True
+            notes.append(f"{self.name}: {affordable} of {len(held)} rows in the final process: time is short")
+            held = held.take(torch.linspace(0, len(held) - 1, affordable).long())
+        self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
+        self.query = Query(self.members)
+        self.held = self._held(data, known, found, len(held))
+        notes += self._described(found, budget)
+        limited = less_repeatable(budget.limited_by, cache.limited_by)
+        return FitReport(budget.counted.wall, tuple(notes), limited)
+
+    def _described(self, found: list[Member], budget: TimeBudget) -> list[str]:
+        """What was found, and what ended the search."""
+        scene, notes = self.members[0].scene, []
+        counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
+        agree = at_noise_floor([member.left_out for member in found], self.noise_floor)
+        ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
+        ended += ", ended by the time budget" if budget.limited else ""
+        notes.append(f"{len(found)} of {self.searches} searches ({ended}), {counts} sources")
+        counted = Counter(kinds(scene.sources, box_of(self.members[0].rows, scene.transmitter)))
+        notes.append("the best search has " + ", ".join(f"{counted[k]} {k}s" for k in SourceKind))
+        clutter = scene.clutter
+        if len(clutter):
+            these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
+            notes.append(f"clutter: {these}")
+        if (self.factors != 1).any():
+            turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
+            notes.append(
+                f"factors of the {self.antennas} antennas estimated, phases up to {turned:.0f} degrees "
+                "from the first's"
+            )
+        return [f"{self.name}: {note}" for note in notes]
+
+    def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
+        """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
+        factors = element_factors(rows, scene, self.noise_floor)
+        if factors is None:
+            return data
+        self.factors = self.factors * factors
+        return replace(data, target=data.target * factors.numpy()[:, None])
+
+    def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
+        """What a search depends on; neither the budget nor the number of searches."""
+        settings = (self.search_rows, self.row_limit, self.offsets, self.clutter, self.settings)
+        rows = sha256(b"".join(part.tobytes() for part in (known, *self._groups))).hexdigest()
+        return {"data": identity(data), "rows": rows, "seed": str(self.seed), "settings": str(settings)}
+
+    def _budget(self, measurements: int, given_s: float | None) -> float:
+        if given_s is not None:
+            return given_s
+        if self.budget_s is not None:
+            return self.budget_s
+        return min(max(SECONDS_PER_ROW * measurements**1.5, MIN_BUDGET_S), MAX_BUDGET_S)
+
+    def _search(
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
+        cache: SearchCache, stage: str = "search",
+    ) -> list[Member]:  # fmt: skip
+        transmitter, floor = self._transmitter(), self.noise_floor
+        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, stage)
+
+    def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
+        """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""
+        parts = [gather(data, self._seen(known, i), self.search_rows, self.seed + i) for i in range(count)]
+        return [self.frame.inside(part) for part in parts]
+
+    def _seen(self, known: np.ndarray, number: int) -> np.ndarray:
+        """The rows of a search by its number."""
+        groups = self._groups
+        return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
+
+    def _held(
+        self, data: Measurements, known: np.ndarray, found: list[Member], most: int
+    ) -> LeftOutRows | None:
+        """Rows of every group predicted by the searches that left it out, from at most `most` others."""
+        if not self._groups:
+            return None
+        rows, means = [], []
+        for turn, group in enumerate(self._groups):
+            members = [one for one in found if one.number % len(self._groups) == turn]
+            if not members:
+                continue
+            apart = self.frame.inside(gather(data, self._seen(known, turn), most, self.seed))
+            twin = copy.copy(self)
+            twin.members = [PhasedPosterior(apart, member.phased, self.noise_floor) for member in members]
+            twin.weights, twin.query = ensemble_weights(members), Query(twin.members)
+            batch = data.batch(group)
+            rows.append(group)
+            means.append(twin.predict(batch.tx, batch.rx).mean)
+        mean = torch.cat(means)
+        return LeftOutRows(np.concatenate(rows), mean, torch.full((len(mean),), float("nan")))
+
+    def _transmitter(self) -> Tensor:
+        assert self.site is not None and self.site.static_position is not None
+        return torch.from_numpy(np.asarray(self.site.static_position, np.float64)) - self.frame.middle
+
+    def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
+        """Estimate offsets against the line of sight, then against more and more sources."""
+        direct = Scene(self._transmitter(), torch.zeros(0, 4).double(), ((),), torch.zeros(1), 0.0)
+        aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.antennas))
+        for sources in ALIGNMENT_SOURCES:
+            few = replace(self.settings, max_sources=sources, final_steps=20)
+            now = TimeBudget(ALIGNMENT_SHARE * budget.seconds, budget.clock)
+            rows = self._row_sets(aligned, known, 1)
+            phased = self._search(rows, few, now, False, SearchCache())[0].phased
+            budget.limited |= now.limited
+            for _ in range(ALIGNMENT_ROUNDS):
+                rows = self._row_sets(aligned, known, 1)
+                gains = PhasedPosterior(rows[0], phased, self.noise_floor).mean_gains
+                aligned = self._remove_offsets(data, known, phased.scene, gains)
+        return aligned
+
+    def _remove_offsets(
+        self, data: Measurements, known: np.ndarray, scene: Scene, gains: Tensor
+    ) -> Measurements:
+        """Targets of the known rows without their offsets against a scene's sources of constant gains."""
+        frequency = data.site.tones()
+        places = torch.from_numpy(measured_places(data, known).copy())
+        places[..., :3] -= self.frame.middle
+        turned = orientations(scene.planes, scene.sequences)
+        away = ranges_at(places.flatten(0, 1), scene.sources, turned)
+        waves = wave_over_band(away, torch.from_numpy(frequency))
+        if gains.shape[1] == 1 or places.shape[1] > 1:
+            gains = gains[:, :1]
+        summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
+        predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
+        mask = None if data.mask is None else data.mask[known]
+        carrier = self.frame.carrier_hz
+        found = estimate(
+            data.target[known], predicted, frequency, carrier, self.offsets == "phase_timing", mask
+        )
+        target = data.target.copy()
+        target[known] = found.removed(data.target[known], frequency, carrier)
+        return replace(data, target=target)
+
+    # ---- predicting ----
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`.
+
+        The variance is the posterior's plus that of the ensemble; the confidence is the explained share of
+        the expected power.
+        """
+        flat, _ = self._places(tx, rx)
+        tones = torch.from_numpy(self._fitted().tones())
+        stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
+        weight = self.weights[:, None, None, None]
+        mean = (weight * stack).sum(0)
+        variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
+        return self._prediction(self._stored(mean, tones) / self.factors[:, None], variance, prior)
+
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+        """The paths that `predict` sums: one per source of every search, with the search's weight.
+
+        Returns:
+            Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
+            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
+            the carrier [Hz].
+        """
+        flat, count = self._places(tx, rx)
+        carrier = self.frame.carrier_hz
+        middle = flat[:, :3].reshape(count, -1, 3).mean(1)
+        weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
+        away = self.query.pack.ranges(flat)
+        gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
+        towards = self.query.pack.sources - middle[:, None]
+        gains, delay, unit, carrier = self._stored_paths(gain.movedim(0, -1), away, towards)
+        return gains / self.factors[:, None], delay, unit, carrier
+
+    def leave_one_out(self) -> LeftOut:
+        """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""
+        self._fitted()
+        each = torch.stack([member.left_out() for member in self.members])
+        predicted = (self.weights[:, None, None] * each).sum(0)
+        return self._left_out(self.members[0].rows, predicted)
+
+    # ---- reductions ----
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        return ("searches", "keep", "confidence")
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """`contribution0`, `contribution1`, ... (K,): mean power of each search's sources at its rows."""
+        return {
+            f"contribution{i}": member.scene.log_amplitude.mul(2).exp() * member.waves.abs().square().mean(0)
+            for i, member in enumerate(self.members)
+        }
+
+    @torch.no_grad()
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`: `searches` of largest weight, a share of their sources (`keep`), no variance.
+
+        The gains of the remaining sources are fitted anew: one factorisation here, nothing at queries.
+        """
+        twin = copy.copy(self)
+        count = min(int(settings.get("searches", len(self.members))), len(self.members))
+        chosen = self.weights.topk(count).indices.sort().values
+        twin.members = [self.members[i] for i in chosen]
+        twin.weights = self.weights[chosen] / self.weights[chosen].sum()
+        if "keep" in settings:
+            share = float(settings["keep"])
+            twin.members = [
+                _loudest(member, share, measured[f"contribution{i}"])
+                for member, i in zip(twin.members, chosen, strict=True)
+            ]
+        if settings.get("confidence", True):
+            twin.query = Query(twin.members)
+            return twin
+        twin.query = Query(twin.members, variance_rows=0)
+        return MeanOnly(twin)
+
+    # ---- state ----
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        self._fitted()
+        return {
+            **self._frame_state(self.members[0].rows),
+            "weights": self.weights,
+            "noise_floor": self.noise_floor,
+            "factors": self.factors,
+            "scenes": [member.phased.state() for member in self.members],
+        }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        rows = self._restore_frame(site, state)
+        self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
+        self.factors = state["factors"]
+        scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
+        self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]
+        self.query = Query(self.members)
+
+    def size(self) -> int:
+        """Sources of the largest scene."""
+        return max((len(member.scene.sequences) for member in self.members), default=0)
+
+
+def _loudest(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:
+    """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
+    count = max(1, math.ceil(share * len(contribution)))
+    kept = sorted({0, *contribution.topk(count).indices.tolist()})
+    phased = member.phased
+    scene = PhasedScene(phased.scene.only(kept), phased.phase[kept], phased.quadrature)
+    return PhasedPosterior(member.rows, scene, member.noise_floor)

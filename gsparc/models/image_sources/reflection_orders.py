@@ -1,0 +1,207 @@
+"""Explain the sources found by fewer mirror planes, and prune sources.
+
+A source is a sequence of planes that mirror the transmitter into it, its length the reflection
+order. Each function maps a scene to a scene, kept when the likelihood allows it: a plane has three
+parameters, so removing one may cost a few nats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
+from gsparc.models.image_sources.refine import Late, never, refine
+from gsparc.models.image_sources.rows import Rows
+from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
+
+LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
+MIN_IMAGE_SHIFT_M = 0.2  # [m], half the least distance of a source from its mirror image
+MANY_PLANES = 9  # beyond, third-order sequences are too many to try
+
+
+def drop_planes(
+    rows: Rows, scene: Scene, tolerance: float, steps: int = 12, allowance: float = 10.0, late: Late = never
+) -> Scene:
+    """Try to remove planes until `late`: their sequences become the nearest over others [tolerance: m]."""
+    index = 0
+    while index < len(scene.planes) and not late():
+        shorter = _without_plane(scene, index, tolerance)
+        if shorter is not None:
+            shorter = refine(rows, shorter, steps)
+            if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + allowance:
+                scene = shorter
+                continue
+        index += 1
+    return scene
+
+
+def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
+    """The scene without one plane; None when its strongest source has no other sequence."""
+    users = [i for i, sequence in enumerate(scene.sequences) if index in sequence]
+    rest = {sequence for i, sequence in enumerate(scene.sequences) if i not in users}
+    order = 3 if len(scene.planes) <= MANY_PLANES else 2
+    indices = [i for i in range(len(scene.planes)) if i != index]
+    candidates = [sequence for sequence in all_sequences(indices, order) if sequence not in rest]
+    if not candidates or not users:
+        return None
+    distance = _distances(scene, candidates, scene.sources[users], LENGTH_PENALTY_M)
+    nearest = distance.argmin(1).tolist()
+    strength = (
+        scene.log_amplitude[users] - (scene.sources[users] - scene.transmitter).norm(dim=1).clamp_min(1).log()
+    )
+    if distance[int(strength.argmax())].min() > tolerance:
+        return None
+    sequences, kept = list(scene.sequences), set(range(len(scene.sequences)))
+    for row, i in enumerate(users):
+        candidate = candidates[nearest[row]]
+        if distance[row].min() < tolerance and candidate not in sequences:
+            sequences[i] = candidate
+        else:
+            kept.discard(i)
+    return replace(scene, sequences=tuple(sequences)).only(sorted(kept))
+
+
+def _distances(scene: Scene, sequences: list[Reflections], places: Tensor, per_reflection: float) -> Tensor:
+    """Distances (places, sequences) [m], plus a penalty on the order."""
+    position = images(scene.transmitter, scene.planes, sequences)
+    order = torch.tensor([len(sequence) for sequence in sequences])
+    return (position[None] - places[:, None]).norm(dim=-1) + per_reflection * order
+
+
+def find_walls(sources: Tensor, relative: float = 0.03, most: int = 10) -> Tensor | None:
+    """Walls: planes (P, 4) that mirror many of the sources (K, 3) into one another, or None."""
+    count = len(sources)
+    tolerance = relative * (sources - sources[0]).norm(dim=1) + 0.02
+    first, second = torch.triu_indices(count, count, 1)
+    planes = bisector(sources[first], sources[second])
+    planes = planes[(sources[first] - sources[second]).norm(dim=1) > 2 * MIN_IMAGE_SHIFT_M]
+    if len(planes) == 0:
+        return None
+    mirrored = reflect(sources[:, None], planes[None])  # (K, P, 3)
+    distance = torch.cdist(mirrored.flatten(0, 1), sources).unflatten(0, mirrored.shape[:2])  # (K, P, K)
+    allowed = torch.maximum(tolerance[:, None], tolerance[None])[:, None]
+    agreement = torch.exp(-((2 * distance / allowed) ** 2)) * (distance < allowed)
+    moved = (mirrored - sources[:, None]).norm(dim=-1) > 2 * MIN_IMAGE_SHIFT_M
+    agreement = agreement * moved[..., None] * ~torch.eye(count, dtype=torch.bool)[:, None]
+    support = agreement.amax(2).sum(0) / 2
+    chosen: list[Tensor] = []
+    while len(chosen) < most and support.max() >= 1.7:
+        best = int(support.argmax())
+        chosen.append(planes[best])
+        alike = (mirrored - mirrored[:, best : best + 1]).norm(dim=-1).mean(0) < 2 * tolerance.mean()
+        support = support.masked_fill(alike, -1.0)
+    return torch.stack(chosen) if chosen else None
+
+
+def orthogonal_walls(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor | None:
+    """The fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
+
+    Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources that differ
+    along one normal only gives a plane. None when no two planes are perpendicular.
+
+    Args:
+        scene: sources; their sequences may be wrong.
+        most: planes.
+        near: tolerance between a source and its sequence [m], plus 1 % of its distance from the transmitter.
+    """
+    triad = _triad(scene)
+    if triad is None:
+        return None
+    sources = scene.sources
+    allowed = near + 0.01 * (sources - sources[0]).norm(dim=1)
+    first, second = torch.triu_indices(len(sources), len(sources), 1)
+    candidates = []
+    for direction in triad:
+        apart = sources[second] - sources[first]
+        along = apart @ direction
+        across = (apart - along[:, None] * direction).norm(dim=1)
+        fits = (across < torch.maximum(allowed[first], allowed[second])) & (
+            along.abs() > 2 * MIN_IMAGE_SHIFT_M
+        )
+        offsets = ((sources[first] + sources[second]) @ direction / 2)[fits]
+        candidates += [torch.cat([direction, offset[None]]) for offset in offsets]
+    chosen, explained = torch.zeros(0, 4, dtype=sources.dtype), 1.0
+    for _ in range(most):
+        tried = [torch.cat([chosen, plane[None]]) for plane in candidates]
+        gains = [_explained(scene, planes, allowed) for planes in tried]
+        if not gains or max(gains) < explained + 0.8:
+            break
+        best = gains.index(max(gains))
+        chosen, explained = tried[best], gains[best]
+    return chosen if len(chosen) else None
+
+
+def _triad(scene: Scene) -> Tensor | None:
+    """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
+    used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
+    normals = scene.planes[:, :3] / scene.planes[:, :3].norm(dim=1, keepdim=True)
+    best: tuple[int, Tensor] | None = None
+    for i in range(len(used)):
+        for j in range(i):
+            if (normals[i] @ normals[j]).abs() < 0.02 and (best is None or used[i] + used[j] > best[0]):
+                second = normals[j] - (normals[j] @ normals[i]) * normals[i]
+                second = second / second.norm()
+                third = torch.linalg.cross(normals[i], second)
+                best = used[i] + used[j], torch.stack([normals[i], second, third])
+    return None if best is None else best[1]
+
+
+def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
+    """Number of sources with a sequence over the planes, weighted by distance and order."""
+    sequences: list[Reflections] = [(), *all_sequences(list(range(len(planes))), 2)]
+    position = images(scene.transmitter, planes, sequences)
+    distance = torch.cdist(scene.sources, position) / allowed[:, None]
+    worth = (1 - 0.5 * distance.square()).clamp_min(0) * torch.tensor(
+        [0.95 ** len(sequence) for sequence in sequences]
+    )
+    return float(worth.amax(1).sum())
+
+
+def reassign(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
+    """New sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
+    sources = scene.sources
+    tolerance = 2.5 * (relative * (sources - sources[0]).norm(dim=1) + 0.02)
+    base = replace(scene, planes=walls)
+    candidates = all_sequences(list(range(len(walls))), 3)
+    distance = _distances(base, candidates, sources, 1.5 * LENGTH_PENALTY_M)
+    planes, kept, taken = [*walls], [0], set()
+    sequences: list[Reflections] = [()]
+    for i in range(1, len(sources)):
+        near = [j for j in distance[i].argsort()[:6].tolist() if distance[i, j] < tolerance[i]]
+        free = next((candidates[j] for j in near if candidates[j] not in taken), None)
+        if free is not None:
+            taken.add(free)
+            sequences.append(free)
+            kept.append(i)
+        elif not near:  # else a duplicate of an assigned source
+            planes.append(bisector(sources[0], sources[i]))
+            sequences.append((len(planes) - 1,))
+            kept.append(i)
+    explained = replace(
+        scene, planes=torch.stack(planes), sequences=tuple(sequences), log_amplitude=scene.log_amplitude[kept]
+    )
+    return explained.only(list(range(len(kept))))
+
+
+def prune(rows: Rows, scene: Scene, least: float, late: Late = never) -> Scene:
+    """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
+    posterior = Posterior(rows, scene)
+    weakest_first: list[Reflections] = sorted(
+        scene.sequences[1:], key=lambda sequence: float(scene.log_amplitude[scene.sequences.index(sequence)])
+    )
+    kept = set(range(len(scene.sequences)))
+    for sequence in weakest_first:
+        if late():
+            break
+        i = scene.sequences.index(sequence)
+        sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in sequence)
+        current = scene.only(sorted(kept))
+        position = sorted(kept).index(i)
+        if posterior.without(position) - posterior.nll < (2 * least if sole_user else least):
+            kept.discard(i)
+            current = scene.only(sorted(kept))
+            posterior = Posterior(rows, current)
+    return scene.only(sorted(kept))

@@ -1,0 +1,120 @@
+"""Complex factors of runs: each run of measurements is the channel times one unknown complex number.
+
+With aligned rows `u_i y_i` a circular Gaussian process of covariance `P C`, the likelihood of the factors
+needs the data only as `M_rs = sum over i in r, j in s of conj(y_i) C^-1_ij y_j`: quadratic in u but for the
+logarithm of its size, so that each factor has a closed form given the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.models.method import Prediction
+
+SWEEPS = 200
+SETTLED = 1e-9
+
+
+@dataclass(frozen=True)
+class RunFactors:
+    """What the channels of each run were multiplied by, relative to the largest run's.
+
+    Attributes:
+        runs: (R,) int64 numbers, as in `Measurements.run`.
+        factors: (R,) complex128.
+    """
+
+    runs: np.ndarray
+    factors: Tensor
+
+    @staticmethod
+    def none() -> RunFactors:
+        """Of channels that are all in phase."""
+        return RunFactors(np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128))
+
+    @staticmethod
+    def several(data: Measurements, rows: np.ndarray) -> bool:
+        """Whether rows (n,) are channels of more than one run."""
+        return data.site.kind == "csi" and data.run is not None and len(np.unique(data.run[rows])) > 1
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    def of(self, run: Tensor | None) -> Tensor:
+        """Factors (B,) complex128 of rows of runs (B,); 1 of runs that were not learned from."""
+        if run is None or len(self) == 1:
+            return torch.ones(1, dtype=torch.complex128)
+        same = run.cpu()[:, None] == torch.from_numpy(self.runs)
+        return torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
+
+    def restored(self, found: Prediction, run: Tensor | None) -> Prediction:
+        """A prediction for the largest run in the phase and level of rows of runs (B,)."""
+        if run is None or len(self) == 1:
+            return found
+        factor = self.of(run).to(found.mean.device)
+        variance = None if found.variance is None else found.variance * factor.abs().square().float()
+        return replace(found, mean=found.mean * factor.to(found.mean.dtype)[:, None, None], variance=variance)
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """The channels in the phase and level of the largest run, as of one run."""
+        assert data.run is not None
+        factor = self.of(torch.from_numpy(data.run)).numpy()
+        target = (data.target / factor[:, None, None]).astype(data.target.dtype)
+        noise = None if data.noise_variance is None else data.noise_variance / np.abs(factor) ** 2
+        return replace(data, target=target, noise_variance=noise, run=None)
+
+    def state(self) -> dict[str, Tensor]:
+        """What `read` reads."""
+        return {"runs": torch.from_numpy(self.runs), "factors": self.factors}
+
+    @staticmethod
+    def read(state: dict[str, Tensor] | None) -> RunFactors:
+        """Inverse of `state`; `none` of None."""
+        return RunFactors.none() if state is None else RunFactors(state["runs"].numpy(), state["factors"])
+
+
+def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """What rows must be multiplied by to belong to the largest run, (runs,) complex128 of largest likelihood.
+
+    Args:
+        inverse: (n, n) inverse of the rows' covariance.
+        target: (n, D) complex.
+        run: (n,) int, numbers 0 to runs - 1, each of which occurs.
+    """
+    count = np.bincount(run)
+    return aligning(run_quadratic(inverse, target, run), target.shape[1] * count)
+
+
+def run_quadratic(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """M (runs, runs) complex128 of the module's text, of arguments as in `run_factors`."""
+    member = np.eye(int(run.max()) + 1)[run]
+    return member.T @ (inverse * (target.conj() @ target.T)) @ member
+
+
+def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """The factors (runs,) from M (runs, runs), of one process or summed over many, and each run's numbers.
+
+    Args:
+        size: (runs,) complex numbers measured in each, above 0; the largest has factor 1.
+    """
+    scale = np.sqrt(size)
+    # The eigenvector of least residual power is right but for the logarithm, and near enough to start from.
+    factors = np.linalg.eigh(quadratic / np.outer(scale, scale))[1][:, 0] / scale
+    factors = np.where(np.abs(factors) > 1e-6 * np.abs(factors).max(), factors, np.abs(factors).max())
+    own = quadratic.diagonal().real
+    for _ in range(SWEEPS):
+        before = factors.copy()
+        power = float((factors.conj() @ quadratic @ factors).real) / size.sum()
+        for r in range(len(size)):
+            others = own[r] * factors[r] - quadratic[r] @ factors
+            pull = abs(others)
+            length = (pull + np.sqrt(pull**2 + 4 * own[r] * power * size[r])) / max(2 * own[r], 1e-300)
+            factors[r] = length * (others / pull if pull > 0 else 1.0)
+        if np.abs(factors - before).max() <= SETTLED * np.abs(factors).max():
+            break
+    return factors / factors[size.argmax()]

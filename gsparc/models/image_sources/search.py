@@ -1,0 +1,248 @@
+"""Search for image sources: greedy, over reflections in known planes first, over free space second."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
+from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, steering
+from gsparc.models.image_sources.refine import Late, learn_visibility, never, refine
+from gsparc.models.image_sources.reflection_orders import (
+    drop_planes,
+    find_walls,
+    orthogonal_walls,
+    prune,
+    reassign,
+)
+from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.source_types import box_of
+from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
+from gsparc.physics.waves import LIGHT
+
+log = logging.getLogger(__name__)
+
+PARENTS = 4  # of a new source, tried in turn until one is found
+SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
+SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
+STEPS = 12  # of refinement after each round
+PRUNE = 5.0  # least gain of a source kept [nats]
+PATIENCE, PROGRESS = 3, 8.0  # rounds without a gain of so many nats before the search ends
+LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How far a search goes, and what it starts from.
+
+    Attributes:
+        margin: of the search box around receivers and transmitter [m].
+        order: largest reflection order of a source.
+        max_sources: that end the search.
+        final_steps: of refinement at the end.
+        noise: variance at the start, of unit signal power.
+        visibility: initial kernel and centre of its prior.
+    """
+
+    margin: float = 8.0
+    order: int = 3
+    max_sources: int = 60
+    final_steps: int = 80
+    noise: float = 0.1
+    visibility: KernelVisibility = field(default_factory=KernelVisibility)
+
+
+class Search:
+    """One search over one set of normalised rows (`Frame`).
+
+    Args:
+        rows: a few hundred.
+        transmitter: (3,) float64 [m].
+        settings: how.
+        seed: of the candidates.
+        late: asked after every round; no other starts when it says so.
+        over: asked after every step; what was found so far is the result when it says so.
+    """
+
+    def __init__(
+        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
+        late: Late = never, over: Late = never,
+    ) -> None:  # fmt: skip
+        self.rows, self.settings, self.late, self.over = rows, settings, late, over
+        self.generator = torch.Generator().manual_seed(seed)
+        self.wavelength = LIGHT / float(rows.frequency.mean())
+        self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
+        waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
+        gain = (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
+        self.scene = Scene(
+            transmitter,
+            torch.zeros(0, 4, dtype=torch.float64),
+            ((),),
+            gain.log().reshape(1),
+            math.log(settings.noise),
+            settings.visibility,
+        )
+
+    def run(self) -> Scene:
+        """Search until no source is accepted, then refine."""
+        s, stale, best = self.settings, 0, math.inf
+        self._refine(STEPS)
+        for number in range(60):
+            added = self._add_sequences()
+            free = not added
+            if free:
+                added = self._add_free()
+            if not added or self.late():
+                break
+            self._refine(STEPS)
+            if free or number % 2:
+                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength, late=self.over)
+            if number >= 4 and number % 3 == 1:
+                self._find_walls()
+            if number % 2:
+                self.scene = prune(self.rows, self.scene, PRUNE, self.over)
+            if number % 3 == 2:
+                self._learn_visibility(6)
+            nll = Posterior(self.rows, self.scene).nll
+            log.debug(
+                "round %d: %d sources, %d planes, nll %.1f, %s",
+                number, len(self.scene.sequences), len(self.scene.planes), nll, self.scene.visibility,
+            )  # fmt: skip
+            if len(self.scene.sequences) >= s.max_sources:
+                break
+            stale, best = (0, nll) if nll < best - PROGRESS else (stale + 1, best)
+            if stale >= PATIENCE:
+                break
+        return self._finish()
+
+    def _finish(self) -> Scene:
+        self._refine(20)
+        self._find_walls()
+        self._reassign(orthogonal_walls(self.scene))
+        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength, late=self.over)
+        self._add_sequences()
+        self._refine(STEPS)
+        self.scene = prune(self.rows, self.scene, PRUNE, self.over)
+        self._learn_visibility(10)
+        self._refine(self.settings.final_steps)
+        return self.scene
+
+    def _refine(self, steps: int) -> None:
+        self.scene = refine(self.rows, self.scene, steps, late=self.over)
+
+    def _learn_visibility(self, steps: int) -> None:
+        if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
+            few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
+            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, self.over)
+
+    def _add_sequences(self, most: int | None = None) -> int:
+        """Add the best reflections in known planes; returns how many."""
+        s, scene = self.settings, self.scene
+        indices = list(range(len(scene.planes)))
+        longer: list[Reflections] = [
+            (*w, i) for w in scene.sequences if len(w) < s.order for i in indices if not w or w[-1] != i
+        ]
+        known = set(scene.sequences)
+        sequences = [w for w in dict.fromkeys(longer + all_sequences(indices, 2)) if w not in known]
+        if not sequences:
+            return 0
+        position = images(scene.transmitter, scene.planes, sequences)
+        candidates = replace(scene, sequences=tuple(sequences)).images(self.rows)
+        scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).conditioned)
+        clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
+        chosen = pick_apart(
+            position, scores * clear, 0.5 * self.wavelength, most or SEQUENCES_PER_ROUND, SEQUENCE_SCORE
+        )
+        if chosen:
+            self.scene = scene.with_sequences([sequences[i] for i in chosen], amplitude[chosen])
+        return len(chosen)
+
+    def _add_free(self) -> int:
+        """Add the best sources anywhere in the box, each with a plane of its own; returns how many.
+
+        Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
+        """
+        posterior = Posterior(self.rows, self.scene)
+        parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
+        for number, parent in enumerate(parents):
+            if number and self.over():
+                break
+            spread = partial(self._spread, parent)
+            found = search_box(
+                self.rows, posterior.conditioned, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
+                self.generator, spread,
+            )  # fmt: skip
+            added = 0
+            for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
+                if gained < FREE_SCORE:
+                    continue
+                sequence, plane = self._parent(position, posterior)
+                planes = torch.cat([self.scene.planes, plane[None]])
+                self.scene = replace(self.scene, planes=planes).with_sequences(
+                    [(*sequence, len(planes) - 1)], amplitude[None]
+                )
+                added += 1
+            if added:
+                return added
+        return 0
+
+    def _able(self, scene: Scene) -> list[int]:
+        """Sources that may be reflected once more."""
+        return [i for i, sequence in enumerate(scene.sequences) if len(sequence) < self.settings.order]
+
+    def _strong_parents(self) -> list[Reflections]:
+        """The static end, then the sequences of the loudest sources that may be reflected once more."""
+        loudness = self.scene.log_amplitude
+        louder = sorted((i for i in self._able(self.scene) if i), key=lambda i: -float(loudness[i]))
+        return [self.scene.sequences[i] for i in (0, *louder[: PARENTS - 1])]
+
+    def _spread(self, parent: Reflections | None, points: Tensor) -> Tensor:
+        """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
+        if parent is None:
+            return points
+        scene = replace(self.scene, sequences=(parent,))
+        return reflect(scene.images(self.rows), bisector(scene.sources, points))
+
+    def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
+        """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
+        scene, able = posterior.scene, self._able(posterior.scene)
+        planes = bisector(scene.sources[able], position)
+        mirrored = reflect(scene.sources[None], planes[:, None])  # (parents, K, 3)
+        flat = mirrored.flatten(0, 1)
+        candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
+        taken = torch.cat([scene.sources, position[None]])
+        new = torch.cdist(flat, taken).amin(1) > 0.5 * self.wavelength
+        scores = score(self.rows, candidates, posterior.conditioned)[0].reshape(mirrored.shape[:2])
+        order = torch.tensor([len(scene.sequences[i]) for i in able])
+        gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
+        if self.rows.array is not None:  # parents differ in how they turn the antennas
+            gain = gain + scores[torch.arange(len(able)), able]
+        best = int(gain.argmax())
+        return scene.sequences[able[best]], planes[best]
+
+    def _find_walls(self) -> None:
+        """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
+        if len(self.scene.sequences) < 6:
+            return
+        self._reassign(find_walls(self.scene.sources))
+
+    def _reassign(self, walls: Tensor | None) -> None:
+        """Reassign every source to these walls, if the likelihood allows."""
+        if walls is None or self.over():
+            return
+        before = self.scene
+        self.scene = reassign(before, walls)
+        self._refine(20)
+        for _ in range(2):
+            if self._add_sequences(6):
+                self._refine(STEPS)
+        saved = len(before.planes) - len(self.scene.planes)
+        allowed = Posterior(self.rows, before).nll + 4 * saved
+        if Posterior(self.rows, self.scene).nll >= allowed:
+            self.scene = before

@@ -1,0 +1,190 @@
+"""Image sources as the Gaussians of a field: mirror planes by gradient, gains in closed form.
+
+A Gaussian here is a virtual source, the image of the static end in a sequence of mirror planes; what steps of
+gradient move are the planes, of which many sources share each, and the sources' powers. The gains given the
+rows are those of `phased_gp`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
+from gsparc.data.splits import Fold
+from gsparc.models.directional.method import DirectionalGP
+from gsparc.models.image_sources.gp_likelihood import correlations
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.phased_gp import PhasedPosterior
+from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.rows import Rows, gather
+from gsparc.ops import Pose
+from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
+from gsparc.training.context import FitContext
+
+
+class MethodField(ConditionalField):
+    """What a fitted method found.
+
+    Args:
+        method: fitted.
+    """
+
+    def __init__(self, method: ImageSourceGP | DirectionalGP) -> None:
+        super().__init__()
+        self.method = method
+
+    @property
+    def count(self) -> int:
+        """Sources, of the largest search."""
+        return self.method.size()
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`."""
+        found = self.method.predict(tx, rx)
+        assert found.variance is not None and found.confidence is not None
+        return Posterior(found.mean, found.variance, found.mean, 1 - found.confidence)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`; of one channel per receiver."""
+        method, left = self.method, self.method.leave_one_out()
+        rows = method.members[0].rows if isinstance(method, ImageSourceGP) else method.rows
+        scale = (method.frame.carrier_hz / rows.frequency).float()[:, None] * method.frame.scale
+        mean = (rows.target * scale - left.residual)[:, :, None]
+        return LeftOutRows(left.rows, mean, torch.full((len(left.rows),), float("nan")))
+
+    def state(self) -> dict[str, Any]:
+        """The method's."""
+        return {"method": self.method.state()}
+
+
+class SourceField(MethodField):
+    """The scenes of an ensemble of searches."""
+
+    kind = "sources"
+    method: ImageSourceGP
+    rates: ClassVar[dict[str, float]] = {"planes": 1e-4}  # [m] of a plane's offset, and of its unit normal
+
+    def __init__(self, method: ImageSourceGP) -> None:
+        super().__init__(method)
+        self.held = method.held
+        fixed = method.offsets != "none"  # those of every snapshot were estimated against these sources
+        scenes = [] if fixed else [member.scene for member in method.members]
+        self.planes = nn.ParameterList([scene.planes.clone() for scene in scenes])
+        self.log_amplitudes = nn.ParameterList([scene.log_amplitude.clone() for scene in scenes])
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Carrier phase, and visibility where it is modelled."""
+        clutter = any(len(member.scene.clutter) for member in self.method.members)
+        return ("phase", "visibility") if clutter else ("phase",)
+
+    def objects(self) -> SiteObjects:
+        """Planes and boxes of the heaviest search."""
+        method = self.method
+        scene = method.members[int(torch.as_tensor(method.weights).argmax())].scene
+        middle = method.frame.middle.double()
+        planes = scene.planes.detach().double()
+        normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
+        moved = torch.cat([normal, planes[:, 3:] + (normal @ middle)[:, None]], 1)
+        boxes = scene.clutter.boxes.detach().double().view(-1, 2, 3) + middle
+        return SiteObjects.of(moved.numpy(), boxes.numpy())
+
+    def loss(self, batch: Batch) -> Tensor:
+        """See `ConditionalField.loss`; of every search by its weight, with circular gains."""
+        rows = rows_of(self.method, batch)
+        each = []
+        for number, member in enumerate(self.method.members):
+            scene = self._scene(number)
+            seen = scene.visible_share(rows.position).detach()
+            waves = scene.unobstructed(rows) * seen * scene.log_amplitude.exp()
+            correlation = correlations(rows, scene.sources.detach(), scene.visibility)
+            covariance = torch.einsum("nk,mk,knm->nm", waves, waves.conj(), correlation.to(waves.dtype))
+            noise = float(np.exp(member.scene.log_noise)) + self.method.noise_floor
+            density = leave_one_out_density(covariance + noise * torch.eye(len(rows)), rows.target)
+            each.append(density * self.method.weights[number])
+        summed = torch.stack(each).sum(0)
+        return summed.view(len(batch), -1).mean(1)
+
+    def _scene(self, number: int) -> Any:
+        """The scene of a search with the parameters as they are."""
+        scene = self.method.members[number].scene
+        return replace(scene, planes=self.planes[number], log_amplitude=self.log_amplitudes[number])
+
+    @torch.no_grad()
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`."""
+        method = self.method
+        if method.offsets != "none":
+            return
+        scenes = [
+            replace(member.phased, scene=_detached(self._scene(number)))
+            for number, member in enumerate(method.members)
+        ]
+        data = replace(data, target=data.target * method.factors.numpy()[:, None])
+        held = method.frame.inside(gather(data, rows, method.row_limit, method.seed))
+        method.members = [PhasedPosterior(held, scene, method.noise_floor) for scene in scenes]
+        method.query = Query(method.members)
+
+
+class RayField(MethodField):
+    """Sources where measured directions of arrival meet."""
+
+    kind = "rays"
+    method: DirectionalGP
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Who sees a source is measured."""
+        return ("phase", "visibility")
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Nothing is left to gradient steps: places and visibility are those of largest likelihood."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`; places are triangulated anew, which is quick."""
+        self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+
+
+def restored_sources(site: Site, state: dict[str, Any]) -> SourceField:
+    """The field whose `state()` this was."""
+    method = ImageSourceGP()
+    method.restore(site, state["method"])
+    return SourceField(method)
+
+
+def restored_rays(site: Site, state: dict[str, Any]) -> RayField:
+    """The field whose `state()` this was."""
+    method = DirectionalGP()
+    method.restore(site, state["method"])
+    return RayField(method)
+
+
+def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:
+    """A batch as rows of the method's frame, one tone of each antenna."""
+    places, _ = method._places(batch.tx, batch.rx)
+    assert method.site is not None
+    tones = torch.from_numpy(method.site.tones())
+    count = len(batch)
+    per = len(places) // count
+    chosen = batch.index.cpu() % len(tones)  # all tones have their turn
+    target = batch.target[torch.arange(count), :, chosen] * method.factors  # (B, A)
+    target = target.reshape(-1, 1) if per > 1 else target
+    frequency = tones[chosen].repeat_interleave(per)
+    receiver = torch.arange(count).repeat_interleave(per)
+    rows = Rows(places[:, :3] + method.frame.middle, frequency, target, receiver)
+    if places.shape[1] > 3:
+        rows = replace(rows, array=places[:per, 3:], element=torch.arange(per).repeat(count))
+    return method.frame.inside(rows)
+
+
+def _detached(scene: Any) -> Any:
+    return replace(scene, planes=scene.planes.detach().clone(), log_amplitude=scene.log_amplitude.detach())

@@ -1,0 +1,112 @@
+"""Training images predicted without their neighbours, by whatever is linear in them, and by a plain process.
+
+Plain leave-one-out tests interpolation over the spacing of the samples only: here each sample is predicted
+without all others within a gap, for several gaps, so that rows can be chosen that are as far from what is
+left as queries will be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.distance import cdist
+from torch import Tensor
+
+from gsparc.models.baselines.gp import choose_kernel
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out_around
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Training spectra predicted without their neighbours.
+
+    Attributes:
+        positions: (n, 3) [m].
+        images: (n, P) float64, some pixels of the spectra.
+        centres: (c,) rows that were held out.
+        gaps: (g,) [m] within which their neighbours were held out, too.
+        predicted: (g, c, P); NaN where no sample was left.
+    """
+
+    positions: np.ndarray
+    images: np.ndarray
+    centres: np.ndarray
+    gaps: np.ndarray
+    predicted: np.ndarray
+
+    def state(self) -> dict[str, Tensor]:
+        """For the checkpoint of a training that may be interrupted."""
+        return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in vars(self).items()}
+
+    @classmethod
+    def of(cls, state: Mapping[str, Tensor] | None) -> LeftOut | None:
+        """From `state()`; None from None."""
+        return None if state is None else cls(**{key: value.numpy() for key, value in state.items()})
+
+    def by_process(self) -> np.ndarray:
+        """The same samples (g, c, P) as a Gaussian process on images predicts them from what is left."""
+        mean = self.images.mean(0)
+        vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
+        kernel = choose_kernel(self.positions, vectors * lengths, len(mean))
+        inverse = Factor.of(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
+        distance = cdist(self.positions, self.positions)
+        return mean + predict_left_out(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
+
+    def at(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predictions and targets (n, P) at one gap, of the samples that anything is left for."""
+        seen = ~np.isnan(predicted[gap]).any(1)
+        return predicted[gap][seen], self.images[self.centres][seen]
+
+    def as_far_as(self, distance: float | None) -> int:
+        """The gap whose held-out samples are most nearly `distance` [m] from what is left, by medians.
+
+        Args:
+            distance: of rows held out of the fit to the nearest row in it; None: no gap at all.
+        """
+        if distance is None:
+            return 0
+        apart = cdist(self.positions[self.centres], self.positions)
+        apart[np.arange(len(apart)), self.centres] = np.inf
+        beyond = [np.where(apart > gap, apart, np.inf).min(1) for gap in self.gaps]
+        medians = np.array([np.median(nearest) for nearest in beyond])
+        return int(np.argmin(np.abs(np.log(medians + 1e-9) - np.log(distance + 1e-9))))
+
+
+def predict_left_out(
+    inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance of each sample given all others outside a gap around it.
+
+    Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
+    `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
+
+    Args:
+        inverse: (n, n) of the Gram matrix with noise.
+        values: (n, M) real or complex.
+        distance: (n, n) [m].
+        centres: (c,) rows.
+        gaps: (g,) [m].
+
+    Returns:
+        Means (g, c, M), and variances (g, c) with noise; NaN where nothing is left.
+    """
+    precision, weighted = torch.from_numpy(inverse), torch.from_numpy(inverse @ values)
+    mean = np.full((len(gaps), len(centres), values.shape[1]), np.nan, dtype=values.dtype)
+    variance, rows = np.full(mean.shape[:2], np.nan), torch.from_numpy(centres)
+    for g, gap in enumerate(gaps):
+        near = distance[centres] <= gap
+        near[np.arange(len(centres)), centres] = True
+        some = np.flatnonzero(~near.all(1))
+        found = left_out_around(precision, weighted, rows[some], torch.from_numpy(near[some]))
+        mean[g, some], variance[g, some] = values[centres[some]] - found[0].numpy(), found[1].numpy()
+    return mean, variance
+
+
+def mean_log_error(error: np.ndarray) -> float:
+    """Mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
+    usable = ~np.isnan(error).all(1)
+    return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0

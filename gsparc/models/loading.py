@@ -1,0 +1,77 @@
+"""The model in a checkpoint: of whatever class it is, with its stations, or as a module of Lightning's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from gsparc.models import checkpoint
+from gsparc.models.method import Method, TrainsByGradient
+from gsparc.models.per_station import PerStation
+from gsparc.models.registry import build, known, method_class
+from gsparc.training.module import GaussianModule
+
+
+@runtime_checkable
+class HasModule(TrainsByGradient, Protocol):
+    """Trains a Gaussian field, and is one where `trainer_options()` says so."""
+
+    def module(self) -> GaussianModule:
+        """What Lightning trains, with schedules one step long."""
+
+
+def restore(stored: checkpoint.Stored) -> Method:
+    """The fitted method a checkpoint holds; only classes of gsparc are built.
+
+    Raises:
+        CheckpointError: unknown method, or a state that does not fit it.
+    """
+    model = stored.configuration.get("model")
+    try:
+        if isinstance(model, dict) and model.get("_target_") == stored.target:
+            make: Callable[[], Method] = partial(build, model, trusted=False)
+        else:
+            make = method_class(_registered(stored))
+        method = PerStation(make) if "per_station" in stored.state else make()
+        method.restore(stored.site, stored.state)
+    except checkpoint.CheckpointError:
+        raise
+    except Exception as error:  # the state comes from a file: anything may be wrong with it
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise checkpoint.CheckpointError(
+            f"{stored.path}: {stored.method} cannot be restored ({reason})"
+        ) from error
+    return method
+
+
+def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
+    """`restore(read(path))`, with what else the file holds.
+
+    Raises:
+        CheckpointError: as these two.
+    """
+    stored = checkpoint.read(path)
+    return restore(stored), stored
+
+
+def module_of(path: str | Path) -> GaussianModule:
+    """The LightningModule of a `model.ckpt` or `last.ckpt` whose method is a splatted field, on the CPU.
+
+    Raises:
+        CheckpointError: unreadable, or another method's.
+    """
+    method, stored = load(path)
+    if not (isinstance(method, HasModule) and method.trainer_options()):
+        raise checkpoint.CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
+    return method.module()
+
+
+def _registered(stored: checkpoint.Stored) -> str:
+    names = [name for name, target in known().items() if target == stored.target]
+    if not names:
+        raise checkpoint.CheckpointError(
+            f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
+        )
+    return names[0]

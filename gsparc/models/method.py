@@ -1,0 +1,221 @@
+"""What every method is (`Method`), what some can do besides, and what they predict (`Prediction`)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.gaussian_cloud import GaussianCloud
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
+from gsparc.data.splits import Fold
+from gsparc.ops import Pose
+from gsparc.training.context import FitContext, FitReport
+
+if TYPE_CHECKING:
+    from gsparc.processes.powers import PowerProcess
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a method says about B positions, in the units of the stored targets.
+
+    Attributes:
+        mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32.
+        confidence: (B,) float32 in [0, 1], larger is surer; None when the method has none.
+        variance: (B,) float32, expected squared error per entry; None when the method has none.
+    """
+
+    mean: Tensor
+    confidence: Tensor | None = None
+    variance: Tensor | None = None
+
+    @staticmethod
+    def joined(parts: Sequence[Prediction], order: Tensor | None = None) -> Prediction:
+        """One after the other, then in an order (B,); what any part lacks is None."""
+
+        def of(name: str) -> Any:
+            values = [getattr(part, name) for part in parts]
+            if any(value is None for value in values):
+                return None
+            return torch.cat(values) if order is None else torch.cat(values)[order]
+
+        return Prediction(of("mean"), of("confidence"), of("variance"))
+
+
+class Method(ABC):
+    """fit, predict, save, load; nothing else is asked of a method."""
+
+    name: str
+    site: Site | None = None  # what was learned from; None before `fit` or `restore`
+    effects: str | None = None  # the propagation effects that are computed, for `summary.json`
+    guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
+    both_ends = False  # whether both ends may move: its query is then (tx, rx)
+    uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
+    resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
+    has_parts = False  # whether it resumes parts in folders of their own
+    has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
+    takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
+
+    @property
+    def label(self) -> str:
+        """The name as people read it, with how the fit approximates."""
+        return self.name
+
+    @property
+    def stored_as(self) -> type[Method]:
+        """The class that a checkpoint names."""
+        return type(self)
+
+    @abstractmethod
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Learn from `fold.train` (and choose settings on `fold.val`); `fold.test` is not looked at."""
+
+    @abstractmethod
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """Predict at tx (B, 3) [m] and one shared or B receiver poses, all in local coordinates."""
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Predict a batch; a method that reads the fresh uplink of its snapshots overrides this."""
+        return self.predict(batch.tx, batch.rx)
+
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """Tensors, numbers and strings that `restore` needs (weights-only unpickling must accept them)."""
+
+    @abstractmethod
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """Become the method whose `state()` this was."""
+
+    def size(self) -> int:
+        """Number of Gaussians, sources or stored training samples."""
+        return 0
+
+    def objects(self) -> SiteObjects:
+        """What it found to stand in the site."""
+        return SiteObjects.of()
+
+    def shares(self, site: Site) -> bool:
+        """Whether it learns several stations of this site at once, told which by `Batch.station`."""
+        return False
+
+    def best_stations(
+        self, data: Measurements, fold: Fold, context: FitContext
+    ) -> tuple[Literal["each", "together"], str]:
+        """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
+        return "each", ""
+
+    def usual_s(self, site: Site) -> float | None:
+        """Seconds of all stations together where `FitContext.budget_s` says nothing; None: no end [s]."""
+        return None
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """What `summary.json` says of a fitted model, None where it means nothing here."""
+        return {
+            "model/num_gaussians": self.size() if self.has_gaussians else None,
+            "model/init": None,
+            "model/steps": None,
+            "model/variance_explained": None,
+            "time/init_s": None,
+        }
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Training rows predicted from all others.
+
+    Attributes:
+        rows: (n,) rows of the measurements, ascending where each occurs once.
+        residual: (n, R) complex, what was measured less what the others predict, stored units.
+    """
+
+    rows: np.ndarray
+    residual: Tensor
+
+
+@runtime_checkable
+class LeaveOneOut(Protocol):
+    """Predicts its training rows, each without itself (Rasmussen and Williams 2006, eq. 5.12)."""
+
+    def leave_one_out(self) -> LeftOut:
+        """Residuals of the rows it was fitted on."""
+
+
+@runtime_checkable
+class Reconditions(Protocol):
+    """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """A method of rows (n,) alone; None where more than settings would remember the others."""
+
+
+@runtime_checkable
+class HasProcess(Protocol):
+    """A Gaussian process on powers says what it does not know."""
+
+    def process(self) -> PowerProcess | None:
+        """The process; None where what was fitted has none."""
+
+
+@runtime_checkable
+class HasPaths(Protocol):
+    """Its channels are sums of propagation paths."""
+
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+        """Gains (B, A, N), delays (B, A, N) [s], directions of arrival (B, N, 3), and the carrier [Hz].
+
+        Raises:
+            ValueError: what was fitted here has none.
+        """
+
+
+@runtime_checkable
+class HasGaussians(Protocol):
+    """What it renders are Gaussians in space."""
+
+    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+        """All of them, with what they emit for tx (B, 3) [m]: the root mean square over these positions.
+
+        Raises:
+            ValueError: what was fitted here has none.
+        """
+
+
+@runtime_checkable
+class Reducible(Protocol):
+    """Answers faster and less accurately when asked to."""
+
+    def knobs(self) -> tuple[str, ...]:
+        """Names of the settings that mean something to what was fitted."""
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """What must be known of training rows (n,) to reduce it; stored with the model."""
+
+    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
+        """A method that answers with these settings; this one is left as it is."""
+
+
+@runtime_checkable
+class Differentiable(Protocol):
+    """Its mean has gradients by position."""
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean of `predict`, with autograd, at tx (B, 3) [m] and one shared or B receiver poses.
+
+        Raises:
+            ValueError: what was fitted here has no gradients.
+        """
+
+
+@runtime_checkable
+class TrainsByGradient(Protocol):
+    """Trains under a Lightning Trainer and heeds its options."""
+
+    def trainer_options(self) -> bool:
+        """Whether it does with its present settings; known before `fit` or settled by it."""

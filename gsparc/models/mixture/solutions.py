@@ -1,0 +1,183 @@
+"""Solutions that initialisers of conditional fields find, and their mean by weights from held-out rows."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.field.initial import InitSettings
+from gsparc.models.fields import INITIALISERS
+from gsparc.models.haste import factor_s
+from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.weights import LEAST_HELD, comparable
+from gsparc.models.terms import EffectSettings
+from gsparc.processes.worker import late_when
+from gsparc.training.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
+
+log = logging.getLogger(__name__)
+
+GROUPS = 3  # of training rows, that solutions are weighed by
+FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
+CLOSED_SHARE = 0.3  # of the seconds, for what takes no more than it needs beside what does
+FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
+SEARCH_LOOKS = 60  # at a search's rows, that the shortest takes
+LEAST_S = 0.2  # of a part, though others left none
+OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
+SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
+
+
+def find(
+    parts: tuple[str, ...], init: InitSettings, effects: EffectSettings, data: Measurements, fold: Fold,
+    context: FitContext, budget: TimeBudget, until_s: float, held: InnerFolds | None,
+) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:  # fmt: skip
+    """What initialisers find, and what each cost.
+
+    Where they are several, training rows are cut into groups as the test was cut, and each solution
+    predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
+    few sources is a solution of its own next to the one that takes what seconds are left: many sources fit
+    rows near others better, few of them what is far.
+
+    Args:
+        parts: names of initialisers, which have settings `init`.
+        fold: validation rows are solved for, too, where nothing is weighed.
+        until_s: the second of the running `budget` by which all should be found.
+        held: how training rows are cut; None of one initialiser.
+
+    Raises:
+        ValueError: the only initialiser, or the one asked for, cannot solve this.
+    """
+    several = held is not None
+    rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
+    groups = () if held is None else _groups(held, fold.train)
+    first = CLOSED_SHARE if any(part in OPEN_ENDED for part in parts) else 1.0
+    plans = [(part, init, first) for part in parts if part not in OPEN_ENDED]
+    for part in (part for part in parts if part in OPEN_ENDED):
+        if several and part in SEARCHES:
+            plans.append((f"few {part}", replace(init, **FEW), FEW_SHARE))
+        plans.append((part, init, 1.0))
+    found: dict[str, ConditionalField] = {}
+    reports: dict[str, FitReport] = {}
+    for name, settings, share in plans:
+        part = name.split()[-1]
+        least = SEARCH_LOOKS * factor_s(settings.search_rows) if part in SEARCHES else 0.0
+        if found and context.resume is None and least > until_s - budget.spent:
+            log.info("init=%s is left out: the seconds are too few for a search", name)
+            budget.limited = True
+            continue
+        within = replace(context, budget_s=share * max(until_s - budget.spent, LEAST_S))
+        if name.startswith("few "):
+            within = replace(within, run_dir=Path(), resume=None)
+        try:
+            leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
+            within = replace(within, leave_out=leave_out)
+            clutter = effects.visibility is not False
+            with late_when(budget.over):
+                field, report = INITIALISERS[part](data, rows, settings, clutter, within)
+            if effects.residual is False and isinstance(field, CompletedField):
+                field = field.field
+            found[name] = field
+            if part not in OPEN_ENDED:
+                field.held = _held(field, data, rows, groups, until_s, budget, report.seconds)
+        except KeyboardInterrupt:
+            if not name.startswith("few "):
+                raise
+            raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
+        except ValueError as error:
+            if len(parts) == 1 or name == init.name:
+                raise
+            log.info("init=%s is left out: %s", name, error)
+            found.pop(name, None)
+            continue
+        reports[name] = report
+    return found, reports
+
+
+def weighed(
+    solutions: dict[str, ConditionalField], data: Measurements, fold: Fold, cut: InnerFolds | None
+) -> dict[str, tuple[ConditionalField, float]]:
+    """Solutions with their weights where positive, by rows which they were not conditioned on.
+
+    Those are validation rows, and training rows as `cut`; one solution needs neither.
+    """
+    first = next(iter(solutions))
+    if len(solutions) == 1:
+        return {first: (solutions[first], 1.0)}
+    held = [field.held for field in solutions.values() if field.held is not None]
+    rows = np.zeros(0, np.int64)
+    if len(held) == len(solutions):
+        rows = np.asarray(functools.reduce(np.intersect1d, [one.rows for one in held]), np.int64)
+    batch = data.batch(fold.val)
+    predicted = []
+    for field in solutions.values():
+        mean = field(batch.tx, batch.rx).mean
+        if len(rows):
+            assert field.held is not None
+            order = {row: place for place, row in enumerate(field.held.rows.tolist())}
+            mean = torch.cat([field.held.mean[[order[row] for row in rows.tolist()]], mean])
+        predicted.append(comparable(mean, data.site))
+    rows = np.concatenate([rows, fold.val])
+    if len(rows) < LEAST_HELD:
+        log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), first)
+        return {first: (solutions[first], 1.0)}
+    target = comparable(data.batch(rows).target, data.site)
+    assert cut is not None
+    alone = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
+    unit = np.where(cut.unit == NOT_TESTED, alone, cut.unit)[rows]
+    weights = solution_weights.weights(predicted, target, unit)
+    for name, one, weight in zip(solutions, predicted, weights, strict=True):
+        log.info(
+            "%d held-out rows: %s misses %.3f of the energy, weight %.2f", len(rows), name,
+            solution_weights.error(one, target), weight,
+        )  # fmt: skip
+    return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
+
+
+def joined(kept: dict[str, tuple[ConditionalField, float]]) -> ConditionalField:
+    """The weighed mean, or the only one."""
+    fields, weights = zip(*kept.values(), strict=True)
+    return fields[0] if len(fields) == 1 else StackedField(fields, weights)
+
+
+def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Training rows (n,) of each group."""
+    found = [np.intersect1d(one.test, train) for one in cut.folds]
+    return tuple(group for group in found if 0 < len(group) < len(train))
+
+
+def _held(
+    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...],
+    until_s: float, budget: TimeBudget, fitted_s: float,
+) -> LeftOutRows | None:  # fmt: skip
+    """Rows of every group, predicted from the others with the parameters of all; None where time is short.
+
+    Args:
+        until_s: second of the budget by which that must be done.
+        fitted_s: seconds of the fit, about what the weights may take at most.
+    """
+    if not groups:
+        return None
+    found, began = [], budget.spent
+    for number, group in enumerate(groups):
+        each = (budget.spent - began) / number if number else fitted_s
+        if budget.spent + each > until_s:
+            budget.limited = True
+            if number:
+                field.condition(data, rows)
+            return None
+        field.condition(data, np.setdiff1d(rows, group))
+        batch = data.batch(group)
+        found.append(field(batch.tx, batch.rx))
+    field.condition(data, rows)
+    mean, variance = (torch.cat([getattr(one, name) for one in found]) for name in ("mean", "variance"))
+    return LeftOutRows(np.concatenate(groups), mean, variance)

@@ -1,0 +1,389 @@
+"""`model=moving_array`: sources, their powers as smooth trends, a Gaussian process on residual spectra.
+
+The trend moves directions of arrival with the receiver, which interpolating images cannot; the residual
+goes to a Gaussian process on images. Images of several searches are averaged.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.censored import heard
+from gsparc.models.method import Prediction
+from gsparc.models.moving_array import reduce
+from gsparc.models.moving_array.checks import MAX_UNEXPLAINED, site_problem, unexplained_energy
+from gsparc.models.moving_array.error_model import ErrorModel, fit_error_model, image_features
+from gsparc.models.moving_array.power_gp import Trend, TrendSettings, fit_trend
+from gsparc.models.moving_array.query import Array, Query
+from gsparc.models.moving_array.residual import Residual, fit_residual, left_out_error
+from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, powers
+from gsparc.models.target_rows import to_real, training_targets
+from gsparc.ops import Pose
+from gsparc.physics.lags import BLOCK, Lags
+from gsparc.physics.separable import Separable, separable
+from gsparc.processes.kernel import Kernel
+from gsparc.training.conditional import LeftOutRows, Posterior
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
+
+log = logging.getLogger(__name__)
+
+UNRESOLVED = 2e-4  # of the images' energy, that the basis of the residual leaves out per mode
+MIN_GAIN = 0.005  # of the leave-one-out error: searches end when the last one gained less
+BUDGET_SHARE = 0.8  # of the budget, by which the last search must end
+SEARCH_SHARE = 0.7  # the same without the kernel of its powers
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Training spectra as few numbers.
+
+    Attributes:
+        places: (n, 3) float64 [m].
+        lags: (n, Q) of their powers.
+        values: (n, R) of their pixels in the residual's basis.
+    """
+
+    places: np.ndarray
+    lags: Tensor
+    values: Tensor
+
+    @property
+    def receivers(self) -> Tensor:
+        """(n, 3) float32 [m]."""
+        return torch.from_numpy(self.places).float()
+
+    def at(self, rows: np.ndarray) -> Spectra:
+        """Some of them."""
+        return Spectra(self.places[rows], self.lags[rows], self.values[rows])
+
+
+class MovingArrayField(Interpolator):
+    """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
+
+    With `trainer.budget_s` it searches until the budget is spent or the leave-one-out error stops falling.
+
+    Args:
+        search: how sources are found.
+        trend: how smooth their powers are.
+        searches: number, without a budget.
+        rest_rows: that the residual's kernel is chosen on; seconds grow with their cube.
+        components: largest number of principal components of the residual; 0: the trends alone.
+        seed: of the first search; the others have the next ones.
+        name: as it appears in tables.
+        most_searches: with a budget, at most so many; None: as many as help.
+
+    Attributes:
+        left_powers: per search (n, K) float32, powers that the others' predict of each training row.
+    """
+
+    effects = "moving_array"
+    takes_budget = True
+
+    def __init__(
+        self,
+        search: SearchSettings | None = None,
+        trend: TrendSettings | None = None,
+        searches: int = 1,
+        rest_rows: int = 1500,
+        components: int = 512,
+        seed: int = 0,
+        name: str = "moving_array",
+        most_searches: int | None = None,
+    ) -> None:
+        super().__init__()
+        if searches < 1 or rest_rows < 3:
+            raise ValueError(
+                f"{name}: model.searches={searches}, model.rest_rows={rest_rows}: expected at least 1 and 3"
+            )
+        self.search, self.trend = search or SearchSettings(), trend or TrendSettings()
+        self.searches, self.rest_rows, self.components = searches, rest_rows, components
+        self.seed, self.name, self.most_searches = seed, name, most_searches
+        self.trends: list[Trend] = []
+        self.left_powers: list[Tensor] = []
+        self._budget = TimeBudget()
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Find sources, fit their powers and the residual.
+
+        Raises:
+            ValueError: not spectra of a moving receiver with a declared array that keeps its orientation.
+        """
+        problem = site_problem(data)
+        if problem is not None:
+            raise ValueError(f"{self.name}: {problem}")
+        self._budget, self._lags = context.time_budget(), None
+        return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`; searches where there are several."""
+        own = ("keep", "stride", "confidence")
+        return ("searches", *own) if len(self.trends) > 1 else own
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Nothing: the process itself holds what each component contributes."""
+        return {}
+
+    reduced = reduce.reduced
+
+    # -- learning ----------------------------------------------------------------------------------
+
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        begin, budget, longest = time.perf_counter(), self._budget, 0.0
+        self.exponent = self._exponent(targets)
+        self.basis = separable(self._blocks(targets), UNRESOLVED)
+        held = self._held(positions, targets)
+        self.trends, self.left_powers, errors = [], [], []
+        modelled = torch.zeros_like(held.values)  # sum over searches of left-out images
+        while True:
+            start = time.perf_counter()
+            sources = self._find(held)
+            power = self._powers(held, sources)
+            modelled += self._add(held, sources, power, self._choose_kernel(held, sources, power))
+            rows = _spread(len(positions), self.trend.rows)
+            left = held.values[rows] - modelled[rows] / len(self.trends)
+            errors.append(left_out_error(positions[rows], left)[0] / targets[0].size)
+            now = time.perf_counter()
+            longest = max(longest, now - start)
+            log.info(
+                "%s: search %d, %d sources, trend length %.3g m, leave-one-out error %.4g, %.0f s",
+                self.name, len(errors), len(sources), self.trends[-1].kernel.length, errors[-1], now - begin,
+            )  # fmt: skip
+            if budget.seconds == math.inf:
+                done = len(errors) == self.searches
+            else:
+                late = budget.over(BUDGET_SHARE - longest / budget.seconds)
+                done = late or len(errors) == self.most_searches
+                done |= len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2]
+            if done:
+                break
+        modelled /= len(self.trends)
+        rows = _spread(len(positions), self.rest_rows)
+        kernel = left_out_error(positions[rows], held.values[rows] - modelled[rows])[1]
+        self._complete(held, modelled, kernel, targets)
+        note = f"{self.name}: {len(self.trends)} searches, {self.size()} sources, leave-one-out error "
+        note += " ".join(f"{error:.4g}" for error in errors)
+        fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
+        return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
+
+    @torch.no_grad()
+    def condition(self, data: Measurements, rows: np.ndarray, sources: Sequence[Tensor]) -> np.ndarray:
+        """Powers, trends, residual and errors anew, with the kernels of the fit.
+
+        Args:
+            data: of the site that was fitted.
+            rows: (n,) to learn from.
+            sources: (K, 3) [m] of each search.
+
+        Returns:
+            Those of the rows where something was heard.
+        """
+        rows = heard(data, rows)
+        if not len(rows):
+            raise ValueError(f"{self.name}: the training set is empty")
+        targets, self.seen = training_targets(data, rows), len(rows)
+        held, kernels = self._held(data.moving[rows], targets), [trend.kernel for trend in self.trends]
+        self.trends, self.left_powers = [], []
+        modelled = torch.zeros_like(held.values)
+        for place, kernel in zip(sources, kernels, strict=True):
+            modelled += self._add(held, place, self._powers(held, place), kernel)
+        self._complete(held, modelled / len(self.trends), self.residual.kernel, targets)
+        return rows
+
+    def _exponent(self, targets: np.ndarray) -> int:
+        """Whether pixels are amplitude (2) or power (1).
+
+        Raises:
+            ValueError: neither is a spectrum of the declared array.
+        """
+        exponent, left = unexplained_energy(self.lags(), self._images(targets[_spread(len(targets), 16)]))
+        if left > MAX_UNEXPLAINED:
+            raise ValueError(
+                f"{self.name}: the declared array cannot have measured these spectra "
+                f"({left:.0%} of their energy is outside its lags)"
+            )
+        return exponent
+
+    def _held(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
+        parts = [(self.lags().of(b**self.exponent), self.basis.of(b)) for b in self._blocks(targets)]
+        lags, values = (torch.cat(part) for part in zip(*parts, strict=True))
+        return Spectra(places, lags, values)
+
+    def _find(self, held: Spectra) -> Tensor:
+        """Sources (K, 3) [m] of the next search."""
+        assert self.site is not None and self.site.grid is not None
+        some, static = held.at(_spread(len(held.places), self.search.rows)), self.site.static_position
+        first = None if static is None else torch.from_numpy(np.asarray(static)).float()
+        return find_sources(
+            some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
+            self.seed + len(self.trends), self._seconds,
+        )  # fmt: skip
+
+    def _seconds(self) -> float:
+        """Left for the search under way [s]; whoever has none of them ends what it does."""
+        self._budget.over(SEARCH_SHARE)
+        return SEARCH_SHARE * self._budget.seconds - self._budget.spent
+
+    def _powers(self, held: Spectra, sources: Tensor) -> np.ndarray:
+        """Powers (n, K) float64 that explain each row best."""
+        array = self.array()
+        return torch.cat([
+            powers(part, array.atoms(sources, places), self.search.ridge)
+            for part, places in zip(held.lags.split(BLOCK), held.receivers.split(BLOCK), strict=True)
+        ]).double().numpy()  # fmt: skip
+
+    def _add(self, held: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
+        """Append the trend of powers (n, K); its left-out images (n, R)."""
+        trend, left = fit_trend(sources, kernel, held.places, power)
+        self.trends.append(trend)
+        self.left_powers.append(torch.from_numpy(left).float())
+        return self._modelled(held, sources, self.left_powers[-1])
+
+    def _modelled(self, held: Spectra, sources: Tensor, power: Tensor) -> Tensor:
+        """Images (n, R) of sources of powers (n, K)."""
+        array = self.array()
+        return torch.cat([
+            self.basis.of(array.render(sources, places, part))
+            for places, part in zip(held.receivers.split(BLOCK), power.split(BLOCK), strict=True)
+        ])  # fmt: skip
+
+    def _choose_kernel(self, held: Spectra, sources: Tensor, power: np.ndarray) -> Kernel:
+        """Kernel of a trend, by leave-one-out error."""
+        rows = _spread(len(held.places), self.trend.rows)
+        some, diagonal = held.at(rows), float(np.linalg.norm(np.ptp(held.places, axis=0))) or 1.0
+        errors = {}
+        for length in self.trend.lengths:
+            kernel = Kernel.of_one(length * diagonal, self.trend.noise)
+            left = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
+            missed = some.values - self._modelled(some, sources, left)
+            errors[kernel] = left_out_error(some.places, missed)[0]
+        return min(errors, key=lambda kernel: errors[kernel])
+
+    def _complete(self, held: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray) -> None:
+        """The process on what left-out trends (n, R) miss, and the error model of the sum."""
+        self.positions, missed = held.places, held.values - modelled
+        self.residual, added = fit_residual(kernel, held.places, missed, self.components)
+        self._left, self._query = modelled + added, None
+        self.trend_error = max(float(missed.square().mean(0).sum()) / targets[0].size, 1e-12)
+        energy = added.square().sum(1) / targets[0].size
+        relative, features, errors = [], [], []
+        for start, image in zip(range(0, len(targets), BLOCK), self._blocks(targets), strict=True):
+            part = slice(start, start + BLOCK)
+            found = self.basis.images(self._left[part]).clamp_(0, 1)
+            error = (found - image).square().mean((1, 2))
+            relative.append(error / image.square().mean((1, 2)).clamp_min(1e-12))
+            errors.append(error)
+            features.append(image_features(found, energy[part]))
+        # two images drawn at random differ by twice the variance
+        prior = 2 * float((held.values - held.values.mean(0)).square().mean(0).sum()) / targets[0].size
+        self.error_model = fit_error_model(
+            held.places, torch.cat(relative), torch.cat(features), kernel,
+            float(np.mean([trend.kernel.length for trend in self.trends])), prior,
+        )  # fmt: skip
+        self._left_error = torch.cat(errors)
+
+    def left_out(self, rows: np.ndarray) -> LeftOutRows:
+        """Images of the training rows (n,), each predicted from the others; of a field just conditioned."""
+        mean = torch.cat([self.basis.images(part).clamp_(0, 1) for part in self._left.split(BLOCK)])
+        return LeftOutRows(rows, mean, self._left_error)
+
+    # -- answering ---------------------------------------------------------------------------------
+
+    def posterior(self, tx: Tensor, rx: Pose) -> Posterior:
+        """What is known at queries; `explained` are the sources' images alone."""
+        return self._answer(self.where(tx, rx))
+
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        found = self._answer(torch.from_numpy(queries))
+        return Prediction(found.mean, 1 - found.unknown, found.variance)
+
+    @torch.no_grad()
+    def _answer(self, where: Tensor) -> Posterior:
+        found = self.query()(where)
+        mean = found.image.clamp_(0, 1)
+        features = image_features(mean, found.added / mean[0].numel())
+        power = mean.flatten(1).square().mean(1)
+        unknown, variance = self.error_model.expected(found.far, features, power)
+        return Posterior(mean, variance, found.explained.clamp_(0, 1), unknown)
+
+    def where(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Receivers' places (B, 3) float64 [m]; `ValueError` before `fit` or `restore`."""
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        return self._queries(tx, rx).detach()
+
+    def query(self, searches: int | None = None, count: int | None = None, stride: int = 1) -> Query:
+        """Answers with the first searches and components (None: all) on every `stride`-th pixel."""
+        if self._query is not None and (searches, count, stride) == (None, None, 1):
+            return self._query
+        residual = self.residual if count is None else self.residual.first(count)
+        query = Query(
+            self.array(stride), self.basis, self.trends[:searches], residual,
+            torch.from_numpy(self.positions), stride,
+        )  # fmt: skip
+        if (searches, count, stride) == (None, None, 1):
+            self._query = query
+        return query
+
+    def size(self) -> int:
+        """Number of sources of all searches."""
+        return sum(len(trend.sources) for trend in self.trends)
+
+    def array(self, stride: int = 1) -> Array:
+        """That looks, at every `stride`-th pixel."""
+        return Array(self.lags(), self.rotation(), self.exponent, stride)
+
+    def rotation(self) -> Tensor:
+        """(3, 3) of the array, receiver to world."""
+        assert self.site is not None and self.site.rx_rotation is not None
+        return torch.from_numpy(np.asarray(self.site.rx_rotation)).float()
+
+    def lags(self) -> Lags:
+        """The array's, computed once."""
+        assert self.site is not None
+        if self._lags is None:
+            self._lags = Lags(*self.site.array_geometry())
+        return self._lags
+
+    _lags: Lags | None = None
+    _query: Query | None = None
+
+    def _images(self, targets: np.ndarray) -> Tensor:
+        return torch.from_numpy(to_real(targets, "spectrum")).reshape(targets.shape)
+
+    def _blocks(self, targets: np.ndarray) -> Iterator[Tensor]:
+        return (self._images(targets[i : i + BLOCK]) for i in range(0, len(targets), BLOCK))
+
+    def _learned(self) -> dict[str, Any]:
+        return {
+            "trends": [trend.state() for trend in self.trends],
+            "exponent": self.exponent,
+            "basis": vars(self.basis),
+            "residual": self.residual.state(),
+            "positions": torch.from_numpy(self.positions),
+            "errors": self.error_model.state(),
+        }
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        self._lags = self._query = None
+        self.trends = [Trend.from_state(trend) for trend in state["trends"]]
+        self.exponent, self.basis = int(state["exponent"]), Separable(**state["basis"])
+        self.residual, self.positions = Residual.from_state(state["residual"]), state["positions"].numpy()
+        self.error_model = ErrorModel.from_state(state["errors"])
+
+
+def _spread(count: int, limit: int) -> np.ndarray:
+    """At most `limit` of `count` rows, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int))

@@ -1,0 +1,93 @@
+"""Images at new places, in float32: sources rendered through the array, and what they leave."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsparc.models.moving_array.power_gp import Trend
+from gsparc.models.moving_array.residual import Residual
+from gsparc.models.moving_array.triangulate import bearings, mixture
+from gsparc.physics.lags import Lags
+from gsparc.physics.separable import Separable
+
+
+class Array:
+    """The array that looks.
+
+    Args:
+        space: its lags.
+        rotation: (3, 3) receiver to world.
+        exponent: whether pixels are amplitude (2) or power (1).
+        stride: between the pixels that are rendered.
+    """
+
+    def __init__(self, space: Lags, rotation: Tensor, exponent: int, stride: int = 1) -> None:
+        self.space, self.rotation, self.exponent = space, rotation, exponent
+        self._pixels = space.pixels if stride == 1 else space.pixels.thinned(stride)
+
+    def atoms(self, sources: Tensor, receivers: Tensor) -> Tensor:
+        """Lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
+        return self.space.atoms(bearings(sources, receivers, self.rotation))
+
+    def render(self, sources: Tensor, receivers: Tensor, power: Tensor, least: float = 0.0) -> Tensor:
+        """Images (n, H, W) of sources of powers (n, K), pixels of power at least `least`."""
+        found = self.space.spectrum(mixture(power, self.atoms(sources, receivers)), self._pixels)
+        found = found.clamp_min(least) if least else found
+        return found.sqrt() if self.exponent == 2 else found
+
+
+class Found(NamedTuple):
+    """Answers at m places.
+
+    Attributes:
+        explained: (m, H, W) images of the sources, not clamped.
+        image: (m, H, W) in all, not clamped.
+        added: (m,) energy of what the process adds, on all pixels.
+        far: (m, n) [m] from the training receivers.
+    """
+
+    explained: Tensor
+    image: Tensor
+    added: Tensor
+    far: Tensor
+
+
+class Query:
+    """What a fitted field answers with.
+
+    Args:
+        array: that looks.
+        basis: of what the residual adds.
+        trends: of the searches, whose images are averaged.
+        residual: the process.
+        places: (n, 3) float64 [m] of the training receivers.
+        stride: between the pixels that are rendered, as the array's.
+    """
+
+    def __init__(
+        self,
+        array: Array,
+        basis: Separable,
+        trends: Sequence[Trend],
+        residual: Residual,
+        places: Tensor,
+        stride: int = 1,
+    ) -> None:
+        self._array, self._trends, self._residual = array, trends, residual
+        self._basis = basis if stride == 1 else basis.thinned(stride)
+        self._middle = places.mean(0)
+        self._places = (places - self._middle).float()
+
+    def __call__(self, where: Tensor) -> Found:
+        """At places (m, 3) float64 [m]."""
+        receivers, centred = where.float(), (where - self._middle).float()
+        # exact differences: the expanded square loses the digits of what is near
+        far = torch.cdist(centred, self._places, compute_mode="donot_use_mm_for_euclid_dist")
+        images = [self._array.render(t.sources, receivers, t.powers(far)) for t in self._trends]
+        explained = images[0] if len(images) == 1 else torch.stack(images).mean(0)
+        added = self._residual.coefficients(far)
+        return Found(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)

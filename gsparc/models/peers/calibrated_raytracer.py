@@ -1,0 +1,204 @@
+"""`model=calibrated_raytracer`: the geometry is known, the materials are learned.
+
+A ray tracer that is told where everything stands, and learns from the measurements what it is made of
+(`gsparc.simulate.calibration`), with one gain of both ends. Nothing is interpolated: where it traces no
+path, it predicts the median of the training rows where it traces none.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.censored import heard
+from gsparc.models.method import Method, Prediction
+from gsparc.models.target_rows import to_real
+from gsparc.ops import Pose
+from gsparc.simulate.calibration import (
+    GENERIC,
+    Calibration,
+    Material,
+    Replay,
+    apply,
+    calibrate,
+    used_materials,
+)
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.paths import Paths
+from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.scenes.build import from_config, known_scene, load_tracer
+from gsparc.training.context import FitContext, FitReport
+
+Start = Literal["generic", "scene"]
+
+
+@dataclass(eq=False, kw_only=True)
+class CalibratedRayTracer(Method):
+    """Powers, or channels of one antenna, from traced paths.
+
+    Args:
+        scene: see `known_scene`; None: the one that a simulated file names.
+        start: materials to begin with: one `generic` for all surfaces, or the `scene`'s own.
+        steps: most evaluations of likelihood and gradient; 0 learns the gain alone.
+        depth: most interactions of a path.
+        diffraction: at wedges.
+        samples, batch: of the solver, see `Sampling`.
+    """
+
+    name = "calibrated_raytracer"
+    kinds: ClassVar[tuple[Kind, ...]] = ("rssi", "csi")
+    scene: str | None = None
+    start: Start = "generic"
+    steps: int = 40
+    depth: int = 5
+    diffraction: bool = True
+    samples: int = 100_000
+    batch: int = 400
+    learned: Calibration | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        if self.start not in get_args(Start):
+            raise ValueError(f"model.start={self.start!r}: expected one of {', '.join(get_args(Start))}")
+        if self.steps < 0 or self.samples < 1 or self.batch < 1:
+            raise ValueError("model: steps is at least 0, samples and batch at least 1")
+        self._scene_json, self._silent_db, self._factor = "", 0.0, 1.0 + 0.0j
+        self._tracer: RayTracer | None = None
+        self._traced_effects()
+
+    def problem(self, data: Measurements) -> str | None:
+        """Why it cannot serve these measurements; None where it may."""
+        site = data.site
+        if site.kind not in self.kinds:
+            return f"{self.name}: needs received powers or channels, not {site.kind}"
+        if site.kind == "csi" and data.target.shape[1] != 1:
+            return f"{self.name}: needs channels of one antenna"
+        if site.static_position is None or not np.isfinite(site.static_position).all():
+            return f"{self.name}: needs one end that stands still at a known place"
+        if site.carrier_hz is None:
+            return f"{self.name}: the carrier is unknown; materials need it"
+        return None
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Trace the training rows, and learn materials and gain from their powers.
+
+        Raises:
+            ValueError: other data than `problem` allows, no known scene, or paths to fewer than 2 rows.
+            SimulatorMissing: Sionna is not installed.
+        """
+        fault = self.problem(data)
+        if fault is not None:
+            raise ValueError(fault)
+        begin = time.perf_counter()
+        self.site = data.site
+        try:
+            scene = known_scene(self.scene, data.provenance, float(data.site.carrier_hz or 0.0))
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from error
+        self._scene_json, self._tracer = json.dumps(asdict(scene)), None
+        rows = heard(data, np.concatenate([fold.train, fold.val]))
+        places, measured = data.moving[rows] + data.site.origin, _levels(data, rows)
+        tracer = self._ready()
+        own = used_materials(tracer)
+        start = own if self.start == "scene" else dict.fromkeys(own, GENERIC)
+        apply(tracer, start)
+        replay = Replay(tracer, places, self._traced_effects())
+        traced = replay.powers()
+        reached = traced > 0
+        if reached.sum() < 2:
+            raise ValueError(f"{self.name}: paths reach {reached.sum()} training rows; is this the scene?")
+        self.learned = calibrate(replay, start, traced, measured, self.steps)
+        # Without paths in training, what is weakest there is the best guess of what lies deeper.
+        self._silent_db = float(np.median(measured[~reached]) if not reached.all() else measured.min())
+        if data.site.kind == "csi":
+            self._factor = self._best_factor(data, rows)
+        return FitReport(time.perf_counter() - begin, self._notes(len(rows) - int(reached.sum())))
+
+    def _notes(self, dark: int) -> tuple[str, ...]:
+        assert self.learned is not None
+        said = ", ".join(
+            f"{name} {one.permittivity:.3g} and {one.conductivity:.2g} S/m"
+            for name, one in self.learned.materials.items()
+        )
+        notes = [f"permittivity and conductivity of {said}; residuals {self.learned.scale_db:.2g} dB"]
+        if dark:
+            notes.append(f"{dark} training rows have no path; such places get {self._silent_db:.4g} dB")
+        return tuple(f"{self.name}: {note}" for note in notes)
+
+    def _best_factor(self, data: Measurements, rows: np.ndarray) -> complex:
+        """The complex factor of least squared error over `rows`."""
+        traced = self._channels(self._trace(data.moving[rows])).ravel()
+        energy = np.vdot(traced, traced).real
+        return complex(np.vdot(traced, data.target[rows].ravel()) / energy) if energy > 0 else 0j
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; `ValueError` before `fit` or `restore`."""
+        if self.site is None or self.learned is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        paths = self._trace(self.site.moving(tx, rx).expand(len(tx), -1).detach().cpu().double().numpy())
+        if self.site.kind == "csi":
+            return Prediction(torch.from_numpy((self._channels(paths) * self._factor).astype(np.complex64)))
+        power = paths.received_power()
+        with np.errstate(divide="ignore"):
+            level = np.where(power > 0, 10 * np.log10(power) + self.learned.gain_db, self._silent_db)
+        return Prediction(torch.from_numpy(10 ** (level / 10))[:, None].float())
+
+    def _channels(self, paths: Paths) -> np.ndarray:
+        """(B, 1, K) without the factor."""
+        assert self.site is not None and self.site.wavelength is not None
+        return paths.responses(self.site.tones(), np.zeros((1, 3)), self.site.wavelength)[:, :1]
+
+    def _trace(self, places: np.ndarray) -> Paths:
+        """Paths to places (B, 3) [m], local."""
+        assert self.site is not None
+        return self._ready().trace(places + self.site.origin, self._traced_effects())
+
+    def _traced_effects(self) -> Effects:
+        return Effects(
+            diffraction=self.diffraction, edge_diffraction=False, diffuse=False, polarisation=False,
+            depth=self.depth,
+        )  # fmt: skip
+
+    def _ready(self) -> RayTracer:
+        """The scene under what was learned, loaded when it is first asked."""
+        if self._tracer is None:
+            assert self.site is not None and self.site.static_position is not None
+            scene = from_config(json.loads(self._scene_json))
+            place = self.site.static_position + self.site.origin
+            self._tracer = load_tracer(scene, Sampling(self.samples, self.batch), place, self.site.name)
+            if self.learned is not None:
+                apply(self._tracer, self.learned.materials)
+        return self._tracer
+
+    def state(self) -> dict[str, Any]:
+        """The scene's settings, the materials, the gain."""
+        assert self.learned is not None
+        return {
+            "scene": self._scene_json, "learned": asdict(self.learned), "silent_db": self._silent_db,
+            "factor": [self._factor.real, self._factor.imag],
+        }  # fmt: skip
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`; the scene is loaded with the first prediction."""
+        self.site, self._scene_json, self._tracer = site, str(state["scene"]), None
+        stored = state["learned"]
+        materials = {name: Material(**one) for name, one in stored["materials"].items()}
+        self.learned = Calibration(**{**stored, "materials": materials})
+        self._silent_db, self._factor = float(state["silent_db"]), complex(*state["factor"])
+
+
+def _levels(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Powers (n,) of `rows` in decibels of stored units; of channels the mean over tones."""
+    if data.site.kind == "rssi":
+        return to_real(data.target[rows], "rssi")[:, 0].astype(np.float64)
+    measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
+    squared = np.abs(data.target[rows].astype(np.complex128)) ** 2
+    power = (squared * measured[rows]).sum(axis=(1, 2)) / np.maximum(measured[rows].sum(axis=(1, 2)), 1)
+    return to_real(power, "rssi")[:, 0].astype(np.float64)

@@ -1,0 +1,140 @@
+"""GSRF: complex-valued Gaussians whose radiance is a Fourier-Legendre series of direction.
+
+K. Yang, G. Dong, S. Ji, W. Du, M. Srivastava, "GSRF: Complex-Valued 3D Gaussian Splatting for Efficient
+Radio-Frequency Data Synthesis", NeurIPS 2025. Its forerunner RFSPM (K. Yang et al., "Scalable 3D Gaussian
+Splatting-Based RF Signal Spatial Propagation Modeling", 2025) had a network per Gaussian instead.
+
+Kept: complex radiance without any network, front-to-back compositing, magnitude of the complex sum, a loss of
+absolute errors, SSIM and the frequency domain. Left out: the phase of the transmittance (ours attenuates
+without a phase; radiances absorb it), adaptive density control, associated Legendre functions (ours are
+products of polynomials and a Fourier series), orthographic splatting onto a sphere of rays (our footprints
+lie on the tangent plane), spectra rendered about the transmitter (ours are about the receiver).
+
+Channels are an extension of ours: the distance to every Gaussian turns and fades its wave, and each has a
+response per antenna and tone. The published task, an uplink channel at a latent position, is another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Kind
+from gsparc.models.peers.gaussians import (
+    GEOMETRY_RATES,
+    GaussianNetwork,
+    GaussianPeer,
+    gaussians_of,
+    rendering_of,
+)
+from gsparc.models.peers.network import Network, Scene
+from gsparc.models.peers.radiance import fourier_legendre, terms
+from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
+
+TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
+
+
+@dataclass(eq=False, kw_only=True)
+class GSRF(GaussianPeer):
+    """Spectra and channels.
+
+    Args:
+        count: Gaussians.
+        degree, order: largest Legendre degree and Fourier order of the radiance.
+        ssim_weight, fourier_weight: shares of SSIM and of the frequency domain in the loss (spectra).
+        others: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
+    rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
+    name: str = "gsrf"
+    count: int = 500
+    degree: int = 3
+    order: int = 3
+    ssim_weight: float = 0.19
+    fourier_weight: float = 0.05
+
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """See `TrainedPeer.build`."""
+        return ComplexGaussians(scene, self)
+
+
+class ComplexGaussians(GaussianNetwork):
+    """N Gaussians, each with K complex coefficients."""
+
+    def __init__(self, scene: Scene, settings: GSRF) -> None:
+        super().__init__()
+        count, self.degree, self.order = settings.count, settings.degree, settings.order
+        self.scene, self.count, self.fourier_weight = scene, count, settings.fourier_weight
+        self.ssim_weight = settings.ssim_weight / (1 - settings.fourier_weight)  # of what the base counts
+        self.field = gaussians_of(scene, count)
+        self.grid, self.options = rendering_of(scene)
+        self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(self.degree, self.order), 2))
+        with torch.no_grad():
+            self.coefficients[:, 0, 0] += 0.3
+        self.response: nn.Parameter | None = None
+        if scene.site.kind == "csi":  # of each Gaussian at every antenna and tone
+            response = torch.zeros(count, *scene.shape, 2)
+            response[..., 0] = 1
+            self.response = nn.Parameter(response)
+        self._frozen: FrozenPlan | None = None
+
+    def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Radiance (B, N, 2) of each Gaussian towards the moving end."""
+        towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
+        distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
+        series = fourier_legendre(towards / distance, self.degree, self.order)
+        sent = torch.einsum("bnk,nkc->bnc", series, self.coefficients)
+        if self.response is None:
+            return sent
+        # Channels of a moving end turn with its distance to every source.
+        assert self.scene.site.wavelength is not None
+        turns = torch.polar(1 / distance, -2 * torch.pi / self.scene.site.wavelength * distance)
+        return torch.view_as_real(torch.view_as_complex(sent.contiguous()) * turns.squeeze(-1))
+
+    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Spectra (B, H, W) or channels (B, A, K)."""
+        sent, geometry = self.radiance(tx, rx), self.field.geometry()
+        if self.response is not None:
+            seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
+            arriving = seen * torch.view_as_complex(sent.contiguous())
+            return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
+        return _magnitude(rasterize(*geometry, sent, rx, self.grid, **self.options).image)
+
+    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `GaussianNetwork`; of channels the root mean square over antennas and tones."""
+        sent = self.radiance(tx, rx)[0].norm(dim=1)
+        return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
+
+    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
+        plain = super().loss(batch, draw)
+        if self.response is not None or batch.mask is not None or not self.fourier_weight:
+            return plain
+        difference = torch.fft.rfft2(self(batch.tx, batch.rx) - batch.target, norm="ortho").abs().mean()
+        return (1 - self.fourier_weight) * plain + self.fourier_weight * difference
+
+    def train(self, mode: bool = True) -> ComplexGaussians:
+        """Further training drops the frozen view."""
+        self._frozen = None
+        super().train(mode)
+        return self
+
+    @torch.no_grad()
+    def answer(self, tx: Tensor, rx: Pose) -> Tensor:
+        """A static receiver's view is frozen once."""
+        if self.response is not None or rx.batched or self.training:
+            return self(tx, rx)
+        if self._frozen is None:
+            geometry = self.field.geometry()
+            plan = make_plan(*geometry, rx, self.grid, **self.options)
+            self._frozen = freeze(plan, *geometry, version=0)
+        return _magnitude(self._frozen.render(self.radiance(tx, rx), 0))
+
+
+def _magnitude(image: Tensor) -> Tensor:
+    """(B, 2, H, W) -> (B, H, W)."""
+    return (image.square().sum(1) + TINY).sqrt()

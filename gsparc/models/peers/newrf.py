@@ -1,0 +1,147 @@
+"""NeWRF: rays along the directions of arrival only, marched for virtual transmitters.
+
+H. Lu, C. Vattheuer, B. Mirzasoleiman, O. Abari, "NeWRF: A Deep Learning Framework for Wireless Radiation
+Field Reconstruction and Channel Prediction", ICML 2024.
+
+Kept: training rays along measured directions of arrival, a network of place and direction that says where on
+the ray a virtual transmitter stands and what it sends, amplitude 1/d and the carrier's phase over the marched
+distance; at a query the directions are *searched* (rays of training receivers are intersected, the nearest
+receivers vote which of the virtual transmitters are seen). Left out: the network that predicts how many paths
+a query has (what at least half of the neighbours see is taken); a density per metre (ours is an opacity per
+sample, since half of the samples lie within 10 cm of where the intersection found something, in place of
+hierarchical resampling).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Kind, Measurements
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
+from gsparc.models.peers.deformation import perceptron
+from gsparc.models.peers.directions import virtual_transmitters, votes
+from gsparc.models.peers.network import Network, Scene
+from gsparc.models.peers.trained import TrainedPeer
+from gsparc.ops import Pose
+
+NEAR = 0.1  # [m] from the receiver, where rays begin
+AROUND = 0.1  # [m], half the interval of the fine samples
+
+
+@dataclass(eq=False, kw_only=True)
+class NeWRF(TrainedPeer):
+    """Channels of one antenna and one tone, with directions of arrival.
+
+    Args:
+        width, depth, octaves: of the network.
+        samples: points per ray, half of them fine.
+        neighbours: training receivers that vote at a query.
+        others: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("csi",)
+    name: str = "newrf"
+    width: int = 128
+    depth: int = 4
+    octaves: int = 8
+    samples: int = 64
+    neighbours: int = 6
+
+    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Virtual transmitters, and which of them every training receiver sees.
+
+        Raises:
+            ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
+        """
+        if data.directions is None:
+            raise ValueError(f"{self.name}: needs directions of arrival; this dataset has none")
+        if data.site.wavelength is None or data.site.static_end != "tx" or data.target[0].size != 1:
+            raise ValueError(
+                f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
+            )
+        places = data.rx_position[rows]
+        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
+        centres, seen = virtual_transmitters(places, rays)
+        if not len(centres):
+            raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
+        return {
+            "places": torch.from_numpy(places).float(),
+            "virtual": torch.from_numpy(centres).float(),
+            "votes": votes(seen, len(centres)),
+        }
+
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """See `TrainedPeer.build`."""
+        return DirectedRays(scene, found, self)
+
+
+class DirectedRays(Network):
+    """The network and the march."""
+
+    def __init__(self, scene: Scene, found: dict[str, Tensor], settings: NeWRF) -> None:
+        super().__init__()
+        assert scene.site.wavelength is not None
+        self.scene, self.found, self.count = scene, found, len(found["virtual"])
+        self.samples, self.neighbours = settings.samples, min(settings.neighbours, len(found["places"]))
+        self.wavenumber = 2 * math.pi / scene.site.wavelength
+        reach = (found["virtual"][:, None] - found["places"][None]).norm(dim=-1)
+        self.far = float(torch.quantile(reach[found["votes"].T > 0], 0.99)) + AROUND
+        around = torch.stack([scene.box[0] - self.far, scene.box[1] + self.far])
+        self.place = PositionEncoding(EncodingSettings("fourier", settings.octaves), around)
+        self.heading = PositionEncoding(EncodingSettings("fourier", 2), torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        inputs = self.place.width + self.heading.width
+        self.network = perceptron(inputs, 3, settings.width, settings.depth)
+
+    def search(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
+        """Virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and whether each is (B, P).
+
+        At least half of the nearest training receivers see them. Training receivers (`skip_self`) see what
+        they were measured to see.
+        """
+        distance = torch.cdist(places, self.found["places"])
+        near = distance.topk(1 if skip_self else self.neighbours, largest=False).indices
+        share = (self.found["votes"] > 0)[near].float().mean(1)
+        best = share.topk(max(int((share >= 0.5).sum(1).max()), 1), dim=1)
+        return self.found["virtual"][best.indices], best.values >= 0.5
+
+    def march(self, places: Tensor, goals: Tensor, likely: Tensor, draw: torch.Generator | None) -> Tensor:
+        """Channels (B,) of rays from places (B, 3) towards goals (B, P, 3) [m], those likely (B, P)."""
+        towards = goals - places[:, None]
+        apart = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
+        heading = towards / apart
+        half = self.samples // 2
+        shape = (*heading.shape[:2], half)
+        jitter = torch.full((2, *shape), 0.5) if draw is None else torch.rand((2, *shape), generator=draw)
+        steps = torch.arange(half)
+        coarse = NEAR + (self.far - NEAR) * (steps + jitter[0]) / half
+        fine = (apart - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
+        depth = torch.cat([coarse, fine], -1).sort(-1).values
+        points = places[:, None, None] + depth[..., None] * heading[:, :, None]
+        place = self.place(points.reshape(-1, 3)).view(*depth.shape, -1)
+        turn = self.heading(heading.reshape(-1, 3)).view(*heading.shape[:2], 1, -1)
+        out = self.network(torch.cat([place, turn.expand(-1, -1, self.samples, -1)], -1))
+        # Before training the samples of a ray let 1/e through: what stands at its end can be seen.
+        opacity = out[..., 2] - math.log(self.samples)
+        clear = F.logsigmoid(-opacity)  # finite also where the sigmoid rounds to 1
+        weight = (clear.cumsum(-1) - clear).exp() * torch.sigmoid(opacity)
+        gain = torch.view_as_complex(out[..., :2].contiguous())
+        wave = torch.polar(weight / depth, -self.wavenumber * depth)
+        return ((gain * wave).sum(-1) * likely).sum(-1)
+
+    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Channels (B, 1, 1) at searched directions."""
+        places = rx.position.reshape(-1, 3)
+        return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
+
+    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Mean squared error along measured directions."""
+        places = batch.rx.position.reshape(-1, 3)
+        seen = self.march(places, *self.search(places, True), draw).view(-1, 1, 1)
+        return (seen - batch.target).abs().square().mean()

@@ -1,0 +1,105 @@
+"""nGRF: channels as a direct complex sum over Gaussians, with no image in between.
+
+M. Umer, M. A. Mohsin, A. Bilal, J. M. Cioffi, "Neural Gaussian Radio Fields for Channel Estimation", 2025.
+
+Kept: Gaussians in space as radiators with complex responses, summed as waves without occlusion:
+h = sum_i g_i exp(-j k r_i) / r_i, r_i softened by the Gaussian's extent. Left out: the network that gives
+the responses (ours are free numbers; a network that also knew the query would fit every training sample and
+predict none), adaptive density control, polarised antenna patterns (one learned response per antenna).
+Written from the published description; the authors' attributes may differ. Spectra, which the paper does not
+predict, are what a declared static array makes of the same waves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Kind
+from gsparc.models.peers.network import Network, Scene
+from gsparc.models.peers.trained import TrainedPeer
+from gsparc.ops import Pose
+from gsparc.physics.array_response import bartlett, normalised, steering
+from gsparc.physics.waves import LIGHT
+
+MARGIN = 3.0  # [m] around the moving end's box, where radiators start
+TRANSMITTER_SPREAD = 0.05  # [m] of the one that starts at a known transmitter
+
+
+@dataclass(eq=False, kw_only=True)
+class NGRF(TrainedPeer):
+    """Channels, and spectra of a static array.
+
+    Args:
+        count: Gaussians.
+        others: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("csi", "spectrum")
+    rates: ClassVar[dict[str, float]] = {
+        "means": 3e-3, "log_extents": 5e-3, "gains": 1e-2, "antennas": 5e-3,
+    }  # fmt: skip
+    name: str = "ngrf"
+    count: int = 30
+
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """See `TrainedPeer.build`; `ValueError` without a frequency, or for spectra without an array."""
+        site = scene.site
+        if site.subcarriers_hz is None and site.carrier_hz is None:
+            raise ValueError(f"{self.name}: the dataset declares no frequency, waves have no phase without")
+        if site.kind == "spectrum" and (site.array is None or scene.receiver is None):
+            raise ValueError(f"{self.name}: spectra need a static receiver with a declared array")
+        return Radiators(scene, self.count)
+
+
+class Radiators(Network):
+    """N radiators."""
+
+    wavenumbers: Tensor
+    steering: Tensor | None
+
+    def __init__(self, scene: Scene, count: int) -> None:
+        super().__init__()
+        self.scene, self.count = scene, count
+        spectrum = scene.site.kind == "spectrum"
+        antennas, tones = (len(scene.site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
+        low, high = scene.box[0] - MARGIN, scene.box[1] + MARGIN
+        means = low + (high - low) * torch.rand(count, 3)
+        if scene.transmitter is not None:
+            means[0] = scene.transmitter + TRANSMITTER_SPREAD * torch.randn(3)
+        self.means = nn.Parameter(means)
+        self.log_extents = nn.Parameter(torch.full((count,), math.log(0.05)))
+        self.gains = nn.Parameter(torch.randn(count, 2) * scene.reach / math.sqrt(2 * count))
+        response = torch.zeros(count, antennas, 2)
+        response[..., 0] = 1
+        matrix = None
+        if spectrum:  # a Gaussian starts as a plane wave from where it stands
+            site, receiver = scene.site, scene.receiver
+            assert receiver is not None and site.grid is not None and site.array is not None
+            assert site.wavelength is not None
+            matrix = steering(site.array, site.grid, site.wavelength).to(torch.complex64)
+            heading = nn.functional.normalize(receiver.local(means), dim=-1)
+            turns = heading @ torch.as_tensor(site.array).float().T / site.wavelength
+            response = torch.view_as_real(torch.polar(torch.ones(()), 2 * math.pi * turns))
+        self.register_buffer("steering", matrix, persistent=False)
+        self.antennas = nn.Parameter(response)
+        hertz = scene.site.subcarriers_hz
+        hertz = torch.as_tensor([scene.site.carrier_hz] * tones if hertz is None else hertz)  # type: ignore
+        self.register_buffer("wavenumbers", (2 * math.pi / LIGHT * hertz).float())  # type: ignore
+
+    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Channels (B, A, K) or spectra (B, H, W)."""
+        moving = self.scene.site.moving(tx, rx)
+        offset = moving[:, None] - self.means
+        distance = (offset.square().sum(-1) + (2 * self.log_extents).exp()).sqrt()
+        strength = torch.view_as_complex(self.gains) / distance
+        waves = torch.polar(torch.ones(()), -distance.unsqueeze(-1) * self.wavenumbers)
+        arriving = torch.einsum("bn,bnk,na->bak", strength, waves, torch.view_as_complex(self.antennas))
+        if self.steering is None:
+            return arriving
+        image = bartlett(arriving[..., 0], self.steering)
+        return normalised(image, self.scene.site.normalisation).view(-1, *self.scene.shape)

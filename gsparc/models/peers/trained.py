@@ -1,0 +1,186 @@
+"""Base of peers trained by gradient: training loop under a time budget, stored state."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any, ClassVar
+
+import lightning.pytorch as L
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.datamodule import order
+from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.method import Method, Prediction
+from gsparc.models.peers.network import Network, Scene
+from gsparc.ops import Pose
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
+
+DEFAULT_BUDGET_S = 60.0
+FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
+WARMUP = 0.02  # share of the training over which rates rise
+QUERY_CHUNK = 32  # bounds the memory of one prediction call
+
+
+@dataclass(eq=False, kw_only=True)
+class TrainedPeer(Method):
+    """Learns from `fold.train` and `fold.val` together for a given time; nothing is chosen on `val`.
+
+    Args:
+        budget_s: seconds of training in processor time per thread, so that a busy machine gives the same
+            training (on a quiet one they are the clock's). None takes 60.
+        max_steps: steps of the learning-rate schedule, which end training where the seconds do not: such a
+            run repeats exactly. None stretches the schedule to the seconds.
+        batch_size: samples per step.
+        rate: Adam's learning rate where `rates` names no other.
+        seed: of initial weights and order of the samples.
+        name: as it appears in tables.
+    """
+
+    takes_budget: ClassVar[bool] = True  # type: ignore[misc]
+    kinds: ClassVar[tuple[Kind, ...]]
+    rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
+    name: str
+    budget_s: float | None = None
+    max_steps: int | None = None
+    batch_size: int = 8
+    rate: float = 2e-3
+    seed: int = 0
+    network: Network | None = field(default=None, init=False, repr=False)
+    found: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+    steps: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        budget_s = self.budget_s = DEFAULT_BUDGET_S if self.budget_s is None else self.budget_s
+        if not budget_s > 0 or self.batch_size < 1:
+            raise ValueError(
+                f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
+            )
+
+    @abstractmethod
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """The untrained network of a scene."""
+
+    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Tensors computed from the training rows (n,) before training; stored with the weights."""
+        return {}
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Train until the budget is spent.
+
+        Raises:
+            ValueError: a kind of data the method does not serve, or no training rows.
+            RuntimeError: the loss became NaN or infinite.
+        """
+        assert self.budget_s is not None
+        budget = TimeBudget(self.budget_s, "processor")
+        rows = np.sort(np.concatenate([fold.train, fold.val]))
+        if data.site.kind not in self.kinds:
+            raise ValueError(
+                f"{self.name}: predicts {' and '.join(self.kinds)}; this dataset holds {data.site.kind}"
+            )
+        if not len(rows):
+            raise ValueError(f"{self.name}: the training set is empty")
+        L.seed_everything(self.seed, verbose=False)
+        self.site, self.found = data.site, self.precompute(data, rows)
+        self.network = self.build(_scene(data, rows), self.found)
+        self._train(data, rows, budget)
+        self.network.eval()
+        note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
+        return FitReport(budget.counted.wall, (note,), budget.clock if self.steps != self.max_steps else None)
+
+    def _train(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> None:
+        network = self.fitted()
+        optimizer = torch.optim.Adam(self._groups(network), eps=1e-15)
+        base = [group["lr"] for group in optimizer.param_groups]
+        draw = torch.Generator().manual_seed(self.seed)
+        for step in count():
+            progress = self._progress(step, budget)
+            if progress >= 1:
+                break
+            for group, rate in zip(optimizer.param_groups, base, strict=True):
+                group["lr"] = rate * rate_factor(progress)
+            batch = data.batch(order(self.seed, step, self.batch_size, rows))
+            optimizer.zero_grad(set_to_none=True)
+            loss = network.loss(batch, draw)
+            if not torch.isfinite(loss):
+                raise RuntimeError(
+                    f"{self.name}: the loss became NaN or infinite at step {step}; lower model.rate"
+                )
+            loss.backward()
+            optimizer.step()
+            self.steps = step + 1
+
+    def _progress(self, step: int, budget: TimeBudget) -> float:
+        """Share of the training that is over; step 0 is always taken."""
+        spent = budget.spent / budget.seconds if step else 0.0
+        return spent if self.max_steps is None or spent >= 1 else step / self.max_steps
+
+    def _groups(self, network: nn.Module) -> Iterator[dict[str, Any]]:
+        for name, parameter in network.named_parameters():
+            known = [prefix for prefix in self.rates if name.startswith(prefix)]
+            rate = self.rates[max(known, key=len)] if known else self.rate
+            yield {"params": [parameter], "lr": rate}
+
+    def fitted(self) -> Network:
+        """The network; `ValueError` before `fit` or `restore`."""
+        if self.network is None:
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.network
+
+    def size(self) -> int:
+        """Number of Gaussians or virtual transmitters; 0 for a network without, and before `fit`."""
+        return 0 if self.network is None else self.network.count
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; these peers give no confidence."""
+        network = self.fitted()
+        parts = [
+            network.answer(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
+            for i in range(0, len(tx), QUERY_CHUNK)
+        ]
+        mean = torch.cat(parts)
+        return Prediction(mean if mean.is_complex() else mean.clamp(0, 1))
+
+    def state(self) -> dict[str, Any]:
+        """Weights, and what the network is built from."""
+        network = self.fitted()
+        scene, receiver = network.scene, network.scene.receiver
+        return {
+            "shape": list(scene.shape),
+            "receiver": None if receiver is None else [receiver.position, receiver.rotation],
+            **{"transmitter": scene.transmitter, "box": scene.box},
+            **{"found": self.found, "network": network.state_dict(), "steps": self.steps},
+        }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        receiver = None if state["receiver"] is None else Pose(*state["receiver"])
+        self.site = site
+        scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"], state["box"])
+        self.found, self.steps = dict(state["found"]), int(state["steps"])
+        self.network = self.build(scene, self.found)
+        self.network.load_state_dict(state["network"])
+        self.network.eval()
+
+
+def rate_factor(progress: float) -> float:
+    """Learning rate at a share of the training in [0, 1], relative to the largest: a rise, then a cosine."""
+    rise = min((progress + 1e-3) / WARMUP, 1.0)
+    return rise * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+
+
+def _scene(data: Measurements, rows: np.ndarray) -> Scene:
+    one, moving = data.batch(rows[:1]), data.moving[rows]
+    box = torch.from_numpy(np.stack([moving.min(0), moving.max(0)])).float()
+    static = data.site.static_end == "rx"
+    ends = (one.rx, None) if static else (None, one.tx[0])
+    return Scene(data.site, tuple(data.target.shape[1:]), *ends, box)  # type: ignore[call-arg]

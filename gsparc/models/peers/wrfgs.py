@@ -1,0 +1,90 @@
+"""WRF-GS+: 3D Gaussians that a network deforms for every position of the transmitter.
+
+C. Wen, J. Tong, Y. Hu, Z. Lin, J. Zhang, "Neural Representation for Wireless Radiation Field Reconstruction:
+A 3D Gaussian Splatting Approach" (WRF-GS and WRF-GS+), 2025.
+
+Kept: a static part (the Gaussians) and a dynamic part (a network of a Gaussian's place and the query) that
+moves, turns, stretches, fades and re-lights them; one projection per query; L1 and SSIM. Left out: adaptive
+density control, initial Gaussians 20 m wide about the origin (ours start around the receiver).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Kind
+from gsparc.models.peers.deformation import Deformation
+from gsparc.models.peers.gaussians import (
+    GEOMETRY_RATES,
+    GaussianNetwork,
+    GaussianPeer,
+    gaussians_of,
+    render_each,
+    rendering_of,
+)
+from gsparc.models.peers.network import Network, Scene
+from gsparc.ops import Pose
+
+CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
+SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
+
+
+@dataclass(eq=False, kw_only=True)
+class WRFGSPlus(GaussianPeer):
+    """Spectra.
+
+    Args:
+        count: Gaussians.
+        width, depth, octaves: of the deforming network.
+        others: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
+    rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
+    name: str = "wrfgs"
+    count: int = 500
+    width: int = 64
+    depth: int = 3
+    octaves: int = 5
+
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """See `TrainedPeer.build`."""
+        return DeformedGaussians(scene, self.count, self.width, self.depth, self.octaves)
+
+
+class DeformedGaussians(GaussianNetwork):
+    """Static Gaussians and the network that deforms them."""
+
+    def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
+        super().__init__()
+        self.scene, self.count = scene, count
+        self.grid, self.options = rendering_of(scene)
+        self.field = gaussians_of(scene, count)
+        self.signals = nn.Parameter(torch.zeros(count))
+        places = torch.stack(self.field.means.detach().aminmax(dim=0))
+        self.deformation = Deformation(places, scene.box, sum(CHANGES), width, depth, octaves)
+
+    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Spectra (B, H, W)."""
+        field = self.field
+        place, turn, stretch, fade, light = self._changes(tx, rx)
+        geometry = (
+            field.means + SHIFT * place,
+            field.quats + turn,
+            (field.log_scales + stretch.clamp(-3, 3)).exp(),
+            torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
+        )
+        signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
+        return render_each(geometry, signal, rx, self.grid, **self.options).squeeze(1)
+
+    def _changes(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
+        changes = self.deformation(self.field.means, self.scene.site.moving(tx, rx))
+        return changes.split(CHANGES, -1)
+
+    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `GaussianNetwork`; these are drawn where they lie before they are moved."""
+        return torch.sigmoid(self.signals + self._changes(tx, rx)[-1][0, :, 0])

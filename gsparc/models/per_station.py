@@ -1,0 +1,347 @@
+"""One copy of a method for each station, and one over all stations for those that it never heard.
+
+Methods know one static end. Measurements with several are several such sites that share their places: a copy
+is fitted to the rows of each. A station without training rows is answered by a copy that takes both ends for
+moving, so that its query is (tx, rx), where the method can do that.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import reduce
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
+from gsparc.data.splits import LEAST_ROWS, Fold
+from gsparc.models import checkpoint, parts
+from gsparc.models.censored import heard
+from gsparc.models.label import common_label
+from gsparc.models.method import Method, Prediction, Reconditions
+from gsparc.models.reduced import View
+from gsparc.ops import Pose
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import Clock, Spent, less_repeatable
+
+log = logging.getLogger(__name__)
+
+SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
+LEAST_SHARE = 0.5  # of an even part of the seconds, which every station has though earlier ones took more
+UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
+
+
+def for_links(make: Callable[[], Method], data: Measurements) -> Method:
+    """`make()`, or a copy of it for each station where there are several.
+
+    Raises:
+        ValueError: both ends move, and the method knows one that does.
+    """
+    method = make()
+    if data.site.stations is not None and len(data.site.stations) > 1:
+        return PerStation(make)
+    if data.site.static_end is None and not method.both_ends:
+        raise ValueError(f"{method.name}: both ends move here; it needs one that stands still")
+    return method
+
+
+def trained_stations(method: Method, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
+    """Stations (T,) bool with training rows enough for `method`, and those of test rows without."""
+    assert data.station is not None and data.site.stations is not None
+    count = len(data.site.stations)
+    rows = fold.train if method.uses_censored else heard(data, fold.train)
+    known = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
+    return known, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~known
+
+
+def of_station(site: Site, number: int) -> Site:
+    """The site as one station sees it; of `UNHEARD`, with both ends moving.
+
+    Its hash is its own, so that nothing kept of one station is taken for another's.
+    """
+    site = replace(site, sha256=sha256(f"{site.sha256} {number}".encode()).hexdigest())
+    if number == UNHEARD:
+        return replace(site, stations=None, static_end=None, static_position=None)
+    stations = site.stations
+    assert stations is not None
+    carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
+    rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
+    place = stations.position[number]
+    return replace(
+        site, name=f"{site.name}, station {stations.name[number]}", stations=None, carrier_hz=carrier,
+        static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
+    )  # fmt: skip
+
+
+class PerStation(Method):
+    """Copies of a method by station.
+
+    Args:
+        make: makes an unfitted copy.
+    """
+
+    def __init__(self, make: Callable[[], Method]) -> None:
+        self._make = make
+        first = make()
+        self.name, self.guesses = first.name, first.guesses
+        self.wrapped, self.takes_budget = first, first.takes_budget
+        self._copies: dict[int, Method] = {}
+        self._shared = False  # whether one copy knows all stations
+
+    @property
+    def stored_as(self) -> type[Method]:
+        """That of the copies."""
+        return type(self.wrapped)
+
+    @property
+    def label(self) -> str:
+        """That of the copies."""
+        return common_label(self.name, list(self._copies.values()))
+
+    @property
+    def effects(self) -> str | None:  # type: ignore[override]
+        """Those of the copies, each once."""
+        said = [copy.effects for copy in self._copies.values() if copy.effects is not None]
+        return ", ".join(dict.fromkeys(said)) if said else self.wrapped.effects
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Fit every station that is asked for, or all together; seconds are shared.
+
+        Together, a method that shares stations learns them as they are, any other as if both ends moved.
+        What an interrupted run finished is taken from its folder (`FitContext.resume`).
+
+        Raises:
+            ValueError: a station of the test rows has too few training rows, or all are learned together, and
+                the method cannot take both ends for moving.
+        """
+        assert data.station is not None and data.site.stations is not None
+        whole = self.wrapped.usual_s(data.site) if context.budget_s is None else context.budget_s
+        budget = context.time_budget(math.inf if whole is None else whole)
+        how = context.stations
+        if how == "auto":
+            how, why = self.wrapped.best_stations(data, fold, replace(context, budget_s=whole))
+            log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
+        together, joint = how == "together", self.wrapped.shares(data.site)
+        self._shared = together and joint
+        if together and not (joint or self.wrapped.both_ends):
+            raise ValueError(f"{self.name}: knows one static end; say stations=each")
+        self.site = data.site
+        known, unheard = trained_stations(self.wrapped, data, fold)
+        numbers = [int(t) for t in np.flatnonzero(known)]
+        if together:
+            numbers = [UNHEARD]
+        elif unheard.any():
+            if not self.wrapped.both_ends and not joint:
+                names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
+                raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
+            numbers.append(UNHEARD)
+        if UNHEARD in numbers and not joint and np.isnan(data.site.stations.position).any():
+            raise ValueError(f"{self.name}: places of stations are unknown, it needs them; say stations=each")
+        notes: list[str] = []
+        left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
+        kept = self.wrapped.resumable and context.run_dir != Path()
+        limited: Clock | None = None
+        if kept and left is None:  # of an earlier run in this folder
+            for file in context.run_dir.glob("station*/**/*.ckpt"):
+                file.unlink()
+        for turn, number in enumerate(numbers):
+            rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+            copy, part = self._make(), data.subset(rows, self._site_of(data.site, number))
+            inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
+            name = "all stations" if together else "stations never heard"
+            name = name if number == UNHEARD else data.site.stations.name[number]
+            folder = "unheard" if number == UNHEARD else f"station{number}"
+            share = None
+            if whole is not None:
+                share = max(
+                    (whole - budget.spent) / (len(numbers) - turn), LEAST_SHARE * whole / len(numbers)
+                )
+            own = context.within(
+                folder, budget_s=share, datamodule=None, resume=None if left is None else left / folder
+            )
+            if self.wrapped.takes_budget and len(numbers) > 1:
+                spent = budget.spent
+                rest = spent / turn * (len(numbers) - turn) if whole is None and turn else None
+                rest = rest if whole is None else max(whole - spent, 0.0)
+                said = "" if rest is None else f", about {rest:.0f} s left for all"
+                log.info("station %d of %d: %s%s", turn + 1, len(numbers), name, said)
+            before = budget.counted.wall
+            try:
+                report = parts.fit(copy, part, inner, own)
+            except KeyboardInterrupt:
+                if not kept or len(numbers) == 1:
+                    raise
+                said = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
+                raise KeyboardInterrupt(f"{said}; go on with ckpt_path={context.run_dir}") from None
+            if kept and len(numbers) > 1:
+                extra = parts.marks(report, part, inner, own)
+                checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
+            earlier = max(
+                report.seconds - (budget.counted.wall - before), 0.0
+            )  # spent by the interrupted run
+            budget.charge(Spent(earlier, earlier))
+            self._copies[number] = copy
+            limited = less_repeatable(limited, report.limited_by)
+            notes += [f"{name}: {note}" for note in report.notes]
+        return FitReport(budget.counted.wall, tuple(notes), limited)
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """See `Reconditions`; stations without rows among these are then as if never heard."""
+        assert data.station is not None
+        found = PerStation(self._make)
+        found.site, found._shared = data.site, self._shared
+        for number, copy in self._copies.items():
+            own = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+            chosen = np.flatnonzero(np.isin(own, rows))
+            if len(chosen) < LEAST_ROWS:
+                continue
+            part = data.subset(own, self._site_of(data.site, number))
+            learned = copy.reconditioned(part, chosen) if isinstance(copy, Reconditions) else None
+            if learned is None:
+                return None
+            found._copies[number] = learned
+        return found if found._copies else None
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Each row by its station's copy."""
+        if self._shared:
+            return self._copies[UNHEARD].answer(batch)
+        stations = self._stations(batch.tx, batch.rx) if batch.station is None else batch.station
+        return self._gathered(stations, lambda copy, chosen: copy.answer(_rows(batch, chosen, copy.site)))
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """By the copy of the station that stands at the static end; see `Method.predict`."""
+        if self._shared:
+            return self._copies[UNHEARD].predict(tx, rx)
+        everyone = torch.arange(len(tx))
+
+        def ask(copy: Method, chosen: Tensor) -> Prediction:
+            return copy.predict(tx[chosen], _pose(rx, chosen, copy.site))
+
+        return self._gathered(self._stations(tx, rx)[everyone], ask)
+
+    def of(self, number: int) -> Method:
+        """The copy that answers for a station.
+
+        Raises:
+            ValueError: it had too few training rows, and there is no copy for such stations.
+        """
+        copy = self._copies.get(number, self._copies.get(UNHEARD))
+        if copy is None:
+            assert self.site is not None and self.site.stations is not None
+            name = self.site.stations.name[number]
+            raise ValueError(f"{self.name}: station {name} had too few training rows")
+        return OfStation(copy, number) if self._shared else copy
+
+    def _site_of(self, site: Site, number: int) -> Site:
+        """The site as a copy sees it: whole, where one learns several stations as such."""
+        return site if number == UNHEARD and self.wrapped.shares(site) else of_station(site, number)
+
+    def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
+        assert self.site is not None and self.site.stations is not None
+        ends = tx if self.site.static_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        table = torch.from_numpy(self.site.stations.position)
+        distance = torch.cdist(ends.detach().cpu().double(), table)
+        apart, number = distance.min(dim=1)
+        shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
+        if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
+            here = (distance[shared[0]] <= SAME_PLACE_M).nonzero()[:, 0].tolist()
+            names = " and ".join(self.site.stations.name[t] for t in here)
+            raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
+        if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
+            row = int(apart.argmax())
+            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M * 100:g} cm of row {row}")
+        return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
+
+    def _gathered(self, stations: Tensor, ask: Callable[[Method, Tensor], Prediction]) -> Prediction:
+        answers: list[tuple[Tensor, Prediction]] = []
+        for number in stations.unique().tolist():
+            chosen = (stations == number).nonzero()[:, 0]
+            answers.append((chosen, ask(self.of(number), chosen)))
+        rows, found = zip(*answers, strict=True)
+        return Prediction.joined(found, torch.argsort(torch.cat(rows)))
+
+    def state(self) -> dict[str, Any]:
+        """The state of every copy, by its station's number."""
+        copies = {str(number): copy.state() for number, copy in self._copies.items()}
+        return {"per_station": copies, "shared": self._shared}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self._shared = site, bool(state["shared"])
+        for number, part in state["per_station"].items():
+            self._copies[int(number)] = copy = self._make()
+            copy.restore(self._site_of(site, int(number)), part)
+
+    def objects(self) -> SiteObjects:
+        """Those of all copies: what stands in a site stands there for all its stations."""
+        return reduce(
+            SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.of()
+        )
+
+    def size(self) -> int:
+        """That of all copies."""
+        return sum(copy.size() for copy in self._copies.values())
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """Sums over the copies of what counts or costs, and means of shares; the initialisers of all."""
+        found = [copy.facts() for copy in self._copies.values()]
+        if not found:
+            return self.wrapped.facts()
+        return {name: _over([one[name] for one in found], name) for name in found[0]}
+
+    def __iter__(self) -> Iterator[tuple[int, Method]]:
+        return iter(self._copies.items())
+
+
+class OfStation(View):
+    """A method that knows all stations, asked about one: several may stand at one place."""
+
+    def __init__(self, inner: Method, number: int) -> None:
+        super().__init__(inner)
+        self.number = number
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        rows = torch.arange(len(tx))
+        station = torch.full_like(rows, self.number)
+        return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
+
+
+def _over(values: list[Any], name: str) -> float | int | str | None:
+    """A fact of all copies."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    if isinstance(known[0], str):
+        return ", ".join(dict.fromkeys(known))
+    return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
+
+
+def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
+    """The chosen poses; one for all where the receiver is the station."""
+    assert site is not None
+    if not rx.batched:
+        return rx
+    if site.static_end == "rx" and site.stations is None:
+        return Pose(rx.position[chosen[0]], rx.rotation[chosen[0]])
+    return Pose(rx.position[chosen], rx.rotation[chosen])
+
+
+def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
+    values: dict[str, Any] = {
+        name: value[chosen] if isinstance(value, Tensor) and name != "station" else value
+        for name, value in vars(batch).items()
+    }
+    known = batch.station is not None and site is not None and site.stations is not None
+    station = batch.station[chosen] if known and batch.station is not None else None
+    return Batch(**{**values, "rx": _pose(batch.rx, chosen, site), "station": station})

@@ -1,0 +1,284 @@
+"""The field of received powers: what the path loses in known walls, and a process of the rest.
+
+In decibels: a constant or a distance law, uncertain; a loss for each known wall on the straight path between
+the ends; one or two Matern-3/2 of place; noise. Without walls it is `model=gp`. Where a wavelength is sampled
+powers interfere: there coherent waves stand beside the process.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.models.baselines.distance_law import law_of
+from gsparc.models.censored import silent
+from gsparc.models.haste import haste
+from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
+from gsparc.models.powers.likelihood import Covariance, left_out_losses
+from gsparc.models.powers.settings import choose_about, choose_prior
+from gsparc.models.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
+from gsparc.ops import Pose
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import Nearest
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, Rows, conditioned, trend_of_rows
+from gsparc.processes.trend import Trend, trend_of
+from gsparc.processes.wall_count import Walls
+from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.training.time_budget import TimeBudget
+
+QUERIES = 512  # at a time: memory
+CHOOSING = 0.3  # of the seconds, for the settings of the process
+
+
+class PowerField(ConditionalField):
+    """See `ConditionalField`; parameters are float64, targets linear powers (1,).
+
+    Args:
+        site: of powers, with at most one end that stands.
+        trend: the mean law.
+        kernel: of the process.
+        seed: of rows drawn where there are too many.
+        fringes: of coherent waves, beside the process; they do not move with gradients.
+
+    Attributes:
+        log_lengths, share_logit, log_noise, log_amplitude: of the process, see `Covariance`.
+    """
+
+    kind = "powers"
+
+    def __init__(
+        self,
+        site: Site,
+        trend: Trend,
+        kernel: Kernel,
+        seed: int = 0,
+        fringes: Fringes | None = None,
+    ) -> None:
+        super().__init__()
+        self.fringes = fringes
+        self.site, self.trend, self.seed = site, trend, seed
+        covariance = Covariance.of(kernel)
+        self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude = (
+            nn.Parameter(part) for part in vars(covariance).values()
+        )
+        self.process: PowerProcess | None = None
+        self._tree: cKDTree | None = None  # of its places, made when it is asked
+        self.known = np.zeros(0, np.int64)
+        self.at = np.zeros(0, np.int64)  # places of the process that known rows are of, where rows share them
+        self.decibels = np.zeros(0)
+
+    @property
+    def count(self) -> int:
+        """See `ConditionalField`; coherent waves count as Gaussians of no extent, far away."""
+        return 0 if self.fringes is None else len(self.fringes.weights)
+
+    @property
+    def forgets(self) -> bool:
+        """See `ConditionalField`; coherent waves keep what they were fitted to."""
+        return self.fringes is None
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """`power` where walls are known, `phase` where coherent waves are, `residual` always."""
+        named = {"power": self.trend.walls is not None, "phase": self.fringes is not None, "residual": True}
+        return tuple(name for name, there in named.items() if there)
+
+    def prior(self) -> tuple[Trend, Kernel]:
+        """What the parameters say, without gradients."""
+        logit = [self.share_logit.item()] if len(self.log_lengths) == 2 else []
+        settings = np.array([*self.log_lengths.tolist(), *logit, self.log_noise.item()])
+        return self.trend, Kernel.of(settings, math.exp(self.log_amplitude.item()))
+
+    def loss(self, batch: Batch) -> Tensor:
+        """See `ConditionalField`; of the process alone. Rows that were not measured cost 0."""
+        losses = self.log_noise.new_zeros(len(batch))
+        used = torch.ones(len(batch), dtype=torch.bool)
+        if batch.mask is not None:
+            used = batch.mask.flatten(1).all(1)
+        places = self._places(batch.tx, batch.rx)[used]
+        if not len(places):
+            return losses + 0 * self.log_noise
+        decibels = 10 * batch.target.flatten(1)[used, 0].double().clamp_min(TINY_POWER).log10()
+        distance = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+        covariance = Covariance(self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude)
+        gram, values = covariance.gram(distance, self.trend.terms(places)), decibels - self.trend.mean(places)
+        return losses.index_put((used.nonzero()[:, 0],), left_out_losses(gram, values, self.log_amplitude))
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`; what rows say where nothing was heard is that powers are below a level.
+
+        Raises:
+            ValueError: no rows.
+        """
+        if not len(rows):
+            raise ValueError("a field of powers needs at least one row")
+        seen = rows_of(data, rows)
+        self.process, _ = conditioned(seen, *self.prior(), self.seed)
+        self._tree = None
+        loud = seen.at(np.flatnonzero(~seen.silent))
+        self.known, self.decibels = rows[~seen.silent], loud.decibels
+        if isinstance(nearest := self.process.posterior, Nearest):
+            # A silent row may lie at the same place; its noise is larger than any mean's.
+            heard = np.flatnonzero(nearest.noise.numpy() <= self.process.kernel.noise)
+            self.at = heard[cKDTree(self.process.places[heard]).query(loud.places)[1]]
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`; (B, 1) linear powers.
+
+        Raises:
+            ValueError: before `condition`.
+        """
+        process, places = self._conditioned(), self._places(tx, rx)
+        parts = [self._answer(process, part) for part in places.split(QUERIES)]
+        mean, spread, share, explained = (torch.cat(part) for part in zip(*parts, strict=True))
+        power = self._power(mean)
+        said = self._power(explained) if self.count else None
+        return Posterior(power, entry_variance(spread.float(), power, "rssi"), said, share.float())
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean (B, 1) alone, with autograd for places."""
+        process, places = self._conditioned(), self._places(tx, rx)
+        decibels = process.mean_at(places)
+        if self.fringes is not None:
+            decibels, _ = self.fringes.blended(decibels, places, self._distance(places.detach()))
+        return self._power(decibels)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`; of rows where something was heard.
+
+        Of very many rows each is predicted without all that was measured at its place.
+
+        Raises:
+            ValueError: before `condition`.
+        """
+        process = self._conditioned()
+        posterior = process.posterior
+        mean, variance = posterior.left_out()
+        loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
+        decibels, spread = mean[loud, 0], process.kernel.amplitude * variance[loud]
+        places = process.places[loud]
+        if self.fringes is not None:
+            decibels, factor = self.fringes.blended_unseen(
+                decibels, torch.from_numpy(places), nearest(places), self.known
+            )
+            spread = spread * factor
+        mean = self._power(decibels)
+        return LeftOutRows(self.known, mean, entry_variance(spread.float(), mean, "rssi"))
+
+    def state(self) -> dict[str, Any]:
+        """See `ConditionalField`."""
+        values = {name: value.detach().clone() for name, value in self.named_parameters()}
+        return {
+            **values,
+            **self.trend.state(),
+            "seed": self.seed,
+            "known": torch.from_numpy(self.known),
+            "at": torch.from_numpy(self.at),
+            "decibels": torch.from_numpy(self.decibels),
+            **({} if self.fringes is None else {"fringes": self.fringes.state()}),
+            **({} if self.process is None else {"process": self.process.state()}),
+        }
+
+    def _answer(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
+        """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
+        mean, spread, share = process.answer(places)
+        if self.fringes is None:
+            return mean, spread, share, mean
+        mean, factor = self.fringes.blended(mean, places, self._distance(places))
+        return mean, spread * factor, share, self.fringes.solutions(places).mean(1)
+
+    def _distance(self, places: Tensor) -> np.ndarray:
+        """From the nearest known row (B,) [m]."""
+        if self._tree is None:
+            self._tree = cKDTree(self._conditioned().places)
+        return self._tree.query(places.numpy())[0]
+
+    def _conditioned(self) -> PowerProcess:
+        if self.process is None:
+            raise ValueError("a field of powers: condition it first")
+        return self.process
+
+    def _places(self, tx: Tensor, rx: Pose) -> Tensor:
+        """(B, 3) of the moving end, or (B, 6) of both, float64 [m]."""
+        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
+
+    def _power(self, decibels: Tensor) -> Tensor:
+        return from_real(decibels[:, None].float(), "rssi", (1,))
+
+
+def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
+    """Powers of rows (n,) in decibels, levels where nothing was heard."""
+    decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
+    return Rows(data.moving[rows], decibels, silent(data, rows))
+
+
+def initialise(
+    data: Measurements,
+    rows: np.ndarray,
+    fringes: bool = True,
+    seed: int = 0,
+    budget: TimeBudget | None = None,
+    walls: Walls | None = None,
+) -> tuple[PowerField, tuple[str, ...]]:
+    """A field of powers and what must be said of it; `condition` is to follow.
+
+    Args:
+        data: powers, of one station where there are several.
+        rows: (n,) to learn from, at least one.
+        fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
+        seed: of rows and waves that are drawn.
+        budget: no waves are sought beyond it.
+        walls: that are known; no waves are sought beside them.
+
+    Raises:
+        ValueError: not powers, several stations, or no rows.
+    """
+    if data.site.kind != "rssi":
+        raise ValueError(f"a field of powers needs received powers (rssi), not {data.site.kind}")
+    if data.site.stations is not None and len(data.site.stations) > 1:
+        raise ValueError(f"a field of powers is of one station, not of {len(data.site.stations)}")
+    if not len(rows):
+        raise ValueError("a field of powers needs at least one row")
+    seen = rows_of(data, rows)
+    pace = haste(budget, CHOOSING, len(rows))
+    if walls is not None:
+        law, notes = law_of(seen, data.site)
+        trend = replace(trend_of_rows(seen, law), walls=walls)
+        kernel, more = choose_about(seen, trend, seed, pace)
+        said = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
+        return PowerField(data.site, trend, kernel, seed), (said, *notes, *more)
+    trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, pace)
+    field = PowerField(data.site, trend, kernel, seed)
+    if fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength):
+        order = np.argsort(rows)
+        assert data.site.wavelength is not None
+        field.fringes, said = find_fringes(
+            seen.at(order), rows[order], field.prior(), data.site.wavelength, seed, budget
+        )
+        notes = (*notes, said)
+    return field, notes
+
+
+def restored(site: Site, state: dict[str, Any]) -> PowerField:
+    """The field whose `state()` this was."""
+    two = len(state["log_lengths"]) == 2
+    kernel = Kernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
+    fringes = fringes_of(state["fringes"]) if "fringes" in state else None
+    field = PowerField(site, trend_of(state), kernel, int(state["seed"]), fringes)
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            parameter.copy_(state[name])
+    field.known, field.decibels = state["known"].numpy(), state["decibels"].numpy()
+    field.at = state["at"].numpy()
+    if "process" in state:
+        field.process = PowerProcess.read(state["process"])
+    return field

@@ -1,0 +1,279 @@
+"""Powers of coherent waves where a wavelength is sampled, averaged over solutions and with a process.
+
+One solution predicts badly, as phases are ambiguous; the mean of many in decibels predicts well, and half of
+that and half of the process better (bagging: L. Breiman, Mach. Learn. 24 (1996)). Each solution is blind to
+one fold of places, so that rows are predicted by solutions that never saw their surroundings; a few rows
+drawn evenly are kept from all solutions and tell how they do between rows. What share the solutions get is a
+matter of both, by least squares (stacking: D. H. Wolpert, Neural Networks 5 (1992)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsparc.models.powers.groups import Gain, compared, folds, groups
+from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.left_out import left_out, left_out_group
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
+from gsparc.processes.trend import Trend
+from gsparc.training.time_budget import TimeBudget
+
+SOLUTIONS, FOLDS = 20, 5
+SIDES = 8  # squares along the longer side
+BEFORE, SPREAD = 0.5, 0.25  # mean and deviation of a prior on the share of the solutions
+TRIED = 10  # solutions after which it must pay
+PROBES = 10  # one row of so many is kept from all solutions
+MOST_ROWS = 3_000
+ROWS_PER_WAVE = 6  # two real unknowns each
+SECONDS = 30.0
+BEYOND = (1.0, 2.0)  # wavelengths from all rows between which solutions lose their share
+
+
+@dataclass(frozen=True)
+class Blend:
+    """How solutions and process share a prediction, by the distance to the nearest row.
+
+    Attributes:
+        distance: between rows and between groups left out [m].
+        share: of the solutions at these two.
+        left: squared errors of both together, of the process's alone, at these two.
+    """
+
+    distance: tuple[float, float]
+    share: tuple[float, float]
+    left: tuple[float, float]
+
+    def at(self, distance: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+        """Shares (n,) of the solutions, and factors (n,) of the process's variance."""
+        near, far = self.distance
+        there = np.clip((distance - near) / max(far - near, 1e-12), 0.0, 1.0)
+        inside = np.clip((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0]), 0.0, 1.0)
+        share = (self.share[0] + (self.share[1] - self.share[0]) * there) * inside
+        left = self.left[0] + (self.left[1] - self.left[0]) * there
+        return share, 1 + (left - 1) * inside
+
+
+@dataclass(frozen=True)
+class Fringes:
+    """Solutions, and what they are worth beside a process.
+
+    Attributes:
+        basis: of coherent fields.
+        weights: (r, S) complex128.
+        blind: (S,) the fold that each never saw.
+        rows: (n,) rows that were learned, sorted.
+        fold: (n,) of each; -1 where no solution saw it.
+        level: mean power [dB].
+        wavelength: [m].
+        blend: with the process.
+    """
+
+    basis: Basis
+    weights: np.ndarray
+    blind: np.ndarray
+    rows: np.ndarray
+    fold: np.ndarray
+    level: float
+    wavelength: float
+    blend: Blend
+
+    @cached_property
+    def _mixed(self) -> Tensor:
+        return torch.from_numpy(self.basis.mixture @ self.weights)
+
+    def solutions(self, places: Tensor) -> Tensor:
+        """Powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
+        phase = places @ torch.from_numpy(self.basis.waves).T
+        field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
+        return self.level + 10 * (field.real.square() + field.imag.square() + FLOOR).log10()
+
+    def blended(self, decibels: Tensor, places: Tensor, distance: np.ndarray) -> tuple[Tensor, Tensor]:
+        """A process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
+
+        Args:
+            decibels: (n,) of the process.
+            places: (n, 3) [m].
+            distance: (n,) to the nearest row that it knows [m].
+        """
+        return self._shared(decibels, self.solutions(places).mean(1), distance)
+
+    def blended_unseen(
+        self, decibels: Tensor, places: Tensor, distance: np.ndarray, rows: np.ndarray
+    ) -> tuple[Tensor, Tensor]:
+        """The same at rows (n,) by those solutions that never saw them or their surroundings."""
+        at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
+        fold = np.where(self.rows[at] == rows, self.fold[at], -1)
+        mean = _held_out_mean(self.solutions(places).numpy(), fold, self.blind)
+        return self._shared(decibels, torch.from_numpy(mean), distance)
+
+    def _shared(self, decibels: Tensor, mean: Tensor, distance: np.ndarray) -> tuple[Tensor, Tensor]:
+        share, factor = (torch.from_numpy(v) for v in self.blend.at(distance, self.wavelength))
+        return decibels + share * (mean - decibels), factor
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and numbers that `fringes_of` needs."""
+        arrays = {name: getattr(self, name) for name in ("weights", "blind", "rows", "fold")}
+        arrays |= {"waves": self.basis.waves, "mixture": self.basis.mixture}
+        blend = [*self.blend.distance, *self.blend.share, *self.blend.left]
+        numbers = {"level": self.level, "wavelength": self.wavelength, "blend": blend}
+        return {**{name: torch.from_numpy(value) for name, value in arrays.items()}, **numbers}
+
+
+def fringes_of(state: dict[str, Any]) -> Fringes:
+    """The fringes whose `state()` this was."""
+    waves, mixture, weights, blind, rows, fold = (
+        state[name].numpy() for name in ("waves", "mixture", "weights", "blind", "rows", "fold")
+    )
+    b = [float(value) for value in state["blend"]]
+    blend = Blend((b[0], b[1]), (b[2], b[3]), (b[4], b[5]))
+    return Fringes(
+        Basis(waves, mixture),
+        weights,
+        blind,
+        rows,
+        fold,
+        float(state["level"]),
+        float(state["wavelength"]),
+        blend,
+    )
+
+
+def sampled(places: np.ndarray, wavelength: float | None) -> bool:
+    """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
+    if wavelength is None or places.shape[1] != 3:
+        return False
+    alone = np.unique(places, axis=0)
+    return len(alone) > 1 and float(np.median(nearest(alone))) < wavelength / 2
+
+
+def nearest(places: np.ndarray) -> np.ndarray:
+    """Distances (n,) of places (n, 3) from the nearest other [m]."""
+    return cKDTree(places).query(places, k=2)[0][:, 1]
+
+
+def find_fringes(
+    rows: Rows,
+    numbers: np.ndarray,
+    plain: tuple[Trend, Kernel],
+    wavelength: float,
+    seed: int,
+    budget: TimeBudget | None,
+) -> tuple[Fringes | None, str]:
+    """Fringes where they pay beside a process, and what must be said of them.
+
+    Args:
+        rows: all heard.
+        numbers: (n,) of the rows, sorted.
+        plain: the process's mean law and kernel.
+        wavelength: [m].
+        seed: of starts, folds and rows that are drawn.
+        budget: none is sought beyond it, nor beyond `SECONDS`.
+    """
+    own = TimeBudget(SECONDS, "processor")
+    kept = draw(rows.silent, MOST_ROWS, seed)
+    drawn = f" (of {len(kept)} of {len(rows.places)} rows)" if len(kept) < len(rows.places) else ""
+    rows, numbers = rows.at(kept), numbers[kept]
+    count, level = len(kept), 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
+    basis = basis_of(rows.places, wavelength)
+    columns = basis.columns(rows.places)
+    if count < ROWS_PER_WAVE * columns.shape[1]:
+        return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
+    rng, group = np.random.default_rng(seed), groups(rows.places, SIDES)
+    fold = np.full(count, -1)
+    for k, part in enumerate(folds(group, FOLDS, seed)):
+        fold[part] = k
+    fold[rng.permutation(count)[: count // PROBES]] = -1
+    process = conditioned(rows, *plain, seed)[0].exact()
+    weights: list[np.ndarray] = []
+    fringes: Fringes | None = None
+    gain: Gain | None = None
+    while len(weights) < SOLUTIONS and not own.over() and not (budget and budget.over()):
+        for k in range(FOLDS):
+            seen = (fold != k) & (fold >= 0)
+            weights.append(fit_waves(columns[seen], rows.decibels[seen] - level, rng))
+        powers, blind = level + decibels_of(columns @ np.stack(weights, 1)), np.arange(len(weights)) % FOLDS
+        blend, gain = _blend(rows, group, fold, powers, blind, process)
+        fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
+        if len(weights) >= TRIED and not gain.exceeds(0.0):
+            break
+    if fringes is None or gain is None or not gain.exceeds(0.0):
+        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{drawn}"
+    share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
+    said = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
+    return fringes, f"{said} between rows and a block away, the process the rest{drawn}"
+
+
+def _held_out_mean(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
+    """Means (n,) of powers (n, S) over the solutions blind to each row's fold; over all where that is -1."""
+    counts = _counted(fold, blind)
+    return (powers * counts).sum(1) / counts.sum(1)
+
+
+def _counted(fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
+    return (fold[:, None] < 0) | (fold[:, None] == blind)
+
+
+def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
+    """Squared error (n,) that the mean of blind solutions has beyond that of as many as there are."""
+    counts = _counted(fold, blind)
+    number, every = counts.sum(1), len(blind)
+    mean = (powers * counts).sum(1) / number
+    spread = ((powers - mean[:, None]) ** 2 * counts).sum(1) / np.maximum(number - 1, 1)
+    return spread * (1 / number - 1 / every)
+
+
+def _blend(
+    rows: Rows,
+    group: np.ndarray,
+    fold: np.ndarray,
+    powers: np.ndarray,
+    blind: np.ndarray,
+    process: PowerProcess,
+) -> tuple[Blend, Gain]:
+    """How to share predictions with a process, and what that gains at places left out."""
+    exact = process.posterior
+    assert isinstance(exact, Exact)
+    inverse, weights = exact.factor.inverse, exact.weights[:, :1]
+    probes, distance = fold < 0, np.zeros(len(fold))
+    error = np.where(probes, -left_out(inverse, weights)[0][:, 0].numpy(), 0.0)
+    distance[probes] = nearest(rows.places)[probes]
+    for k in range(FOLDS):
+        part, rest = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
+        error[part] = -left_out_group(inverse, weights, torch.from_numpy(part))[0][:, 0].numpy()
+        distance[part] = cKDTree(rows.places[rest]).query(rows.places[part])[0]
+    towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
+    excess = _excess_variance(powers, fold, blind)
+    shares, left = [], []
+    for chosen in (probes, ~probes):
+        share = _share(error[chosen], towards[chosen], excess[chosen], group[chosen])
+        both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
+        shares.append(share)
+        left.append(both / max(float((error[chosen] ** 2).mean()), 1e-12))
+    apart = ~probes
+    squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * excess
+    gain = compared(squares[apart], error[apart] ** 2, group[apart])
+    middle = (float(np.median(distance[probes])), float(np.median(distance[apart])))
+    return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
+
+
+def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, group: np.ndarray) -> float:
+    """Of what leads from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
+
+    Rows of one group err together and count as one.
+    """
+    alike = len(group) / len(np.unique(group))
+    noise = alike * max(float((error**2).mean()), 1e-12)
+    square = max(float(towards @ towards - excess.sum()), 0.0)
+    certain = 1 / SPREAD**2
+    return float(
+        np.clip((-(towards @ error) / noise + BEFORE * certain) / (square / noise + certain), 0.0, 1.0)
+    )

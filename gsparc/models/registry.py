@@ -1,0 +1,77 @@
+"""Methods by name, imported when asked for, and methods built from `conf/model/*.yaml`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from hydra.utils import get_class, instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.instantiate import refuse_foreign, suggest, targets
+from gsparc.data.plugins import plugins
+from gsparc.models.method import Method
+
+METHODS = {
+    "zero": "gsparc.models.baselines.zero.Zero",
+    "mean": "gsparc.models.baselines.mean.Mean",
+    "nearest": "gsparc.models.baselines.nearest.Nearest",
+    "idw": "gsparc.models.baselines.idw.InverseDistance",
+    "distance_law": "gsparc.models.baselines.distance_law.DistanceLaw",
+    "gp": "gsparc.models.baselines.gp.GaussianProcess",
+    "kriging": "gsparc.models.baselines.kriging.Kriging",
+    "gsrf": "gsparc.models.peers.gsrf.GSRF",
+    "wrfgs": "gsparc.models.peers.wrfgs.WRFGSPlus",
+    "swiftwrf": "gsparc.models.peers.swiftwrf.SwiftWRF",
+    "nerf2": "gsparc.models.peers.nerf2.NeRF2",
+    "ngrf": "gsparc.models.peers.ngrf.NGRF",
+    "newrf": "gsparc.models.peers.newrf.NeWRF",
+    "calibrated_raytracer": "gsparc.models.peers.calibrated_raytracer.CalibratedRayTracer",
+    "ridge": "gsparc.models.baselines.ridge.Ridge",
+    "fire": "gsparc.models.peers.fire.Fire",
+    "uplink": "gsparc.models.uplink.method.UplinkField",
+    "complex_gp": "gsparc.models.channels.complex_gp.ComplexGP",
+    "image_source_gp": "gsparc.models.image_sources.method.ImageSourceGP",
+    "directional_gp": "gsparc.models.directional.method.DirectionalGP",
+    "array": "gsparc.models.splat.array.ArrayField",
+    "moving_array": "gsparc.models.moving_array.method.MovingArrayField",
+    "gsparc": "gsparc.models.gsparc.Gsparc",
+}
+
+
+def known() -> dict[str, str]:
+    """Import paths of all methods by name: `METHODS` and what plugins bring."""
+    return plugins("model") | METHODS
+
+
+def method_class(name: str) -> type[Method]:
+    """The class called `name`; `ValueError` with the nearest right name when there is none."""
+    if name in METHODS:  # before plugins, whose entry points take milliseconds to read
+        return get_class(METHODS[name])
+    there = known()
+    if name not in there:
+        raise ValueError(f"no method is called {name!r}{suggest(name, there)}")
+    return get_class(there[name])
+
+
+def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
+    """The method that a config of the group `model` describes (unfitted).
+
+    Args:
+        config: `_target_` and its arguments.
+        trusted: False for text out of a file: then every `_target_` must be a class of gsparc.
+
+    Raises:
+        ValueError: no or wrong `_target_`, or arguments it does not take.
+    """
+    node = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
+    target = node.get("_target_")
+    if target is None:
+        raise ValueError("model: the config names no _target_ (choose one with model=NAME)")
+    if not trusted:
+        for path in targets(OmegaConf.to_container(node, resolve=False)):
+            refuse_foreign(path)
+    method = instantiate(node)
+    if not isinstance(method, Method):
+        raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
+    return method

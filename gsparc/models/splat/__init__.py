@@ -1,0 +1,1 @@
+"""`LearnedField`: Gaussians that are rasterized, initialised in closed form and trained by gradient."""

@@ -1,0 +1,38 @@
+"""`model=array`, spectra of a static array: the Gaussian field through the array under a name of its own."""
+
+from __future__ import annotations
+
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.initial import InitSettings
+from gsparc.field.response import ResponseSettings
+from gsparc.models.splat.method import LearnedField
+
+
+class ArrayField(LearnedField):
+    """The complex field at a static array as a function of the transmitter's position.
+
+    Args:
+        field: number and places of the Gaussians.
+        refit: learn from validation rows too (settings are chosen by cross-validation, not on them).
+        name: as it appears in tables.
+    """
+
+    effects = "array"
+    takes_budget = False
+    resumable = False
+
+    def __init__(
+        self, field: FieldSettings = FieldSettings(), refit: bool = True, name: str = "array"
+    ) -> None:
+        super().__init__(
+            field=field,
+            response=ResponseSettings(array=True),
+            init=InitSettings("vectors"),
+            refit=refit,
+            name=name,
+            steps=0,
+        )
+
+    def trainer_options(self) -> bool:
+        """See `TrainsByGradient`: it is solved in closed form."""
+        return False

@@ -1,0 +1,191 @@
+"""A first field in closed form: project the training images on the footprints, regress over position.
+
+Footprints are fixed, so an image is linear in the emissions, and an emission that is linear in the whitened
+kernel features is a Gaussian process of position: both fits are ridge least squares. Gradient training
+starts from there; from random weights it needs minutes to get as far and generalises worse (Adam's solution
+is not the one of least norm).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.distance import cdist
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.field.confidence import fit_errors
+from gsparc.field.encoding import Prior
+from gsparc.field.model import GaussianModel
+from gsparc.models.baselines.gp import choose_kernel, principal_components
+from gsparc.models.left_out_images import LeftOut, predict_left_out
+from gsparc.models.target_rows import to_real, training_targets
+from gsparc.ops import Pose
+from gsparc.processes.factor import Factor
+from gsparc.processes.features import Whitened, whitened
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.left_out import left_out
+
+IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular
+CHUNK = 256  # images held as floats at a time
+KERNEL_ROWS = 1024  # leave-one-out factors a matrix of this size at every look
+COMPONENTS = 128
+LEAST_ROWS = 4  # for predictions without their neighbours to say anything
+GAPS = (0.0, 2.0, 5.0, 10.0)  # between a row and what is left, in spacings of rows
+PIXELS, CENTRES = 600, 160  # of the images, and rows, that are predicted so
+LEAST_NOISE = 1e-6  # of the kernel's variance
+
+
+def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Prior:
+    """Smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
+    generator = np.random.default_rng(seed)
+    chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
+    kernel = _kernel(data, chosen)
+    return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process of position, conditioned on training rows.
+
+    Attributes:
+        prior: of the emission's encoding.
+        features: with what maps values at the rows to weights.
+    """
+
+    prior: Prior
+    features: Whitened
+
+
+def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Process:
+    """Of training rows (n,), at up to `anchors` places."""
+    generator = np.random.default_rng(seed)
+    chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
+    kernel = _kernel(data, chosen)
+    noise = max(kernel.noise, LEAST_NOISE)
+    places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
+    features = whitened(places, kernel.length, noise, "matern32", anchors)
+    prior = Prior(features.places.float(), kernel.length, noise, "matern32", features.whitening.float())
+    return Process(prior, features)
+
+
+def _kernel(data: Measurements, chosen: np.ndarray) -> Kernel:
+    looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
+    parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
+    return choose_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Training images as emissions of fixed footprints.
+
+    Attributes:
+        weights: (P, N), pixels by Gaussians.
+        images: (n, P), the targets.
+        outputs: (n, N) float64, of the emission's read-out.
+        attenuation: (n, N), or None.
+    """
+
+    weights: Tensor
+    images: Tensor
+    outputs: Tensor
+    attenuation: Tensor | None
+
+    def at(self, rows: np.ndarray) -> Seen:
+        """Of some rows (m,) alone."""
+        attenuation = None if self.attenuation is None else self.attenuation[rows]
+        return Seen(self.weights, self.images[rows], self.outputs[rows], attenuation)
+
+    def rendered(self, outputs: Tensor) -> Tensor:
+        """Images (n, P) of other outputs (n, N) at the same places."""
+        emission = outputs.float()
+        return (emission if self.attenuation is None else emission * self.attenuation) @ self.weights.mT
+
+
+@torch.no_grad()
+@torch.autocast("cpu", enabled=False)  # a Gram matrix rounded to half precision has no Cholesky factor
+def warm_start(
+    model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, process: Process
+) -> LeftOut | None:
+    """Set the emission's last layer so that the model reproduces the training spectra as well as it can.
+
+    What the process leaves unknown becomes the model's error model.
+
+    Args:
+        model: spectra, a static receiver, a linear read-out (`emission.hidden=0`) of the process's features.
+        data: all measurements.
+        rows: (n,) training rows.
+        receiver: the static pose.
+        process: of these rows.
+
+    Returns:
+        Rows predicted without their neighbours; None where there are too few.
+
+    Raises:
+        ValueError: the emission has hidden units.
+    """
+    if model.settings.emission.hidden:
+        raise ValueError("init=images solves a linear read-out: set model.emission.hidden=0")
+    version = int(model.gaussians.version)
+    weights = model.freeze(receiver).render(torch.eye(len(model.gaussians)), version).flatten(1).mT
+    parts = [_seen(model, data, part, weights) for part in np.array_split(rows, -(-len(rows) // CHUNK))]
+    outputs = torch.cat([part.outputs for part in parts])
+    mean = outputs.mean(0)
+    readout = process.features.weigh @ (outputs - mean)
+    model.emission.weight2.copy_(readout.mT.unsqueeze(-1).float())
+    model.emission.bias2.copy_(mean.unsqueeze(-1).float())
+    first = parts[0]
+    own = rows[: len(first.outputs)]
+    places = torch.from_numpy(data.moving[own]).float().double()
+    alone = whitened(places, process.prior.length, process.prior.noise, "matern32", len(own))
+    inverse = alone.weigh.mT @ alone.weigh
+    if model.error is not None:
+        model.error.set(*_errors(first, inverse, process.prior.noise, mean))
+    return _left_out(first, inverse, data.moving[own], mean)
+
+
+def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> Seen:
+    """Emissions (least squares) that show the images of rows (n,)."""
+    gram = weights.mT @ weights
+    ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
+    batch = data.batch(rows)
+    images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
+    emission = Factor.of(gram + ridge).solved(weights.mT @ images.mT).mT
+    distance = model.distances(batch.tx)
+    attenuation = model.attenuation(distance)
+    emission = emission if attenuation is None else emission / attenuation
+    outputs = model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1)
+    return Seen(weights, images, outputs.double(), attenuation)
+
+
+def _errors(seen: Seen, inverse: Tensor, noise: float, mean: Tensor) -> tuple[float, float]:
+    """Level and power of the `ErrorModel`: errors of rows left out one by one, and of the mean alone.
+
+    Rasmussen and Williams (2006), eq. 5.12.
+    """
+    residual, variance = left_out(inverse, inverse @ (seen.outputs - mean))
+    unknown = (variance - noise).clamp(0, 1)
+    shown = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
+    error = torch.cat([(image - seen.images).square().mean(1) for image in shown])
+    return fit_errors(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
+
+
+def _left_out(seen: Seen, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
+    """Rows at places (n, 3) [m] predicted without their neighbours, at gaps of some spacings."""
+    count = len(places)
+    if count < LEAST_ROWS:
+        return None
+    draws = np.random.default_rng(0)
+    pixels = torch.from_numpy(np.sort(draws.permutation(seen.images.shape[1])[:PIXELS]))
+    centres = np.sort(draws.permutation(count)[:CENTRES])
+    distance = cdist(places, places)
+    spacing = np.median(np.where(np.eye(count, dtype=bool), np.inf, distance).min(1))
+    gaps = np.array(GAPS) * spacing
+    about = (seen.outputs - mean).numpy()
+    means, _ = predict_left_out(inverse.numpy(), about, distance, centres, gaps)
+    some = Seen(seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation).at(centres)
+    predicted = [some.rendered(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
+    images = seen.images[:, pixels].double().numpy()
+    return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())

@@ -1,0 +1,420 @@
+"""The learned Gaussian field as a method: fit with Lightning, predict from a frozen plan."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import astuple, replace
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsparc.data.gaussian_cloud import GaussianCloud
+from gsparc.data.inner_folds import cut_inside
+from gsparc.data.limits import check_arguments, or_null, switch, whole
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.field import edit
+from gsparc.field.confidence import Confidence, ConfidenceSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import Prior
+from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.initial import InitSettings, InitTask
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
+from gsparc.field.response import ResponseSettings
+from gsparc.models import checkpoint
+from gsparc.models.left_out_images import LeftOut
+from gsparc.models.method import Method, Prediction
+from gsparc.models.mixture.weights import LEAST_HELD
+from gsparc.models.origin import Origin
+from gsparc.models.splat import reduce
+from gsparc.models.splat.auto_settings import Choices, resolve, settled
+from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
+from gsparc.models.splat.initialise import prepare
+from gsparc.ops import Pose
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.fit import run_stage, total_steps
+from gsparc.training.keep_best import SHORT, KeepBest, StopAt
+from gsparc.training.module import GaussianModule, LossSettings
+from gsparc.training.optimizer import OptimizerSettings
+from gsparc.training.pace import Pace
+from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
+
+log = logging.getLogger(__name__)
+
+LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
+QUERY_CHUNK = 256  # bounds the memory of one prediction call
+
+
+class LearnedField(Method):
+    """A Gaussian field trained by gradient.
+
+    Args:
+        field, emission, attenuation, raster, confidence: all switches of the model.
+        loss: task loss.
+        optimizer: learning rates.
+        response: coherent terms: an array's spectra.
+        name: as it appears in tables.
+        init: where Gaussians come from; `auto` solves the emission in closed form where it can.
+        refit: after validation, train again on training and validation rows together.
+        keep_best: end with the parameters of the best validation, and end early when none is better.
+        steps: of gradient, at most; None: `trainer.max_steps`. 0 after a closed-form start: it is the answer.
+        guesses: settings the source of this configuration does not give, one line each.
+    """
+
+    has_gaussians = True
+    resumable = True  # every step's state is in `last.ckpt`
+    takes_budget = True
+    _limited_by: Clock | None = None
+
+    def __init__(
+        self,
+        field: FieldSettings = FieldSettings(),
+        emission: EmissionSettings = EmissionSettings(),
+        attenuation: AttenuationSettings = AttenuationSettings(),
+        raster: RasterSettings = RasterSettings(),
+        confidence: ConfidenceSettings = ConfidenceSettings(),
+        loss: LossSettings = LossSettings(),
+        optimizer: OptimizerSettings = OptimizerSettings(),
+        response: ResponseSettings | None = None,
+        name: str = "gsparc",
+        init: InitSettings | None = None,
+        refit: bool = True,
+        keep_best: bool = True,
+        steps: int | None = None,
+        guesses: Sequence[str] = (),
+    ) -> None:
+        check_arguments(locals(), refit=switch(), keep_best=switch(), steps=or_null(whole(0)))
+        response = response or ResponseSettings()
+        self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
+        self.loss, self.rates, self.name = loss, optimizer, name
+        self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
+        self.refit, self.guesses = refit, tuple(guesses)
+        self.keep_best, self.most_steps = keep_best, steps
+        self.model: GaussianModel | None = None
+        self.site: Site | None = None
+        self.choices: Choices | None = None
+        self._ends: dict[str, Tensor] = {}
+        self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
+        self._prior: Prior | None = None
+        self._paying: int | None = None  # position in the schedule after which steps did not pay
+        self.steps = 0  # of gradient, of the last stage
+        self.init_s: float | None = None  # of all initialisers; None of a model read back
+        self._billed = Spent()  # for reusable work, by the stages so far
+        self.frozen: FrozenView | FrozenArray | None = None
+        self._reserve_s = 0.0  # of the budget, for what follows the last stage [s]
+        self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
+        self._left_out: LeftOut | None = None  # of the initialiser; not stored
+        self._apart: float | None = None  # validation rows from the nearest training row, median [m]
+
+    # -- learning ----------------------------------------------------------------------------------
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
+
+        The second stage (`refit`) trains again on both with the confidence fixed, because the baselines
+        learn from all of them. Without steps (`steps=0`) both are solved at once.
+        """
+        self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
+        if data.site.kind == "csi":
+            self._shape = (data.target.shape[1], data.target.shape[2])
+        self.choices, reasons = resolve(self.settings, self.init.name, data.site)
+        for reason in reasons:
+            log.info("%s", reason)
+        origin = Origin.of(data, fold, context)
+        resumed = None if context.resume is None else interrupted(context.resume)
+        if resumed is not None:
+            origin.refuse_other(resumed)
+        marks = {} if resumed is None else resumed.extra
+        stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
+        budget = context.time_budget(before=Spent(*marks.get("spent", ())))
+        now = None if context.budget_s is None else context.budget_clock
+        self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
+        self.spent, self._apart = {}, _apart(data, fold)
+        self._left_out = LeftOut.of(
+            marks.get("left_out")
+        )  # the initialiser of an interrupted run is not repeated
+        self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
+        if self._told_by_few(fold) and not self.choices.closed_form:
+            fold = _more_told(data, fold, context)
+        if self._solved(fold):
+            if self.refit:
+                fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+            self._stage("train", origin, data, fold, context, budget, seconds)
+            self._weigh_process(data, fold)
+            self.frozen = None
+            return FitReport(budget.counted.wall, limited_by=self._limited_by)
+        if stage == "train":
+            seconds += self._stage("train", origin, data, fold, context, budget, seconds)
+            self._calibrate(data, fold)
+            self._weigh_process(data, fold)
+        elif resumed is not None:
+            self.restore(data.site, resumed.state)
+        if self.refit and len(fold.val) and self._pays():
+            every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+            resume = context.resume if stage == "refit" else None
+            again = context.within("refit", resume=resume)
+            confidence = self.fitted().confidence
+            self._stage("refit", origin, data, every, again, budget, seconds, confidence)
+        self.frozen = None
+        return FitReport(budget.counted.wall, limited_by=self._limited_by)
+
+    def _pays(self) -> bool:
+        """Whether another stage is worth its seconds."""
+        return True
+
+    def _solved(self, fold: Fold) -> bool:
+        """Whether a closed-form start is the answer: few validation rows choose steps by chance."""
+        assert self.choices is not None
+        return self.choices.closed_form and (self.most_steps == 0 or self._told_by_few(fold))
+
+    def _told_by_few(self, fold: Fold) -> bool:
+        return self.keep_best and len(fold.val) < LEAST_TOLD
+
+    def _stage(
+        self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
+        budget: TimeBudget, earlier_s: float, confidence: Confidence | None = None,
+    ) -> float:  # fmt: skip
+        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
+        folder, resume = context.run_dir, context.resume
+        L.seed_everything(context.seed, verbose=False)
+        started = budget.counted
+        assert self.choices is not None
+        if context.init_from is not None and resume is None and stage == "train":
+            self._start_from(data.site, context.init_from)
+        elif resume is None:
+            start = prepare(
+                InitTask(
+                    settled(self.settings, self.choices), self.choices.closed_form, data,
+                    fold.train, self._receiver(), self._ends.get("tx_position"), self.loss.snapshot,
+                    context.seed, folder,
+                )
+            )  # fmt: skip
+            self._prior = start.prior
+            self.model = self._new_model(data.site)
+            solved = start.solve(self.model)
+            self._left_out = solved or start.left_out
+            # What an earlier run has paid for is billed; what an earlier stage has, is not again.
+            budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
+            self._billed = Spent(*start.billed_s)
+            self._limited_by = less_repeatable(self._limited_by, "processor" if start.time_limited else None)
+        else:
+            self.restore(data.site, checkpoint.read(resume).state)
+        if confidence is not None:
+            self.fitted().confidence = confidence.requires_grad_(False)
+        prepared = (budget.counted - started).wall
+        self.init_s = (self.init_s or 0.0) + prepared
+        again = "" if stage == "train" else " again, on all rows"
+        self.spent["initialiser" + again] = prepared
+        if stage == "train" and self._solved(fold):
+            return prepared
+        steps, pace = total_steps(context) if self.most_steps is None else self.most_steps, None
+        if context.budget_s is not None:
+            first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
+            end = context.budget_s * 0.5 if first else context.budget_s - self._reserve_s
+            pace = Pace(steps, end - budget.spent)
+            if pace.budget_s <= 0 and self._paying != 0:
+                blind = stage == "train" and self.keep_best and self.choices.closed_form
+                self._paying = 0 if blind else self._paying  # nothing shows that steps would gain
+                log.warning(
+                    "budget_s=%.3g: %.1f of %.3g s went before the first step of stage %s (preparation, "
+                    "earlier stages), which has %s; give more",
+                    context.budget_s, budget.spent, end, stage, "none" if blind else "one step",
+                )  # fmt: skip
+        if self._paying == 0:
+            self.steps = 0
+            return prepared
+        module = self.module(steps, folder, pace)
+        module.prepared_seconds, module.solved = earlier_s + prepared, self.choices.closed_form
+        marks = {
+            "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
+            "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
+            "left_out": None if self._left_out is None else self._left_out.state(), **origin.marks(),
+        }  # fmt: skip
+        files = GsparcCheckpointIO(self, context.config_yaml, marks)
+        watch: list[L.Callback] = []
+        every = None
+        if self.keep_best and stage == "train":
+            assert self.choices is not None
+            watch.append(KeepBest(SHORT) if self.choices.closed_form else KeepBest())
+            every = max(1, round(SHORT / 2 * steps)) if self.choices.closed_form else None
+        if stage == "refit" and self._paying is not None:
+            watch.append(StopAt(self._paying))
+        ran = run_stage(module, data, fold, context, files, budget, watch, every)
+        self.steps = ran.steps
+        self.spent["gradient steps" + again] = ran.seconds
+        if stage == "train":
+            self._paying = ran.position
+        return prepared + ran.seconds
+
+    def _weigh_process(self, data: Measurements, fold: Fold) -> None:
+        """A hook between the stages: what a process averaged with the field would gain."""
+
+    def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
+        """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
+        return GaussianModule(self.fitted(), self.loss, self.rates, steps, run_dir, pace)
+
+    def _start_from(self, site: Site, path: Path) -> None:
+        """Take the weights of another model of this site; what is learned anew are these rows.
+
+        Raises:
+            ValueError: it holds no Gaussian field, or one of other positions, directions or channels.
+        """
+        stored = checkpoint.read(path)
+        state = stored.state.get("inner", stored.state)
+        if "model" not in state:
+            raise ValueError(f"init_from={path}: {stored.method} holds no Gaussian field")
+        for name in ("kind", "grid", "static_end"):
+            mine, its = getattr(site, name), getattr(stored.site, name)
+            if mine != its:
+                raise ValueError(f"init_from={path}: its {name} is {its}, here it is {mine}")
+        if not np.allclose(site.origin, stored.site.origin, atol=1e-6):
+            raise ValueError(
+                f"init_from={path}: its origin is {stored.site.origin} m, here it is {site.origin} m"
+            )
+        LearnedField.restore(self, site, {**state, "ends": self._ends, "shape": self._shape})
+
+    def _receiver(self) -> Pose | None:
+        ends = self._ends
+        return Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
+
+    def _new_model(self, site: Site) -> GaussianModel:
+        assert self.choices is not None
+        settings, transmitter = settled(self.settings, self.choices), self._ends.get("tx_position")
+        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
+
+    def _calibrate(self, data: Measurements, fold: Fold) -> None:
+        model = self.fitted()
+        rows = fold.val if len(fold.val) else fold.train
+        if model.confidence is not None:
+            model.confidence.calibrate(torch.from_numpy(np.asarray(data.moving[rows], dtype=np.float32)))
+
+    # -- answering ---------------------------------------------------------------------------------
+
+    def fitted(self) -> GaussianModel:
+        """The trained model.
+
+        Raises:
+            RuntimeError: before `fit` or `restore`.
+        """
+        if self.model is None:
+            raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
+        return self.model
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
+        model = self.fitted()
+        if len(tx) > QUERY_CHUNK:
+            chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
+            parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
+            return Prediction.joined(parts)
+        frozen = self.frozen_at(rx)
+        found = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
+        mean = found.mean.clamp_(0, 1) if model.site.kind == "spectrum" else found.mean
+        if model.error is not None and found.unknown is not None:
+            return Prediction(mean, *model.error(found.unknown))
+        if model.confidence is None:
+            return Prediction(mean)
+        return Prediction(mean, model.confidence.normalised(model.site.moving(tx, rx)))
+
+    def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
+        """The matrix of the static receiver, made anew after an edit; None for any other pose."""
+        model, static = self.fitted(), self._receiver()
+        if model.site.kind != "spectrum" or static is None or rx.batched:
+            return None
+        if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
+            return None
+        if self.frozen is None or self.frozen.version != int(model.gaussians.version):
+            self.frozen = frozen_view(model, rx)
+        return self.frozen
+
+    @torch.no_grad()
+    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+        """See `HasGaussians`; their attenuated emissions."""
+        if self.model is None or not self.size():
+            raise ValueError(f"{self.name}: nothing here is rendered from Gaussians")
+        model, square = self.model, torch.zeros(self.size())
+        for i in range(len(tx)):  # one at a time: features of all would be gigabytes
+            square += model.features(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx)[0].square().sum(1)
+        return model.gaussians.cloud((square / max(len(tx), 1)).sqrt(), "emission of a Gaussian")
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The model's own mean, not clamped; see `Differentiable`.
+
+        Raises:
+            ValueError: gradients by the receiver's position are asked for, and images depend on it.
+        """
+        if rx.position.requires_grad:
+            raise ValueError(f"{self.name}: footprints have no gradients by the receiver's position")
+        return self.fitted()(tx, rx).mean
+
+    # -- what it can do besides ----------------------------------------------------------------------
+
+    def trainer_options(self) -> bool:
+        """See `TrainsByGradient`."""
+        return True
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        return reduce.knobs(self.fitted())
+
+    contributions = reduce.contributions
+    reduced = reduce.reduced
+
+    # -- storing -----------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything `restore` needs."""
+        prior = None if self._prior is None else vars(self._prior)
+        choices = None if self.choices is None else vars(self.choices)
+        model = self.fitted().state_dict()
+        return {
+            "choices": choices, "ends": self._ends, "prior": prior, "shape": self._shape, "model": model
+        }  # fmt: skip
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """Become the field whose `state()` this was."""
+        self.site = site
+        self.choices = Choices(**state["choices"])
+        self._ends = dict(state["ends"])
+        self._shape = None if state["shape"] is None else tuple(state["shape"])
+        self._prior = None if state["prior"] is None else Prior(**state["prior"])
+        self.model = self._new_model(site)
+        edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
+        self.model.load_state_dict(state["model"])
+        self.frozen = None
+
+    def size(self) -> int:
+        """Number of Gaussians."""
+        return len(self.fitted().gaussians)
+
+
+def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
+    """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    if len(known) < 3 * LEAST_HELD:
+        return fold
+    cut = cut_inside(data, fold, context.split, 3, context.seed).folds[0]
+    return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
+
+
+def _apart(data: Measurements, fold: Fold) -> float | None:
+    """How far validation rows are from the nearest training row, median [m]; None where there are none."""
+    if not len(fold.val):
+        return None
+    return float(np.median(cKDTree(data.moving[fold.train]).query(data.moving[fold.val])[0]))
+
+
+def _static_end(data: Measurements, row: int) -> dict[str, Tensor]:
+    """Where the end that never moves stands, local coordinates [m]."""
+    one = data.batch(np.array([row]))
+    if data.site.static_end == "rx":
+        return {"rx_position": one.rx.position, "rx_rotation": one.rx.rotation}
+    return {"tx_position": one.tx[0]}

@@ -1,0 +1,91 @@
+"""Whether several stations are learned in one field or each in its own, where nobody says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.inner_folds import cut_inside
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import LEAST_ROWS, Fold
+from gsparc.field.initial import InitSettings
+from gsparc.models.censored import heard
+from gsparc.models.fields import INITIALISERS
+from gsparc.models.per_station import of_station
+from gsparc.training.conditional import ConditionalField
+from gsparc.training.context import FitContext
+
+ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
+FOLDS = 3
+TRIED_ON = 2_000  # rows of a fold that are learned from
+SHARE, MOST_S = 0.1, 6.0  # of the seconds, and seconds, after which no further fold is tried
+PLAIN = InitSettings("diffuse")  # no Gaussians: asked is what stations share
+
+
+def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
+    """How stations of a site that can be learned as one are best learned, and why.
+
+    Channels share waves and where their stations really stand: together. Powers share little more than a
+    law, so that folds cut as the test was cut decide, between processes without Gaussians.
+    """
+    assert data.station is not None
+    if data.site.kind == "csi":
+        return "together", "channels at all stations share waves and the frame of places"
+    if not np.isin(data.station[fold.test], data.station[fold.train]).any() and len(fold.test):
+        return "together", "no station of the test rows was heard, and what stations share answers for them"
+    known = heard(data, np.sort(np.concatenate([fold.train, fold.val])))
+    if len(known) > ONE_FACTOR:
+        return "each", f"{len(known)} rows are more than one factor holds ({ONE_FACTOR})"
+    given = math.inf if context.budget_s is None else context.budget_s
+    budget = context.time_budget(min(MOST_S, SHARE * given))
+    errors = []
+    for inner in cut_inside(data, fold, context.split, FOLDS, context.seed).folds:
+        learned, asked = (heard(data, part) for part in (np.union1d(inner.train, inner.val), inner.test))
+        if len(learned) > TRIED_ON:
+            learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:TRIED_ON])
+        own = replace(context, run_dir=Path(), resume=None, budget_s=MOST_S)
+        parts = list(_by_station(data, learned, asked, own))
+        if not parts:
+            continue
+        joint, _ = INITIALISERS["joint_powers"](data, learned, PLAIN, False, own)
+        rows = np.concatenate([part for part, _ in parts])
+        alone = torch.cat([said for _, said in parts])
+        target = _decibels(data.batch(rows).target)
+        errors.append([(_said(joint, data, rows) - target).square(), (alone - target).square()])
+        if budget.over():
+            break
+    if not errors:
+        return "together", "too few rows of each station to leave any out"
+    together, each = (float(torch.cat(part).mean().sqrt()) for part in zip(*errors, strict=True))
+    why = f"rmse {together:.2f} dB together, {each:.2f} dB each, of rows left out as the test is"
+    return ("together" if together <= each else "each"), f"{why} ({len(errors)} folds)"
+
+
+def _by_station(
+    data: Measurements, learned: np.ndarray, asked: np.ndarray, context: FitContext
+) -> Iterator[tuple[np.ndarray, Tensor]]:
+    """Rows (m,) asked of each station with rows to learn from, and powers (m,) [dB] by its own process."""
+    assert data.station is not None
+    for number in np.unique(data.station[asked]).tolist():
+        rows = np.flatnonzero(data.station == number)
+        known, left = (np.flatnonzero(np.isin(rows, part)) for part in (learned, asked))
+        if len(known) >= LEAST_ROWS:
+            part = data.subset(rows, of_station(data.site, number))
+            field, _ = INITIALISERS["powers"](part, known, PLAIN, False, context)
+            yield rows[left], _said(field, part, left)
+
+
+@torch.no_grad()
+def _said(field: ConditionalField, data: Measurements, rows: np.ndarray) -> Tensor:
+    return _decibels(field.answer(data.batch(rows)).mean)
+
+
+def _decibels(power: Tensor) -> Tensor:
+    return 10 * power.flatten().double().clamp_min(1e-30).log10()

@@ -1,0 +1,68 @@
+"""What all methods that read a fresh uplink share."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.models.method import Method, Prediction
+from gsparc.ops import Pose
+
+
+@runtime_checkable
+class SeparatesPaths(Protocol):
+    """Finds the propagation paths of an uplink."""
+
+    def sources(self, uplink: Tensor) -> Any:
+        """Gains, delays and directions (B, N) of uplinks (B, U, L)."""
+
+    def from_uplink_at(
+        self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
+    ) -> Prediction:
+        """Channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
+
+
+def rms(channels: Tensor) -> Tensor:
+    """Root mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
+    return channels.abs().square().mean((1, 2)).sqrt().clamp_min(1e-30)
+
+
+class UplinkMethod(Method):
+    """A method that needs the snapshot's own uplink; a position alone is no question to it."""
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Predict from `batch.uplink` (B, U, L).
+
+        Raises:
+            ValueError: the data hold no uplink, or nothing was fitted.
+        """
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        if batch.uplink is None:
+            raise ValueError(f"{self.name}: reads a fresh uplink, and these data have none; take model=gp")
+        return self.from_uplink(batch.uplink, batch.noise_variance)
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """Always refused: `ValueError`."""
+        raise ValueError(f"{self.name}: answers snapshots with their uplink, not positions")
+
+    @abstractmethod
+    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+        """Channels of the downlink (B, A, K) from uplinks (B, U, L), with noise powers (B,) where known."""
+
+    def own(self, uplink: Tensor) -> Tensor:
+        """Of uplinks (B, U, L), those (B, A, L) heard by the antennas that answer."""
+        assert self.site is not None
+        return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
+
+    def _need_uplink(self, data: Measurements) -> Site:
+        if data.site.kind != "csi" or data.uplink is None or data.site.antennas is None:
+            raise ValueError(
+                f"{self.name}: reads a fresh uplink, and {data.site.name} has none (dataset=argos does)"
+            )
+        return data.site

@@ -1,0 +1,196 @@
+"""Sources of a snapshot by greedy search on a grid, each round followed by a joint refinement off it.
+
+Newtonised matching pursuit (Mamandipoor, Ramasamy, Madhow 2016) with gains under a sparse Bayesian prior
+(Tipping 2001), refined by variable projection (Golub and Pereyra 1973): directions and delays take
+Gauss-Newton steps on what the best gains leave unexplained.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.models.uplink.posterior import Sources
+from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
+from gsparc.processes.factor import Factor
+
+LEAST_SHARE = 1e-7  # of a snapshot's power, lower bound of a source's prior against division by zero
+UNEXPLAINED = 0.2  # of a round's residual that counts as noise: sources not found yet bias those found
+LARGEST_STEP = (0.06, 0.012)  # of direction cosines and of delays, a fraction of a resolution cell
+REACH = (0.03, 0.006)  # prior standard deviation of a step: half a step of the grid
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Source search.
+
+    Attributes:
+        rounds: of matching pursuit.
+        picks: new sources a round.
+        refinements: joint steps after each round.
+        final: joint steps at the end.
+        oversampling: grid points per resolution cell of the array and of the band.
+        delay_window: first and last delay, turns per tone, about the snapshot's mean delay.
+        leakage: share of a snapshot's power that is not explained by sources (hardware, drift).
+    """
+
+    rounds: int = 6
+    picks: int = 3
+    refinements: int = 1
+    final: int = 2
+    oversampling: float = 1.5
+    delay_window: tuple[float, float] = (-0.12, 0.30)
+    leakage: float = 3e-4
+
+
+class SourceSearch:
+    """Finds the sources of snapshots measured on one aperture.
+
+    Args:
+        aperture: antennas and tones.
+        settings: see there.
+    """
+
+    def __init__(self, aperture: Aperture, settings: SearchSettings) -> None:
+        self.aperture, self.settings = aperture, settings
+        self.cosines, self.delays, self.shape = _grid(aperture, settings)
+        self._over_antennas = steering(self.cosines[None], aperture)[0].conj()
+        self._over_tones = delays(self.delays[None], aperture)[0].conj().T.contiguous()
+
+    def __call__(self, snapshot: Tensor, noise: Tensor) -> tuple[Sources, Tensor]:
+        """Sources of snapshots (B, A, K) complex64 of noise power (B,), and the residual (B, A, K)."""
+        s = self.settings
+        power = snapshot.abs().square().mean((1, 2))
+        scale = power.sqrt().clamp_min(1e-30)
+        y, noise = snapshot / scale[:, None, None], noise / power.clamp_min(1e-30) + s.leakage
+        count = len(snapshot)
+        direction, delay = snapshot.real.new_zeros(count, 0, 2), snapshot.real.new_zeros(count, 0)
+        prior, residual = delay, y
+        for turn in range(s.rounds):
+            new_direction, new_delay = self._peaks(residual)
+            direction, delay = torch.cat([direction, new_direction], 1), torch.cat([delay, new_delay], 1)
+            prior = torch.cat([prior, torch.full_like(new_delay, 1 / (s.rounds * s.picks))], 1)
+            last = turn == s.rounds - 1
+            inflated_noise = noise + UNEXPLAINED * residual.abs().square().mean((1, 2))
+            for _ in range(s.refinements + (s.final if last else 0)):
+                fit = self._fit(y, inflated_noise, direction, delay, prior)
+                turned, moved = self._step(fit, inflated_noise)
+                direction, delay = direction + turned, delay + moved
+                prior = (fit.gain.abs().square() + fit.variance(inflated_noise)).clamp_min(LEAST_SHARE)
+            if not last:
+                residual = y - fit.columns.response(fit.gain)
+        fit = self._fit(y, noise, direction, delay, prior)
+        residual = scale[:, None, None] * (y - fit.columns.response(fit.gain))
+        return self._posterior(fit, noise, direction, delay, scale), residual
+
+    def _peaks(self, residual: Tensor) -> tuple[Tensor, Tensor]:
+        """The strongest local maxima of the correlation with the grid's atoms."""
+        score = torch.view_as_real(self._over_antennas @ (residual @ self._over_tones)).square().sum(-1)
+        cube = score.view(-1, *self.shape)
+        peaks = torch.where(_largest_near(cube) == cube, cube, 0).flatten(1)
+        at = peaks.topk(self.settings.picks, 1).indices
+        return self.cosines[at // len(self.delays)], self.delays[at % len(self.delays)]
+
+    def _fit(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
+        """Best gains of given sources, and the gradient by their directions and delays."""
+        n = delay.shape[1]
+        columns = Columns.of(direction, delay, self.aperture)
+        gram, inner = columns.gram(), columns.inner(y)
+        torch.diagonal(gram, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
+        cross, inverse = gram[:, n:, :n], torch.linalg.inv(gram[:, :n, :n])
+        gain = (inverse @ inner[:, :n, None])[..., 0]
+        gains = gain.repeat(1, 3)
+        slope = ((inner[:, n:] - (cross @ gain[..., None])[..., 0]) * gains.conj()).real
+        gain_slopes = cross @ inverse
+        projected = gram[:, n:, n:] - gain_slopes @ cross.mH
+        curvature = (projected * gains[:, None] * gains.conj()[..., None]).real
+        return _Fit(columns, gain, inverse, slope, curvature, gain_slopes)
+
+    def _step(self, fit: _Fit, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on the residual of the best gains."""
+        n = fit.gain.shape[1]
+        reach = self._reach(n)
+        factor = Factor.of(self._scaled(fit, noise), "ignore")
+        step = factor.solved((fit.slope * reach)[..., None])[..., 0] * reach
+        turned = step[:, : 2 * n].view(-1, 2, n).transpose(1, 2).clamp(-LARGEST_STEP[0], LARGEST_STEP[0])
+        return turned, step[:, 2 * n :].clamp(-LARGEST_STEP[1], LARGEST_STEP[1])
+
+    def _scaled(self, fit: _Fit, noise: Tensor) -> Tensor:
+        """Curvature (B, 3 N, 3 N) in units of `_reach`, with the prior of a small step."""
+        reach = self._reach(fit.gain.shape[1])
+        scaled = fit.curvature * (reach[:, None] * reach)
+        torch.diagonal(scaled, dim1=1, dim2=2).add_(noise[:, None])
+        return scaled
+
+    def _posterior(
+        self, fit: _Fit, noise: Tensor, direction: Tensor, delay: Tensor, scale: Tensor
+    ) -> Sources:
+        """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
+        reach = self._reach(fit.gain.shape[1])
+        gains = (fit.gain * scale[:, None]).repeat(1, 3)
+        spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
+        return Sources(
+            direction,
+            delay,
+            fit.gain * scale[:, None],
+            fit.inverse * (noise * scale**2)[:, None, None],
+            spread * (noise / 2)[:, None, None],
+            -(fit.gain_slopes.mH * gains[:, None]),
+        )
+
+    def _reach(self, count: int) -> Tensor:
+        """Standard deviations (3 N,) of a step before anything is known."""
+        return torch.cat([torch.full((2 * count,), REACH[0]), torch.full((count,), REACH[1])])
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Gains of given sources, and the projected problem of their places (columns of unit gains, scaled).
+
+    Attributes:
+        columns: atoms and slopes.
+        gain: (B, N).
+        inverse: (B, N, N) of the regularised Gram matrix of the atoms.
+        slope: (B, 3 N) downhill.
+        curvature: (B, 3 N, 3 N).
+        gain_slopes: (B, 3 N, N) what the slopes of unit gains have in common with the gains' inverse.
+    """
+
+    columns: Columns
+    gain: Tensor
+    inverse: Tensor
+    slope: Tensor
+    curvature: Tensor
+    gain_slopes: Tensor
+
+    def variance(self, noise: Tensor) -> Tensor:
+        """Of the gains (B, N)."""
+        return noise[:, None] * torch.diagonal(self.inverse, dim1=1, dim2=2).real
+
+
+def _largest_near(cube: Tensor) -> Tensor:
+    """The largest value within one step along every axis of cubes (B, ...)."""
+    for axis in range(1, cube.ndim):
+        size = cube.shape[axis] - 1
+        if size:
+            grown = cube.clone()
+            for mine, other in ((0, 1), (1, 0)):
+                part = grown.narrow(axis, mine, size)
+                torch.maximum(part, cube.narrow(axis, other, size), out=part)
+            cube = grown
+    return cube
+
+
+def _grid(aperture: Aperture, s: SearchSettings) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
+    """Cosines (G, 2), delays (T,), and the shape of both together; one cosine where the array is a line."""
+    axes = []
+    for axis in range(2):
+        extent = float(aperture.places[:, axis].max() - aperture.places[:, axis].min())
+        cells = max(1, round(2 * s.oversampling * (extent * 2 + 1) / 2)) if extent > 1e-6 else 1
+        axes.append((torch.arange(cells) + 0.5) / cells * 2 - 1)
+    step = 1 / (len(aperture.tones) * s.oversampling)
+    found = torch.arange(s.delay_window[0], s.delay_window[1], step)
+    cosines = torch.cartesian_prod(*axes)
+    return cosines, found, (len(axes[0]), len(axes[1]), len(found))

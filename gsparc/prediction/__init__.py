@@ -1,0 +1,1 @@
+"""What is done with a trained model: asking about places, timing, confidence, faster versions."""

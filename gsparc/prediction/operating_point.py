@@ -1,0 +1,63 @@
+"""`gsparc.load(FILE, budget_ms=...)`: time the stored operating points here and take the best that fits."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gsparc.models.checkpoint import Stored
+from gsparc.models.method import Method
+from gsparc.models.reduced import reduced
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.stored_front import Operating, kept
+from gsparc.prediction.timing import BLOCKS, interleaved
+
+log = logging.getLogger(__name__)
+
+CLOCK = replace(BLOCKS, rounds=12, budget_s=3.0)
+QUANTILE = 0.75  # a point fits when three of four of its queries did: its median then does so again
+QUERIES = 16  # at places drawn in the scene's box
+
+
+def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Operating]:
+    """The most accurate stored operating point whose queries take at most `budget_ms` on this machine.
+
+    Sets torch's number of threads to the point's.
+
+    Args:
+        method: as stored.
+        stored: its checkpoint.
+        budget_ms: for one query end to end [ms].
+
+    Raises:
+        ValueError: the budget is no positive number, or nothing fits; the fastest point is named.
+    """
+    if not (isinstance(budget_ms, (int, float)) and math.isfinite(budget_ms) and budget_ms > 0):
+        raise ValueError(f"budget_ms={budget_ms!r}: a positive number of milliseconds is needed")
+    points, measured = kept(stored.extra)
+    advice = "" if points else f"; `gsparc tradeoff ckpt={stored.path}` finds faster ways to answer"
+    if not points:
+        points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
+    points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
+    ways = [reduced(method, point.settings, measured) for point in points]
+    site, draw = stored.site, np.random.default_rng(0)
+    places = draw.uniform(site.box[0], site.box[1], (QUERIES, 3)) + site.origin
+    calls = {i: Predictor(way, site).cycling(places) for i, way in enumerate(ways)}
+    times = interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
+    here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
+    fitting = [i for i in here if here[i] <= budget_ms]
+    if not fitting:
+        fastest = min(here, key=lambda i: here[i])
+        raise ValueError(
+            f"budget_ms={budget_ms:g}: no operating point of {stored.path} is that fast on this machine; the "
+            f"fastest ({points[fastest].label}) takes {here[fastest]:.3g} ms{advice}"
+        )
+    best = max(fitting, key=lambda i: (points[i].score, -here[i]))
+    torch.set_num_threads(points[best].threads)
+    log.info("%s: %s, %.3g ms here", stored.path, points[best].label, np.median(times[best]))
+    return ways[best], points[best]

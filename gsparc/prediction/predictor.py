@@ -1,0 +1,384 @@
+"""`gsparc.load(FILE)`: ask a trained model about places, in world coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.assemble import FARTHEST
+from gsparc.data.links.stations import station_number
+from gsparc.data.schema import End, Kind, Site
+from gsparc.models.method import Method, Prediction
+from gsparc.models.per_station import PerStation, of_station
+from gsparc.ops import Pose
+from gsparc.prediction.confidence import Trusted
+from gsparc.prediction.timing import Call
+
+if TYPE_CHECKING:
+    from gsparc.data.links.georeference import Georeference
+    from gsparc.prediction.export import Paths
+    from gsparc.prediction.stored_front import Operating
+
+SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
+COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
+
+
+class Predictor:
+    """A fitted method in world coordinates.
+
+    Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis. NumPy (or
+    lists) in gives NumPy out, torch in gives torch out. The static end may be left out: the model knows
+    where it stood.
+
+    Args:
+        method: fitted or restored.
+        site: the dataset's fixed facts.
+        whole: asked for the confidence, where `method` spares it; None asks `method`.
+        point: the operating point `method` answers at, if one was chosen.
+        extra: what else the checkpoint holds.
+        trusted: which confidence is answered, and from when on a prediction is accepted.
+        kind: of the confidence; None: as `trusted` says.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        site: Site,
+        whole: Method | None = None,
+        point: Operating | None = None,
+        trusted: Trusted | None = None,
+        kind: str | None = None,
+        extra: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.extra = extra or {}
+        self.trusted, self.kind = trusted or Trusted(), kind
+        self.method, self.site, self.point = method, site, point
+        self._whole = whole or method
+        self._still = self._still_pose()
+
+    def __repr__(self) -> str:
+        low, high = (self.site.box + self.site.origin).round(2).tolist()
+        return (
+            f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
+            f"the {self.site.moving_end} moves, scene from {low} to {high} m)"
+        )
+
+    def at(self, station: str | int) -> Predictor:
+        """The same model asked about one station alone, by name or number.
+
+        >>> gsparc.load("model.ckpt").at("roof-3").rssi(rx=[2.0, 1.0, 1.5])
+
+        Raises:
+            ValueError: no station is called that.
+        """
+        stations = self.site.stations
+        if stations is None:
+            raise ValueError(f"at: {self.site.name} has one static end, and no stations")
+        number = station_number(station, stations.name, len(stations))
+        if number is None:
+            raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
+        # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
+        method, whole = (
+            one.of(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
+        )
+        site = of_station(self.site, number)
+        return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra)
+
+    def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
+        """World positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
+
+        >>> predictor.rssi(rx=predictor.metres(40.7652, -111.8348))
+
+        Args:
+            latitude, longitude: [deg], longitude to the east.
+            height: () or (B,) [m]; None for the one height at which the moving end was measured.
+
+        Raises:
+            ValueError: measured in metres about an unknown origin, degrees that are not on Earth, or no
+                height where the moving end had several.
+        """
+        origin = self._georeference()
+        if height is None:
+            height = usual_heights(self.site).get(self.site.moving_end)
+        if height is None:
+            raise ValueError(f"height= is needed: the {self.site.moving_end} had several, or none is known")
+        single = np.ndim(latitude) == 0 and np.ndim(longitude) == 0 and np.ndim(height) == 0
+        across = origin.from_degrees(latitude, longitude)
+        try:
+            above = np.broadcast_to(np.asarray(height, np.float64), len(across))
+        except (TypeError, ValueError):
+            raise ValueError(f"height= must be one number or {len(across)} [m]") from None
+        places = np.column_stack([across, above])
+        return places[0] if single else places
+
+    def degrees(self, position: Any) -> tuple[Any, Any, Any]:
+        """Latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3) or (3,) [m].
+
+        Raises:
+            ValueError: measured in metres about an unknown origin, or no positions.
+        """
+        origin = self._georeference()
+        places = _positions("position", position)
+        latitude, longitude = origin.to_degrees(np.atleast_2d(places)[:, :2])
+        if places.ndim == 1:
+            return float(latitude[0]), float(longitude[0]), float(places[2])
+        return latitude, longitude, places[:, 2]
+
+    def _georeference(self) -> Georeference:
+        if self.site.georeference is None:
+            raise ValueError(
+                f"{self.site.name} was measured in metres about an unknown origin, not in degrees"
+            )
+        return self.site.georeference
+
+    def predict(self, tx: Any = None, rx: Any = None) -> Prediction:
+        """Mean, variance and confidence (B, ...) at once, as tensors, in the units of the measurements.
+
+        The confidence is None where the method has none; else the one that `confidence` answers.
+        """
+        asked, pose, _, _ = self._ends(tx, rx)
+        with torch.no_grad():
+            said = self._whole.predict(asked, pose)
+        sure, scale = None, self.site.target_scale
+        if said.confidence is not None or (self.kind or self.trusted.kind) not in (None, "learned"):
+            places = self.site.moving(asked, pose).double().numpy()
+            sure = torch.from_numpy(self.trusted.confidence(said, places, self.kind))
+        # In float64: squares of powers in watts are beyond float32.
+        variance = None if said.variance is None else said.variance.double() * scale**2
+        return Prediction(said.mean * scale, sure, variance)
+
+    def cycling(self, places: np.ndarray) -> Call:
+        """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time.
+
+        Of several stations the first that the model answers for is asked.
+        """
+        asked = self
+        for name in () if self.site.stations is None else self.site.stations.name:
+            with suppress(ValueError):
+                asked = self.at(name)
+                break
+        ask = getattr(asked, self.site.kind)
+        return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
+
+    def spectrum(self, tx: Any = None, rx: Any = None) -> Any:
+        """Power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
+
+        Raises:
+            ValueError: the model predicts something else, or a position is missing or not finite.
+        """
+        return self._ask("spectrum", tx, rx)
+
+    def csi(
+        self,
+        tx: Any = None,
+        rx: Any = None,
+        *,
+        uplink: Any = None,
+        frequency_hz: Any = None,
+        symbols: int | None = None,
+    ) -> Any:
+        """Channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
+
+        Args:
+            tx, rx: positions; where the model reads a fresh uplink, none.
+            uplink: (B, U, L) or (U, L) complex channels heard now, for a model that reads them.
+            frequency_hz: (K,) [Hz] of any OFDM grid within the band; None for the measured tones.
+            symbols: OFDM symbols of a slot; then the result is Sionna's
+                [rx, rx_ant, tx, tx_ant, symbols, K].
+        """
+        if uplink is None and frequency_hz is None and symbols is None:
+            return self._ask("csi", tx, rx)
+        from gsparc.prediction import export
+
+        if uplink is not None:
+            channel = export.uplink_channels(self.method, self.site, uplink, frequency_hz)
+            found = export.on_grid(channel, self.site, None, symbols)
+            return found if isinstance(uplink, Tensor) else found.numpy()
+        asked = torch.as_tensor(self._ask("csi", tx, rx))
+        asked = asked[None] if asked.ndim == 2 else asked
+        found = export.on_grid(asked, self.site, frequency_hz, symbols)
+        return found if any(isinstance(end, Tensor) for end in (tx, rx)) else found.numpy()
+
+    def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
+        """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
+        positions; see `gsparc.prediction.export`.
+
+        Raises:
+            ValueError: the model's channels are not made of paths.
+        """
+        from gsparc.prediction import export
+
+        if uplink is not None:
+            return export.uplink_paths(self.method, self.site, uplink)
+        asked, pose, _, _ = self._ends(tx, rx)
+        return export.placed_paths(self._whole, self.site, asked, pose)
+
+    def rssi(self, tx: Any = None, rx: Any = None) -> Any:
+        """Received power (B, 1) float32, linear, in the physical units of the measurements."""
+        return self._ask("rssi", tx, rx)
+
+    def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
+        """How sure the model is, (B,) float32 in [0, 1], larger is surer.
+
+        Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
+        `gsparc calibrate` found best, else the model's own.
+
+        Raises:
+            ValueError: the method has no confidence of that kind.
+        """
+        sure, single, like = self._sure(tx, rx, uplink)
+        return _returned(sure, single, like)
+
+    def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
+        """Whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
+
+        None is where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
+
+        Raises:
+            ValueError: the model was never calibrated, or for another kind of confidence.
+        """
+        if self.trusted.promise is None:
+            raise ValueError(
+                "accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not"
+            )
+        if self.kind not in (None, self.trusted.kind):
+            raise ValueError(
+                f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
+            )
+        sure, single, like = self._sure(tx, rx, uplink)
+        good = sure >= self.trusted.threshold
+        good = good[0] if single else good
+        return good if like else (bool(good) if good.ndim == 0 else good.numpy())
+
+    def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
+        """Confidences (B,), whether one was asked for, and whether torch was given."""
+        if uplink is not None:
+            from gsparc.prediction import export
+
+            said = export.judged(self.method, self.site, uplink)
+            single, like, places = np.ndim(uplink) == 2, isinstance(uplink, Tensor), None
+        else:
+            asked, pose, single, like = self._ends(tx, rx)
+            with torch.no_grad():
+                said = self._whole.predict(asked, pose)
+            places = self.site.moving(asked, pose).double().numpy()
+        if said.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
+            raise ValueError(f"{self.method.name} has no confidence")
+        return torch.from_numpy(self.trusted.confidence(said, places, self.kind)), single, like
+
+    def _ask(self, kind: Kind, tx: Any, rx: Any) -> Any:
+        if self.site.kind != kind:
+            raise ValueError(
+                f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
+                f"call .{self.site.kind}(...)"
+            )
+        asked, pose, single, like = self._ends(tx, rx)
+        with torch.no_grad():
+            mean = self.method.predict(asked, pose).mean
+        scale = self.site.target_scale
+        return _returned(mean if scale == 1 else mean * scale, single, like)
+
+    def _ends(self, tx: Any, rx: Any) -> tuple[Tensor, Pose, bool, bool]:
+        """Both ends in local coordinates, whether one position was asked for, and whether torch was given."""
+        given = rx.position if isinstance(rx, Pose) else rx
+        places = {
+            end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
+        }
+        moving, static = self.site.moving_end, self.site.static_end or "tx"
+        for needed in (moving,) if self.site.static_end else ("rx", "tx"):
+            if needed not in places:
+                raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
+        single = all(place.ndim == 1 for place in places.values())
+        if self._still is not None and len(places) == 1:  # the common case, with nothing to look up
+            asked = _float(np.atleast_2d(places[moving] - self.site.origin))
+            return asked, self._still, single, isinstance(tx, Tensor)
+        local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
+        count = max(len(place) for place in local.values())
+        for end, place in local.items():
+            if len(place) not in (1, count):
+                raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
+        ends = {moving: local[moving], static: self._static(local.get(static))}
+        rotation = self._rotation(rx, count)
+        if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
+            pose = Pose(_float(ends["rx"]), _float(rotation))
+        else:
+            positions = np.broadcast_to(ends["rx"], (count, 3))
+            pose = Pose(_float(positions), _float(np.broadcast_to(rotation, (count, 3, 3))))
+        asked = _float(np.broadcast_to(ends["tx"], (count, 3)))
+        return asked, pose, single, any(isinstance(v, Tensor) for v in (tx, given))
+
+    def _still_pose(self) -> Pose | None:
+        """The pose of a receiver that never moved, made once; None for any other site."""
+        site = self.site
+        if site.static_end != "rx" or site.static_position is None:
+            return None
+        return Pose(_float(site.static_position), _float(self._rotation(None, 1)))
+
+    def _static(self, given: np.ndarray | None) -> np.ndarray:
+        """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
+        known, end = self.site.static_position, self.site.static_end
+        if known is None:
+            if given is not None:
+                return given[0] if len(given) == 1 else given
+            if self.site.stations is not None:
+                raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
+            if self.site.kind == "rssi":  # learned without its transmitter's place
+                return np.full(3, np.nan)
+            raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
+        if given is not None and (np.linalg.norm(given - known, axis=-1) > SAME_PLACE_M).any():
+            stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
+            raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
+        return known
+
+    def _rotation(self, rx: Any, count: int) -> np.ndarray:
+        if isinstance(rx, Pose):
+            rotation = rx.rotation.detach().cpu().double().numpy()
+            if rotation.ndim == 3 and len(rotation) not in (1, count):
+                raise ValueError(f"rx= holds {len(rotation)} rotations for {count} positions")
+            return rotation
+        return np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
+
+
+def usual_heights(site: Site) -> dict[End, float]:
+    """World height [m] of each end that moved and was always at the same height."""
+    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
+    low, high = site.moving_box[:, 2::3]
+    # Rounded: the origin was taken away from it.
+    above = {end: round(float(low[i] + site.origin[2]), 9) for i, end in enumerate(moving)}
+    return {end: above[end] for i, end in enumerate(moving) if low[i] == high[i]}
+
+
+def _positions(end: str, value: Any) -> np.ndarray:
+    """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
+    try:
+        array = value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
+        array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")
+    except (TypeError, ValueError):
+        raise ValueError(f"{end}= must be real numbers [m], got {type(value).__name__}") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != 3 or not array.size:
+        raise ValueError(f"{end}= must be (3,) or (B, 3) [m], got shape {array.shape}")
+    if not np.isfinite(array).all():
+        row = "" if array.ndim == 1 else f" in row {int(np.flatnonzero(~np.isfinite(array).all(1))[0])}"
+        raise ValueError(f"{end}= holds NaN or Inf{row}")
+    if np.abs(array).max() > FARTHEST:
+        raise ValueError(f"{end}= holds {np.abs(array).max():.3g}; expected metres, none beyond {FARTHEST:g}")
+    step = float(np.spacing(np.float32(np.abs(array).max())))
+    if getattr(value, "dtype", None) in (np.float32, torch.float32) and step > COARSE_M:
+        raise ValueError(f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64")
+    return array
+
+
+def _float(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float32))
+
+
+def _returned(value: Tensor, single: bool, as_torch: bool) -> Any:
+    value = value[0] if single else value
+    if as_torch:
+        return value
+    return value.numpy() if value.ndim else float(value)

@@ -1,0 +1,152 @@
+"""Time, machine and memory: no accuracy is shown without them."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from gsparc.data.schema import Batch
+from gsparc.models.method import Method
+
+Key = TypeVar("Key")
+Call = Callable[[int], object]
+
+COPY = "copy"
+COPY_BYTES = 16 * 2**20  # beyond most second-level caches, below a second everywhere
+
+
+@dataclass(frozen=True)
+class ClockSettings:
+    """How long to measure.
+
+    Attributes:
+        rounds: largest number of rounds, each visiting every contender once.
+        least: rounds that are run even when they exceed the budget.
+        warmup: calls of each contender before the clock starts.
+        budget_s: no new round starts after this many seconds [s].
+        calls: timed calls of a visit.
+        untimed: calls at the start of each visit, which bring the contender's data back into the caches.
+    """
+
+    rounds: int = 60
+    least: int = 5
+    warmup: int = 3
+    budget_s: float = 5.0
+    calls: int = 1
+    untimed: int = 0
+
+
+# Where contenders differ in threads: a new team of threads slows the first call of every visit.
+BLOCKS = ClockSettings(rounds=40, warmup=0, budget_s=60.0, calls=4, untimed=1)
+
+
+def interleaved(
+    contenders: Mapping[Key, Call],
+    settings: ClockSettings | None = None,
+    threads: Mapping[Key, int] | None = None,
+) -> dict[Key, np.ndarray]:
+    """Wall times (rounds * calls,) [ms] of each contender.
+
+    Rounds alternate so that a competing process hits all of them alike; each timed call is given another
+    number (to take another query each time) and the device is synchronised before the clock is read.
+
+    Args:
+        contenders: what to call.
+        settings: how long to measure.
+        threads: CPU threads of each, in whose order a round visits them; None leaves them as they are.
+    """
+    settings = settings or ClockSettings()
+    before = torch.get_num_threads()
+    threads = threads or dict.fromkeys(contenders, before)
+    order = sorted(contenders, key=threads.__getitem__)
+    for call in contenders.values():
+        for warm in range(settings.warmup):
+            call(warm)
+    times: dict[Key, list[float]] = {name: [] for name in contenders}
+    begin = time.perf_counter()
+    try:
+        for turn in range(settings.rounds):
+            if turn >= settings.least and time.perf_counter() - begin > settings.budget_s:
+                break
+            for name in order:
+                if torch.get_num_threads() != threads[name]:
+                    torch.set_num_threads(threads[name])
+                times[name] += _visit(contenders[name], turn, settings)
+    finally:
+        torch.set_num_threads(before)
+    return {name: np.array(values) for name, values in times.items()}
+
+
+def _visit(call: Call, turn: int, settings: ClockSettings) -> list[float]:
+    """Wall times [ms] of a contender's calls in one round."""
+    for _ in range(settings.untimed):
+        call(turn)
+    times = []
+    for number in range(turn * settings.calls, (turn + 1) * settings.calls):
+        synchronise()
+        start = time.perf_counter()
+        call(number)
+        synchronise()
+        times.append((time.perf_counter() - start) * 1e3)
+    return times
+
+
+def cycling(methods: Mapping[Key, Method], queries: Sequence[Batch]) -> dict[Key, Call]:
+    """Calls that answer one of `queries` each, another one every time."""
+
+    def call(method: Method) -> Call:
+        return lambda turn: method.answer(queries[turn % len(queries)])
+
+    return {name: call(method) for name, method in methods.items()}
+
+
+def reference_copy() -> Call:
+    """A fixed piece of work, a 16 MiB copy, against which times of different machines can be read."""
+    source = torch.ones(COPY_BYTES // 4)
+    target = torch.empty_like(source)
+    return lambda turn: target.copy_(source)
+
+
+def machine_facts() -> dict[str, float | int | str | None]:
+    """`machine/*`: threads, cores, 1-minute load per core, processor and accelerator."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    load = os.getloadavg()[0] / cores if hasattr(os, "getloadavg") else None
+    return {
+        "machine/threads": torch.get_num_threads(),
+        "machine/cores": cores,
+        "machine/load": load,
+        "machine/cpu": _processor(),
+        "machine/gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }
+
+
+def peak_memory() -> dict[str, float]:
+    """`memory/peak_mb`: largest resident set of the process so far [MB]; `memory/gpu_peak_mb` with CUDA."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    facts = {"memory/peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6}
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        facts["memory/gpu_peak_mb"] = torch.cuda.max_memory_allocated() / 1e6
+    return facts
+
+
+def synchronise() -> None:
+    """Wait for the accelerator, if one is used."""
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor() or platform.machine()

@@ -1,0 +1,99 @@
+"""What a fit is given (`FitContext`), and what it says of itself (`FitReport`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from gsparc.data.splits import FileSettings, SplitSettings
+from gsparc.training.time_budget import NOTHING, Clock, Spent, TimeBudget
+
+if TYPE_CHECKING:
+    from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
+
+StationModels = Literal["auto", "each", "together"]
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What fitting cost.
+
+    Attributes:
+        seconds: that it took, validations too [s].
+        notes: what a reader must know (early stop, dropped components), one line each.
+        limited_by: the clock whose seconds decided something, so that another machine's result may differ.
+    """
+
+    seconds: float
+    notes: tuple[str, ...] = ()
+    limited_by: Clock | None = None
+
+
+@dataclass(frozen=True)
+class FitContext:
+    """What a run brings along to a fit.
+
+    Attributes:
+        run_dir: where the fit may write; empty: nowhere.
+        seed: of whatever is random and has no seed of its own.
+        budget_s: seconds of training; None: as the method is configured.
+        budget_clock: whether these are of the clock on the `wall` or of the `processor`.
+        stations: of several, whether `each` has a model or all are one's `together`; `auto` as the method's
+            `best_stations` says.
+        split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
+        leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
+        resume: what an interrupted run left, to go on from: a file, or the folder of a run of parts.
+        init_from: a checkpoint of the same model whose weights training starts from.
+        batch_size: rows of a step of gradient training, where no `datamodule` says so.
+        datamodule: the run's `DataModule`, whose loaders gradient training on its measurements goes through.
+        trainer: makes a Lightning Trainer from further options; None: with `DEFAULTS` of `training.fit`.
+        callbacks: makes fresh Lightning callbacks.
+        loggers: made once per run, closed by the caller.
+        config_yaml: the whole configuration, stored in every checkpoint.
+
+    Raises:
+        ValueError: a budget that is no time, an unknown clock or `stations`, or a batch without rows.
+    """
+
+    run_dir: Path = Path()
+    seed: int = 0
+    budget_s: float | None = None
+    budget_clock: Clock = "wall"
+    stations: StationModels = "auto"
+    split: SplitSettings | FileSettings | None = None
+    leave_out: tuple[np.ndarray, ...] = ()
+    resume: Path | None = None
+    init_from: Path | None = None
+    batch_size: int = 16
+    datamodule: DataModule | None = None
+    trainer: partial[Any] | None = None
+    callbacks: Callable[[], Sequence[Any]] = tuple
+    loggers: Sequence[Any] = ()
+    config_yaml: str = ""
+
+    def __post_init__(self) -> None:
+        if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
+            raise ValueError(f"budget_s={self.budget_s!r}: a positive number of seconds is needed, or null")
+        if self.budget_clock not in get_args(Clock):
+            raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
+        if self.stations not in get_args(StationModels):
+            raise ValueError(f"stations={self.stations!r}: one of auto, each, together is needed")
+        if type(self.batch_size) is not int or self.batch_size < 1:
+            raise ValueError(
+                f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
+            )
+
+    def within(self, folder: str, **changes: Any) -> FitContext:
+        """The context of a part of the fit, which may write to a folder of its own in `run_dir`."""
+        return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
+
+    def time_budget(self, seconds: float | None = None, before: Spent = NOTHING) -> TimeBudget:
+        """So many seconds of this context's clock (None: `budget_s`, or no end), some spent before."""
+        seconds = self.budget_s if seconds is None else seconds
+        return TimeBudget(math.inf if seconds is None else seconds, self.budget_clock, before)

@@ -1,0 +1,256 @@
+"""The LightningModule: field, rasterizer and confidence-weighted loss in one training step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn, get_args
+
+import lightning.pytorch as L
+import torch
+from torch import Tensor
+
+from gsparc.data.limits import Checked, choice, number, setting
+from gsparc.data.schema import Batch
+from gsparc.field import edit
+from gsparc.field.confidence import weighted
+from gsparc.field.initial import Snapshot
+from gsparc.field.model import GaussianModel, Rendered
+from gsparc.ops import UnsoundGaussian
+from gsparc.training.conditional import ConditionalField
+from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ssim
+from gsparc.training.optimizer import OptimizerSettings, conditional_optimizer, optimizer_for, scheduler_for
+from gsparc.training.pace import Pace
+from gsparc.training.processes import count
+
+
+@dataclass(frozen=True)
+class LossSettings(Checked):
+    """Task loss.
+
+    Attributes:
+        ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone, as do images
+            smaller than 11 x 11.
+        snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the loss does
+            not look at it.
+    """
+
+    ssim_weight: float = setting(0.2, number(0, 1))
+    snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
+
+
+class NonFiniteLoss(RuntimeError):
+    """Training met a NaN or an infinity; batch and parameters are on disk."""
+
+
+class GaussianModule(L.LightningModule):
+    """Trains a Gaussian field: by rendering, or by the density of left-out rows where weights follow.
+
+    Args:
+        model: what is trained.
+        loss: task loss.
+        optimizer: learning rates.
+        total_steps: length of the schedules.
+        run_dir: where a poisoned batch is left.
+        pace: says how far the schedules are when seconds decide, not steps.
+    """
+
+    def __init__(
+        self, model: GaussianModel | ConditionalField, loss: LossSettings, optimizer: OptimizerSettings,
+        total_steps: int, run_dir: Path, pace: Pace | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.model: Any = model
+        self.loss, self.rates = loss, optimizer
+        self.total_steps, self.run_dir, self.pace = total_steps, run_dir, pace
+        self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
+        self.train_seconds = 0.0  # written by the cost ledger
+        self.solved = False  # whether training starts from emissions in closed form
+        self.log_every = 1  # steps; a figure costs as much as a kernel to log
+        self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
+        self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
+
+    @property
+    def position(self) -> int:
+        """How far the schedule is [steps]."""
+        return self.global_step if self.pace is None else self.pace.step
+
+    @property
+    def conditional(self) -> bool:
+        """Whether weights follow from the rows in closed form."""
+        return isinstance(self.model, ConditionalField)
+
+    def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
+        """Loss per sample (B,) before confidence; what was not measured counts as met."""
+        if self.model.site.kind == "spectrum":
+            if batch.mask is not None:
+                prediction = torch.where(batch.mask, prediction, batch.target)
+            return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
+        return channel_loss(prediction, batch.target, batch.mask, self.loss.snapshot)
+
+    def _render(self, batch: Batch) -> Rendered:
+        try:
+            return self.model(batch.tx, batch.rx)
+        except UnsoundGaussian as refused:  # a NaN, an infinity, or what would overflow to one
+            row = int(self.model.gaussians.ids[refused.index])
+            raise self._stop(batch, int(batch.index[0]), f"Gaussian id {row}: {refused}") from refused
+
+    def training_step(self, batch: Batch, step: int) -> Tensor:
+        """Confidence-weighted loss of a batch."""
+        self.batch = batch
+        if self.conditional:
+            # A variance weighs every error in this density, as the confidence does below.
+            return self._checked(self.model.loss(batch), batch)
+        self.rendered = self._render(batch)
+        task = self.task_loss(self.rendered.mean, batch)
+        confidence = self.model.confidence
+        if confidence is None:
+            loss = task.mean()
+        else:
+            exponent = confidence.exponent(self.model.site.moving(batch.tx, batch.rx))
+            loss = weighted(task, exponent, confidence.settings.alpha).mean()
+        return self._checked(task, batch, loss)
+
+    def _checked(self, task: Tensor, batch: Batch, loss: Tensor | None = None) -> Tensor:
+        """The loss, or the mean of its samples' (B,), logged and known to be finite."""
+        loss = task.mean() if loss is None else loss
+        if not torch.isfinite(loss):
+            bad = ~torch.isfinite(task)
+            raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
+        if (self.global_step + 1) % self.log_every == 0:
+            part = batch.share * count()  # the mean over processes is that over the batch
+            self.log("train/task_loss", task.detach().mean() * part, sync_dist=True)
+            # weighted by the confidence, where there is one
+            self.log("train/loss", loss.detach() * part, sync_dist=True)
+            self.log("model/num_gaussians", float(self.count))
+        return loss * batch.share
+
+    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        """The rates of the step that was taken."""
+        if self.global_step % self.log_every == 0:
+            for group in self.trainer.optimizers[0].param_groups:
+                self.log(f"rate/{group['name']}", group["lr"])
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return self.model.count if self.conditional else len(self.model.gaussians)
+
+    def prepare_validation(self, data: Any) -> None:
+        """Closed-form weights of the training rows with the parameters as they are."""
+        if self.conditional:
+            self.model.condition(data.measurements, data.fold.train)
+
+    def on_validation_epoch_start(self) -> None:
+        """See `prepare_validation`."""
+        self.prepare_validation(self.trainer.datamodule)  # type: ignore[attr-defined]
+
+    def error(self, batch: Batch) -> Tensor:
+        """Squared error of each row (B,): per entry, of powers in decibels."""
+        return squared_error(self._mean(batch), batch, str(self.site.kind))
+
+    @property
+    def site(self) -> Any:
+        """What the data declare."""
+        return self.model.site
+
+    def _mean(self, batch: Batch) -> Tensor:
+        found = self.model(batch.tx, batch.rx) if self.conditional else self._render(batch)
+        return found.mean
+
+    def validation_step(self, batch: Batch, step: int) -> None:
+        """Log validation figures."""
+        mean = self._mean(batch)
+        if batch.mask is not None:
+            mean = torch.where(batch.mask, mean, batch.target)
+        size = len(batch)
+        figures = {"val/error": squared_error(mean, batch, str(self.site.kind)).mean()}
+        error = (mean - batch.target).abs().square().flatten(1).mean(1)
+        if self.site.kind != "spectrum":
+            figures["val/mse"] = error.mean()
+        else:
+            if holds_window(mean):
+                figures["val/ssim_gauss"] = ssim(mean, batch.target).mean()
+            figures["val/psnr_db"] = (-10 * error.clamp_min(1e-12).log10()).mean()
+        self.log_dict(figures, batch_size=size, prog_bar=True)
+        # Dashboards get the seconds beside every figure too.
+        self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
+
+    def predict_step(self, batch: Batch, step: int) -> Tensor:
+        """Targets (B, ...) in stored units, spectra within [0, 1]."""
+        mean = self._mean(batch)
+        return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
+
+    def test_step(self, batch: Batch, step: int) -> None:
+        """Log the squared error of test rows; `gsparc evaluate` has all figures."""
+        self.log("test/error", self.error(batch).mean(), batch_size=len(batch))
+
+    @classmethod
+    def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
+        """A checkpoint of ours holds a whole model: `NotImplementedError` says what reads it."""
+        raise NotImplementedError(
+            "a checkpoint holds a whole model: say gsparc.models.loading.module_of(FILE)"
+        )
+
+    def configure_optimizers(self) -> Any:
+        """One Adam group per tensor, rates as pure functions of the step."""
+        if self.conditional:
+            return conditional_optimizer(self.model)
+        optimizer = optimizer_for(self.model, self.rates)
+        scheduler = scheduler_for(optimizer, self.rates, self.total_steps, self.pace)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:
+        """Make room for the number of Gaussians before their tensors arrive."""
+        if not self.conditional:
+            edit.resize(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
+        return super().load_state_dict(state_dict, *rest, **named)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """A poisoned state never replaces a good checkpoint."""
+        if self._offender() is not None and self.batch is not None:
+            raise self._stop(self.batch, int(self.batch.index[0]))
+
+    def _offender(self) -> str | None:
+        """The first parameter that is not finite, with the id of its Gaussian; None when all are."""
+        rows = {} if self.conditional else edit.row_parameters(self.model, len(self.model.gaussians))
+        for name, parameter in self.model.named_parameters():
+            bad = ~torch.isfinite(parameter)
+            if not bad.any():
+                continue
+            if name not in rows:
+                return name
+            row = int(bad.nonzero()[0, 0])
+            return f"Gaussian id {int(self.model.gaussians.ids[row])}, {name}"
+        return None
+
+    def _stop(self, batch: Batch, sample: int, refused: str | None = None) -> NonFiniteLoss:
+        """Leave batch, parameters and the first offender on disk; the error that says so."""
+        path = self.run_dir / "nonfinite.pt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        offender = self._offender() or refused
+        evidence = {
+            **{"step": self.global_step, "sample": sample, "offender": offender},
+            **{"index": batch.index, "tx": batch.tx, "target": batch.target, "mask": batch.mask},
+            **{"rx_position": batch.rx.position, "rx_rotation": batch.rx.rotation},
+        }
+        torch.save({**evidence, "state_dict": self.model.state_dict()}, path)
+        culprit = f"first offender: {offender}" if offender else "all parameters are finite, see the batch"
+        return NonFiniteLoss(
+            f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; {culprit}); "
+            f"batch and parameters are in {path}"
+        )
+
+
+def squared_error(mean: Tensor, batch: Batch, kind: str) -> Tensor:
+    """Squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
+    target = batch.target
+    if kind == "rssi":
+        error = 10 * (mean.clamp_min(1e-30).log10() - target.clamp_min(1e-30).log10())
+    else:
+        error = (mean - target).abs()
+    square = error.square()
+    if batch.mask is not None:
+        square = torch.where(batch.mask, square, 0)
+    return square.flatten(1).mean(1)

@@ -1,0 +1,185 @@
+"""Array vectors recovered from published spectra: residuals, ambiguities, other normalisations, the cache."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from known_arrays import array_site, measure, room_vectors, spectra, walk
+
+from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.load import load
+from gsparc.data.splits import Fold
+from gsparc.models.array_vectors import splat_init, vector_cache
+from gsparc.models.array_vectors.phase_retrieval import recover
+from gsparc.models.array_vectors.vector_gp import align, mirror_elements, twin
+from gsparc.models.splat.array import ArrayField
+from gsparc.ops import SphereGrid
+from gsparc.training.context import FitContext
+
+
+def _agreement(found, truth, partner):
+    """|<x, y>| of unit vectors, the better of the two twins."""
+    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (found, truth)]
+    direct = np.abs((unit[0].conj() * unit[1]).sum(1))
+    return np.maximum(direct, np.abs((twin(unit[0], partner).conj() * unit[1]).sum(1)))
+
+
+def test_vectors_of_a_traced_room_come_back(known_campaign):
+    data, truth = known_campaign
+    found = recover(data.site, data.target[:60], data.tx[:60])
+    assert (found.residual < found.expected).all() and not found.suspect.any()
+    agreement = _agreement(found.vectors, truth[:60], mirror_elements(data.site.array))
+    assert np.median(agreement) > 0.9999 and (agreement > 0.99).mean() > 0.95
+
+
+def test_spectra_are_redrawn_to_the_bit(known_campaign):
+    data, _ = known_campaign
+    found = recover(data.site, data.target[:30], data.tx[:30])
+    image = spectra(data.site, torch.from_numpy(found.vectors)).numpy()
+    assert np.sqrt(((image - data.target[:30] / 255.0) ** 2).mean()) < 2 / 255
+
+
+def test_a_subtracted_minimum_is_found():
+    site = array_site(SphereGrid.hemisphere(20, 40), planar_array(3, 3), normalisation="minmax")
+    rng = np.random.default_rng(3)
+    truth = rng.normal(size=(12, 9)) + 1j * rng.normal(size=(12, 9))
+    image = spectra(site, torch.from_numpy(truth)).numpy()
+    low, high = image.min((1, 2)), image.max((1, 2))
+    published = (image - low[:, None, None]) / (high - low)[:, None, None]
+    found = recover(site, published.astype(np.float32), rng.normal(size=(12, 3)))
+    agreement = _agreement(found.vectors, truth, mirror_elements(site.array))
+    assert np.median(agreement) > 0.999
+    assert np.median(np.abs(found.offset - low / (high - low))) < 2e-3
+
+
+def test_an_image_that_the_array_cannot_measure_is_suspect(known_campaign):
+    data, _ = known_campaign
+    images = data.target[:8].copy()
+    images[5] = np.random.default_rng(0).integers(0, 256, images[5].shape)
+    found = recover(data.site, images, data.tx[:8], budget_s=0.0)
+    assert np.flatnonzero(found.suspect).tolist() == [5]
+
+
+def test_rows_that_seconds_gave_up_are_known_also_from_the_cache(known_campaign, tmp_path, monkeypatch):
+    """Seconds of the wall gave up rows, the cache kept them, and no report told."""
+    data, _ = known_campaign
+    images = data.target.copy()
+    images[5] = np.random.default_rng(0).integers(0, 256, images[5].shape)
+    spoilt = replace(data, target=images)
+    monkeypatch.setattr(vector_cache, "recover", partial(recover, budget_s=0.0))
+    for cache in (tmp_path, tmp_path):
+        found, _ = vector_cache.recovered(spoilt, np.arange(8), cache)
+        assert np.flatnonzero(found.time_limited).tolist() == [5]
+    monkeypatch.setattr(splat_init, "platform_cache", lambda: None)
+    fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
+    for measured, clock in ((spoilt, "processor"), (data, None)):
+        assert ArrayField().fit(measured, fold, FitContext(tmp_path)).limited_by == clock
+
+
+def test_a_zero_spectrum_gives_a_zero_vector(known_campaign):
+    data, _ = known_campaign
+    images = np.concatenate([data.target[:4], np.zeros_like(data.target[:1])])
+    found = recover(data.site, images, data.tx[:5])
+    assert np.isfinite(found.vectors).all() and np.abs(found.vectors[4]).max() < 1e-2
+
+
+def test_twins_and_phases_agree_along_the_path(known_campaign):
+    data, truth = known_campaign
+    rng = np.random.default_rng(0)
+    partner = mirror_elements(data.site.array)
+    mixed = truth * np.exp(2j * np.pi * rng.random(len(truth)))[:, None]
+    flipped = rng.random(len(truth)) < 0.5
+    mixed[flipped] = twin(mixed[flipped], partner)
+    aligned = align(mixed, data.tx, partner)
+    unit = aligned / np.linalg.norm(aligned, axis=1, keepdims=True)
+    steps = np.abs((unit[1:].conj() * unit[:-1]).sum(1))
+    turns = np.angle((unit[1:].conj() * unit[:-1]).sum(1))
+    assert np.median(steps) > 0.95 and np.median(np.abs(turns)) < 0.2
+
+
+def test_mirror_elements():
+    assert mirror_elements(planar_array()).tolist() == list(range(15, -1, -1))
+    assert mirror_elements(np.array([[0.0, 0, 0], [0.16, 0, 0], [0.48, 0, 0]])) is None
+
+
+def test_only_requested_rows_are_recovered_and_cached(known_campaign, tmp_path, monkeypatch):
+    data, _ = known_campaign
+    asked = []
+    inner = vector_cache.recover
+    monkeypatch.setattr(vector_cache, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
+    first, seconds = vector_cache.recovered(data, np.arange(10), tmp_path)
+    again, later = vector_cache.recovered(data, np.arange(5, 15), tmp_path)
+    assert asked == [10, 5] and seconds.wall > 0 and later.wall > seconds.wall / 2
+    assert seconds.processor > 0 and seconds.processor / 2 < later.processor
+    np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
+    other = replace(data, site=replace(data.site, sha256="another"))
+    vector_cache.recovered(other, np.arange(3), tmp_path)
+    assert asked == [10, 5, 3]
+
+
+def test_an_interrupted_recovery_resumes(known_campaign, tmp_path, monkeypatch):
+    data, _ = known_campaign
+    asked, whole = [], vector_cache.recover
+
+    def interrupted(site, images, places, seed):
+        asked.append(len(places))
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return whole(site, images, places, seed)
+
+    monkeypatch.setattr(vector_cache, "AT_ONCE", 5)
+    monkeypatch.setattr(vector_cache, "recover", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        vector_cache.recovered(data, np.arange(20), tmp_path)
+    found, _ = vector_cache.recovered(data, np.arange(20), tmp_path)
+    assert asked == [5, 5, 5, 5, 5] and len(found.vectors) == 20
+
+
+def test_a_damaged_cache_is_computed_anew(known_campaign, tmp_path, caplog):
+    data, _ = known_campaign
+    vector_cache.recovered(data, np.arange(4), tmp_path)
+    file = next(tmp_path.rglob("*.npz"))
+    file.write_bytes(file.read_bytes()[:100])
+    found, _ = vector_cache.recovered(data, np.arange(4), tmp_path)
+    assert np.isfinite(found.vectors).all() and "computed anew" in caplog.text
+
+
+def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
+    data, _ = known_campaign
+    images = data.target.copy()
+    images[2] = np.random.default_rng(0).integers(0, 256, images[2].shape)
+    broken = replace(data, target=images)
+    rows = np.arange(4)
+    found = recover(data.site, images[rows], data.tx[rows], budget_s=0.0)
+    vector_cache.report(found, broken, rows, tmp_path / "array_recovery.csv")
+    lines = (tmp_path / "array_recovery.csv").read_text().splitlines()
+    assert [line[-1] for line in lines[1:]] == ["0", "0", "1", "0"] and "row 2" in caplog.text
+
+
+def test_real_spectra_are_sixteen_complex_numbers(real_rfid):
+    data = load({"name": "rfid", "root": str(real_rfid)})
+    rows = np.arange(40, 80)
+    found = recover(data.site, data.target[rows], data.tx[rows])
+    assert np.median(found.residual) < 1e-3 and not found.suspect.any()
+
+
+def test_seven_element_path(known_campaign):
+    """A geometry without mirror symmetry has no twins to confuse."""
+    array = np.array([[0.0, 0, 0], [0.16, 0, 0], [0.48, 0, 0], [0, 0.16, 0], [0, 0.4, 0]])
+    site = array_site(SphereGrid.hemisphere(20, 40), array)
+    tx = walk(20)
+    vectors, _ = room_vectors(tx, 1, array)
+    data = measure(site, tx, vectors)
+    found = recover(site, data.target, tx)
+    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (found.vectors, vectors)]
+    assert np.median(np.abs((unit[0].conj() * unit[1]).sum(1))) > 0.999
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_very_few_spectra(known_campaign, rows):
+    data, _ = known_campaign
+    assert np.isfinite(recover(data.site, data.target[:rows], data.tx[:rows]).vectors).all()

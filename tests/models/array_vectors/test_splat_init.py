@@ -1,0 +1,164 @@
+"""The splatted field through an array: the posterior of the array's vectors, and what follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from campaigns import compose
+from contexts import short
+from known_arrays import spectra
+
+from gsparc.data.files import platform_cache
+from gsparc.data.splits import Fold
+from gsparc.field.frozen import seen_by_array
+from gsparc.models import checkpoint
+from gsparc.models.array_vectors import splat_init
+from gsparc.models.array_vectors.cross_validation import tune
+from gsparc.models.array_vectors.vector_cache import recovered
+from gsparc.models.array_vectors.vector_gp import aligned_by, mirror_elements
+from gsparc.models.registry import build
+from gsparc.physics.array_response import steering
+
+COUNT = "model.field.count=64"
+
+
+def _trained(data, fold, folder, *overrides: str, steps: int = 10):
+    method = build(
+        compose("logger=none", "model.effects.array=true", "model.effects.residual=false", *overrides).model
+    )
+    method.fit(data, fold, short(folder, steps, 16, validate_every=steps))
+    return method
+
+
+@pytest.fixture(scope="module")
+def trained(known_campaign, tmp_path_factory):
+    data, _ = known_campaign
+    order = np.random.default_rng(0).permutation(160)
+    fold = Fold(np.sort(order[60:]), order[:0], np.sort(order[:60]))
+    return _trained(data, fold, tmp_path_factory.mktemp("run"), COUNT), data, fold
+
+
+@pytest.fixture(scope="module")
+def process(trained):
+    """Mean and variance of the vector process of the same 100 spectra, at the others."""
+    _, data, fold = trained
+    site, places = data.site, data.tx[fold.train]
+    images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
+    matrix, partner = steering(site.array, site.grid, site.wavelength).numpy(), mirror_elements(site.array)
+    found, _ = recovered(data, fold.train, platform_cache())  # the same solutions
+    kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner).kernel
+    vectors = aligned_by(found.vectors, places, partner, kernel)
+    rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])
+    inverse, cross = np.linalg.inv(kernel.gram(rows).numpy()), kernel.between(queries, rows).numpy()
+    return cross @ inverse @ vectors, 1 - np.einsum("ij,ij->i", cross @ inverse, cross)
+
+
+def test_the_field_is_the_posterior_of_the_vectors(trained, process):
+    method, data, fold = trained
+    model, batch = method.fitted(), data.batch(fold.test)
+    mean, variance = process
+    emitted = torch.view_as_complex(model.features(batch.tx, batch.rx).contiguous()).detach()
+    vectors = (emitted @ seen_by_array(model, batch.rx)).numpy()
+    # One phase is common to all vectors and known to nobody.
+    turn = np.vdot(vectors, mean) / abs(np.vdot(vectors, mean))
+    assert np.linalg.norm(vectors * turn - mean) < 2e-3 * np.linalg.norm(mean)
+    np.testing.assert_allclose(model.unknown(batch.tx, batch.rx).numpy(), variance, atol=1e-4)
+
+
+def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
+    method, data, fold = trained
+    said, batch = method.predict(*_ends(data, fold.test)), data.batch(fold.test)
+    mean, variance = process
+    background = torch.from_numpy(data.targets(fold.train).numpy().mean(0))
+    known = spectra(data.site, torch.from_numpy(mean)).square()
+    wanted = (known + torch.from_numpy(variance)[:, None, None] * background.square()).sqrt().clamp(max=1)
+    torch.testing.assert_close(said.mean.double(), wanted, atol=2e-3, rtol=0)
+    assert (said.mean - batch.target).square().mean() < 0.01 * batch.target.square().mean()
+
+
+def test_far_away_all_is_unknown_and_at_data_little(trained):
+    method, data, fold = trained
+    tx, rx = _ends(data, fold.train)
+    far = method.predict(tx[:10] + torch.tensor([9.0, -8.0, 3.0]), rx)
+    background = method.fitted().response.background
+    torch.testing.assert_close(far.mean, background.expand(10, -1, -1), atol=1e-5, rtol=0)
+    assert (far.confidence == 0).all() and (far.variance == far.variance[0]).all()
+    near = method.predict(tx, rx)
+    assert near.confidence.min() > 0.5 and near.variance.max() < 0.5 * far.variance[0]
+    assert (method.fitted().unknown(tx, rx) < 0.05).all()
+
+
+def test_the_frozen_field_is_the_rasterized_one_and_has_gradients(trained):
+    method, data, fold = trained
+    model, batch = method.fitted(), data.batch(fold.test[:3])
+    live = model(batch.tx, batch.rx)
+    quick = method.predict(batch.tx, batch.rx)
+    torch.testing.assert_close(live.mean.clamp(0, 1), quick.mean, atol=1e-3, rtol=0)
+    (live.mean - batch.target).square().sum().backward()
+    for parameter in (model.gaussians.means, model.gaussians.opacity_logits, model.emission.weight2):
+        assert torch.isfinite(parameter.grad).all() and parameter.grad.abs().sum() > 0
+    model.zero_grad()
+
+
+def test_it_is_stored_and_read_back(trained, tmp_path):
+    method, data, fold = trained
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    again = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model)
+    again.restore(data.site, checkpoint.read(tmp_path / "model.ckpt").state)
+    one, two = (m.predict(*_ends(data, fold.test)) for m in (method, again))
+    for part in ("mean", "confidence", "variance"):
+        assert torch.equal(getattr(one, part), getattr(two, part))
+
+
+def test_steps_are_taken_where_asked_for(known_campaign, tmp_path):
+    data, _ = known_campaign
+    fold = Fold(np.arange(0, 120, 2), np.arange(1, 40, 4), np.arange(121, 160, 2))
+    more = _trained(data, fold, tmp_path, COUNT, "model.keep_best=false", "model.refit=false", steps=6)
+    none = _trained(data, fold, tmp_path, COUNT, "model.steps=0", "model.refit=false")
+    moved = (more.fitted().gaussians.means - none.fitted().gaussians.means).abs().max()
+    assert moved > 1e-4 and more.effects == "array"
+    errors = [
+        (m.predict(*_ends(data, fold.test)).mean - data.targets(fold.test)).square().mean()
+        for m in (more, none)
+    ]
+    assert errors[0] < 2 * errors[1]
+
+
+def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):
+    data, _ = known_campaign
+    fold = Fold(np.arange(40), np.arange(40, 44), np.arange(44, 50))
+    method = _trained(data, fold, tmp_path, "model.field.count=20", "init=sphere", steps=3)
+    assert not method.fitted().tells_unknown
+    said = method.predict(*_ends(data, fold.test))
+    assert (said.mean.flatten(1).amax(1) > 0.999).all() and said.variance is None
+
+
+def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_path):
+    """A field that the receiver does not see emits nothing: all numbers stay finite."""
+    data, _ = known_campaign
+    found = splat_init.learn(data, np.arange(20), 1024, 0, tmp_path)
+    method, _, _ = trained
+    model = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model)
+    model.restore(data.site, method.state())
+    with torch.no_grad():
+        model.fitted().gaussians.opacity_logits.fill_(-40.0)
+    batch = data.batch(np.arange(1))
+    few = replace(found, weights=torch.ones(100, 16, dtype=torch.complex128))
+    splat_init.start(model.fitted(), few, batch.rx)
+    assert torch.isfinite(model.fitted().emission.weight2).all()
+
+
+def test_a_closed_form_that_cannot_be_is_refused(known_campaign, tmp_path):
+    data, _ = known_campaign
+    fold = Fold(np.arange(20), np.arange(20, 24), np.arange(24, 30))
+    for setting in ("emission.hidden=4", "attenuation.inverse_distance=true"):
+        with pytest.raises(ValueError, match=r"asks for networks|solves a linear read-out"):
+            _trained(data, fold, tmp_path, "init=vectors", "model.field.count=20", f"model.{setting}")
+
+
+def _ends(data, rows):
+    batch = data.batch(rows)
+    return batch.tx, batch.rx

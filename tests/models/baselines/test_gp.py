@@ -1,0 +1,118 @@
+"""The Gaussian process against brute force, scikit-learn and the real data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sklearn.decomposition import PCA
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
+from gsparc.data.load import load, split_for
+from gsparc.evaluation.scores import score
+from gsparc.models.baselines.gp import GaussianProcess, choose_kernel, principal_components
+from gsparc.ops import Pose
+from gsparc.processes.density import LeftOutDensity
+from gsparc.processes.kernel import Kernel
+from gsparc.training.context import FitContext
+
+
+def test_chosen_kernel_is_a_minimum(campaign):
+    data = campaign("spectrum", 40)
+    scores = torch.from_numpy(principal_components(data.target, "spectrum", 512).scores)
+    kernel, places = choose_kernel(data.moving, scores.numpy(), 288), torch.from_numpy(data.moving)
+    at = {
+        step: LeftOutDensity.apply(
+            Kernel.of_one(kernel.length * step, kernel.noise).gram(places), scores, 288, False
+        )[0]
+        for step in (0.8, 1.0, 1.25)
+    }
+    assert at[1.0] == min(at.values())
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
+def test_components_are_the_principal_ones(campaign, kind):
+    target = campaign(kind, 20).target
+    parts = principal_components(target, kind, limit=3, block=5)
+    whole = principal_components(target, kind, limit=512)
+    rows = whole.mean + whole.scores @ whole.axes
+    reference = PCA(n_components=parts.scores.shape[1], svd_solver="full").fit(rows)
+    assert np.allclose(parts.axes @ parts.axes.T, np.eye(len(parts.axes)), atol=1e-5)
+    kept = (parts.scores**2).sum(0)
+    assert np.allclose(np.sort(kept), np.sort(reference.explained_variance_ * 19), rtol=1e-4)
+    left = ((rows - reference.inverse_transform(reference.transform(rows))) ** 2).mean()
+    assert parts.lost == pytest.approx(left, rel=1e-3, abs=1e-9)
+    assert whole.lost == pytest.approx(0, abs=1e-9)
+
+
+def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
+    data, fold = campaign("csi", 40), folds(40).folds[0]
+    gp = GaussianProcess()
+    gp.fit(data, fold, FitContext(tmp_path))
+    rows = np.concatenate([fold.train, fold.val])
+    k = gp.scores.prior.kernel
+    target = data.target[rows].reshape(len(rows), -1).view(np.float32)
+    shape = ConstantKernel(k.amplitude) * Matern(k.length, nu=1.5) + WhiteKernel(k.amplitude * k.noise)
+    library = GaussianProcessRegressor(shape, optimizer=None, alpha=0).fit(
+        data.moving[rows], target - target.mean(0)
+    )
+    mean, deviation = library.predict(data.moving[fold.test], return_std=True)
+    batch = data.batch(fold.test)
+    found = gp.predict(batch.tx, batch.rx)
+    expected = torch.from_numpy(mean + target.mean(0)).float().view(-1, 4, 3, 2)
+    assert torch.allclose(torch.view_as_real(found.mean), expected, atol=1e-4)
+    # A complex entry holds two real numbers.
+    assert torch.allclose(found.variance, torch.from_numpy(2 * deviation[:, 0] ** 2).float(), rtol=1e-3)
+
+
+def test_it_knows_what_it_does_not_know(campaign, folds, tmp_path):
+    data, fold = campaign("spectrum", 120), folds(120).folds[0]
+    gp = GaussianProcess()
+    gp.fit(data, fold, FitContext(tmp_path))
+    batch = data.batch(fold.test)
+    near, far = gp.predict(batch.tx, batch.rx), gp.predict(batch.tx + 1000.0, batch.rx)
+    assert near.confidence.min() > far.confidence.max() and far.confidence.max() < 1e-6
+    assert near.confidence.max() <= 1
+    ratio = float(((near.mean - batch.target) ** 2).mean() / near.variance.mean())
+    assert 0.3 < ratio < 3
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_hardly_any_samples(campaign, folds, tmp_path, rows):
+    data = campaign("spectrum", 8)
+    fold = folds(8).folds[0]
+    few = type(fold)(fold.train[:rows], fold.val[:0], fold.test)
+    gp = GaussianProcess()
+    gp.fit(data, few, FitContext(tmp_path))
+    prediction = gp.predict(*(lambda b: (b.tx, b.rx))(data.batch(fold.test)))
+    assert torch.isfinite(prediction.mean).all() and torch.isfinite(prediction.variance).all()
+
+
+def test_equal_samples_at_one_place(campaign, folds, tmp_path):
+    data = campaign("spectrum", 12)
+    data.tx[:] = data.tx[0]
+    data.target[:] = data.target[0]
+    gp = GaussianProcess()
+    gp.fit(data, folds(12).folds[0], FitContext(tmp_path))
+    found = gp.predict(torch.zeros(2, 3), Pose(torch.zeros(3), torch.eye(3))).mean
+    assert torch.allclose(found, data.targets(np.array([0, 0])), atol=1e-5)
+
+
+def test_few_components_say_so(campaign, folds, tmp_path):
+    data, fold = campaign("spectrum", 48), folds(48).folds[0]
+    gp = GaussianProcess(components=4)
+    notes = gp.fit(data, fold, FitContext(tmp_path)).notes
+    assert any("4 components" in note for note in notes) and gp.axes.shape[0] == 4
+    with pytest.raises(ValueError, match="components"):
+        GaussianProcess(components=0)
+
+
+def test_figures_on_the_real_subset(real_rfid, tmp_path):
+    data = load({"name": "rfid", "root": str(real_rfid)})
+    split = split_for({"name": "random"}, data)
+    gp = GaussianProcess()
+    gp.fit(data, split.folds[0], FitContext(tmp_path))
+    figures = score([gp], data, split).figures()
+    assert figures["ssim_gauss"] == pytest.approx(0.927, abs=0.002)
+    assert figures["psnr_db"] == pytest.approx(28.9, abs=0.2)

@@ -1,0 +1,151 @@
+"""The simple baselines, and what all of them share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.baselines import kriging
+from gsparc.models.baselines.idw import InverseDistance
+from gsparc.models.registry import method_class
+from gsparc.models.target_rows import from_real, to_real
+from gsparc.training.context import FitContext
+
+NAMES = ("zero", "mean", "nearest", "idw", "gp")
+
+
+def fitted(name, data, fold, tmp_path):
+    method = method_class(name)()
+    method.fit(data, fold, FitContext(tmp_path))
+    return method
+
+
+@pytest.mark.parametrize("static_end", ["rx", "tx"])
+@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
+@pytest.mark.parametrize("name", NAMES)
+def test_every_baseline_serves_every_kind(campaign, folds, tmp_path, name, kind, static_end):
+    data, fold = campaign(kind, 30, static_end), folds(30).folds[0]
+    method = fitted(name, data, fold, tmp_path)
+    batch = data.batch(fold.test)
+    found = method.predict(batch.tx, batch.rx)
+    assert found.mean.shape == batch.target.shape and found.mean.dtype == batch.target.dtype
+    again = method_class(name)()
+    again.restore(data.site, method.state())
+    assert torch.equal(again.predict(batch.tx, batch.rx).mean, found.mean)
+    assert again.size() == len(fold.train) + len(fold.val)
+    for value in (found.confidence, found.variance):
+        assert value is None or (value.shape == (len(batch),) and (value >= 0).all())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_test_row_is_looked_at(campaign, folds, tmp_path, name):
+    data, fold = campaign("csi", 30), folds(30).folds[0]
+    batch = data.batch(fold.test)
+    clean = fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean
+    data.target[fold.test] = np.nan
+    assert torch.equal(fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean, clean)
+
+
+@pytest.mark.parametrize("name", ["mean", "nearest", "idw", "gp"])
+def test_validation_rows_are_learned_from(campaign, folds, tmp_path, name):
+    data, fold = campaign("csi", 30), folds(30).folds[0]
+    batch = data.batch(fold.val)
+    before = fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean
+    data.target[fold.val] += 10
+    assert not torch.allclose(fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean, before)
+
+
+@pytest.mark.parametrize("name", ["nearest", "idw"])
+def test_a_sample_is_repeated_at_its_own_place(campaign, folds, tmp_path, name):
+    data, fold = campaign("spectrum", 30), folds(30).folds[0]
+    batch = data.batch(fold.train)
+    found = fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx)
+    assert torch.allclose(found.mean, batch.target, atol=1e-4)
+    assert found.confidence.min() > 0.999
+
+
+def test_idw_weighs_by_inverse_squared_distance(campaign, folds, tmp_path):
+    data = campaign("rssi", 3)
+    data.tx[:] = [[0, 0, 0], [3, 0, 0], [100, 0, 0]]
+    fold = type(folds(8).folds[0])(np.arange(3), np.arange(0), np.arange(0))
+    method = InverseDistance(neighbours=2)
+    method.fit(data, fold, FitContext(tmp_path))
+    found = method.predict(torch.tensor([[1.0, 0, 0]]), data.batch(np.arange(1)).rx).mean
+    decibels = 10 * np.log10(data.target[:2, 0])
+    assert 10 * torch.log10(found)[0, 0] == pytest.approx((4 * decibels[0] + decibels[1]) / 5, rel=1e-4)
+    with pytest.raises(ValueError, match="neighbours"):
+        InverseDistance(neighbours=0)
+
+
+def test_mean_is_the_mean(campaign, folds, tmp_path):
+    data, fold = campaign("spectrum", 30), folds(30).folds[0]
+    rows = np.concatenate([fold.train, fold.val])
+    batch = data.batch(fold.test)
+    found = fitted("mean", data, fold, tmp_path).predict(batch.tx, batch.rx).mean
+    assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6) and torch.equal(
+        found[0], found[-1]
+    )
+
+
+@pytest.mark.parametrize("name", ["mean", "nearest", "idw", "gp"])
+def test_entries_never_measured_do_not_leak(campaign, folds, tmp_path, name):
+    data, fold = campaign("csi", 30), folds(30).folds[0]
+    mask = np.random.default_rng(0).random(data.target.shape) > 0.3
+    results = []
+    for rubbish in (0.0, 1e6):
+        target = np.where(mask, data.target, np.complex64(rubbish))
+        masked = Measurements(data.site, data.tx, data.rx_position, data.rx_rotation, target, mask=mask)
+        batch = masked.batch(fold.test)
+        results.append(fitted(name, masked, fold, tmp_path).predict(batch.tx, batch.rx).mean)
+    assert torch.equal(*results)
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
+def test_encoding_is_undone(campaign, kind):
+    data = campaign(kind, 5)
+    rows = torch.from_numpy(to_real(data.target, kind))
+    assert torch.allclose(from_real(rows, kind, data.target.shape[1:]), data.targets(np.arange(5)), rtol=1e-5)
+
+
+def test_asking_before_fitting_is_an_error():
+    with pytest.raises(ValueError, match="fit or restore"):
+        method_class("gp")().predict(torch.zeros(1, 3), None)
+
+
+def test_kriging_lends_its_pivots_to_no_one(campaign, folds, tmp_path, monkeypatch):
+    """SciPy counts them from 1 in place while it solves: two threads wrote beside the matrix."""
+    data = campaign("rssi")
+    method = fitted("kriging", data, folds(len(data)).folds[0], tmp_path)
+    seen = []
+    solve = kriging.lu_solve
+    monkeypatch.setattr(kriging, "lu_solve", lambda pair, right: seen.append(pair[1]) or solve(pair, right))
+    method.answer(data.batch(np.arange(3)))
+    assert len(seen) == 1 and not np.shares_memory(seen[0], method.system[1])
+
+
+def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
+    """50,000 rows were a matrix of 20 GB for a baseline that every run of powers fits."""
+    monkeypatch.setattr(kriging, "WHOLE", 30)
+    monkeypatch.setattr(kriging, "NEAREST", 20)
+    places = np.random.default_rng(0).uniform(0, 9, (80, 3))
+    data = from_arrays({"rx_position": places, "tx_position": np.zeros(3), "rssi_db": -40 - places[:, 0]})
+    method = kriging.Kriging()
+    report = method.fit(data, Fold(np.arange(60), np.arange(60, 70), np.arange(70, 80)), FitContext(tmp_path))
+    assert method.system is None and "of 70 places each query's nearest 20" in report.notes[0]
+    error = 10 * torch.log10(method.answer(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[:, 0]
+    assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
+
+
+def test_runs_were_taken_as_one_without_a_word(campaign, folds, tmp_path):
+    data = campaign("csi")
+    fold = folds(len(data)).folds[0]
+    several = replace(data, run=np.arange(len(data)) % 2)
+    said = [InverseDistance().fit(d, fold, FitContext(tmp_path)).notes for d in (several, data)]
+    assert any("channels of 2 runs" in note for note in said[0])
+    assert not any("runs" in note for note in said[1])

@@ -1,0 +1,177 @@
+"""Mirror planes that several static ends share: found by all, and of use to one that was never heard."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from rooms import WAVELENGTH, nmse
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import SplitSettings, make_split
+from gsparc.models.channels.columns import gather
+from gsparc.models.channels.covariance import Shape, Values, diffuse_fields, disturbance, mirrored, specular
+from gsparc.models.channels.evidence import compressed, normalised
+from gsparc.models.channels.field import ChannelField, restored
+from gsparc.models.channels.initial import initialise
+from gsparc.models.channels.mirrors import find_mirrors
+from gsparc.models.channels.probe import Probe
+from gsparc.models.channels.settings import ChannelSettings
+from gsparc.ops import Pose
+from gsparc.physics.mirror_planes import reflect
+from gsparc.simulate.shoebox import Room, images
+
+K = 2 * np.pi / WAVELENGTH
+WALL = np.array([np.cos(0.3), np.sin(0.3), 0.0, 2.1])  # no axis of the room
+
+
+def _channels(ends, places, walls, *, turned=0.0, noise=0.03, seed=0):
+    """Direct waves and images in walls (W, 4), each with a loss of 4 dB."""
+    rng = np.random.default_rng(seed)
+    channel = np.zeros((len(places), len(ends)), complex)
+    for number, end in enumerate(ends):
+        for wall, gain in ((None, 1.0), *((wall, -0.63) for wall in walls)):
+            at = end if wall is None else reflect(torch.from_numpy(end), torch.from_numpy(wall)).numpy()
+            away = np.linalg.norm(places - at, axis=1)
+            channel[:, number] += gain * np.exp(-1j * K * away) / away
+        channel[:, number] *= np.exp(1j * turned * rng.standard_normal())
+    size = np.sqrt((np.abs(channel) ** 2).mean())
+    return channel + noise * size * (rng.standard_normal((*channel.shape, 2)) @ [1, 1j])
+
+
+def _site(walls, *, ends=5, count=70, side=0.5, **rest):
+    rng = np.random.default_rng(3)
+    end = np.c_[rng.uniform(-1, 1.2, (ends, 2)), rng.uniform(1.0, 1.8, ends)]
+    place = np.c_[rng.uniform(0, side, (count, 2)), rng.uniform(0.3, 0.5, count)]
+    return end, place, _channels(end, place, walls, **rest)
+
+
+def _data(end, place, channel):
+    return from_arrays(
+        {
+            "tx_position": place,
+            "station_position": end,
+            "csi": channel,
+            "carrier_hz": np.array(299792458.0 / WAVELENGTH),
+            "frequency_hz": np.array([299792458.0 / WAVELENGTH]),
+        }
+    )
+
+
+def _bare(data):
+    """Groups, shape and values of a direct wave in a diffuse field."""
+    groups = tuple(normalised(group) for group in gather(data, np.arange(len(data)), True))
+    none, middle = torch.zeros(0, 3, dtype=torch.float64), torch.from_numpy(data.moving).mean(0)
+    shape = Shape(none, 8.0, False, True, False, middle, 20.0)
+    power = torch.tensor([0.3, 0.5, 0.02, 0.01], dtype=torch.float64)
+    lengths = torch.tensor([2.0, 0.8], dtype=torch.float64)
+    return groups, shape, Values(power, lengths[0], lengths[1], torch.zeros(3).double())
+
+
+def _covariance(group, shape, values):
+    fields = diffuse_fields((group,), shape, values)[0]
+    return (
+        fields
+        + specular(shape, values, group.slot, group.places, group.places)
+        + disturbance(shape, values, group)
+    )
+
+
+def test_a_probe_gains_what_the_likelihood_rises():
+    groups, shape, values = _bare(_data(*_site([WALL], ends=1)))
+    group, level = groups[0], 0.2
+    probe, covariance = (
+        Probe.of(compressed(groups, shape, values)[0], values.power),
+        _covariance(group, shape, values),
+    )
+    waves = torch.randn(2, len(group), dtype=torch.complex128, generator=torch.manual_seed(0))
+    for _ in range(2):  # alone, then beside the first
+        for wave, gain in zip(waves, probe.gain(waves, level), strict=True):
+            more = covariance + level * wave[:, None] * wave.conj()[None]
+            fits = [
+                (group.target.mH @ torch.linalg.solve(c, group.target)).real.sum() for c in (covariance, more)
+            ]
+            sizes = [torch.linalg.slogdet(c)[1] for c in (covariance, more)]
+            rise = (fits[0] - fits[1]) / probe.scale + sizes[0] - sizes[1]
+            torch.testing.assert_close(gain, rise, rtol=1e-4, atol=1e-3)
+        covariance = covariance + level * waves[0][:, None] * waves[0].conj()[None]
+        probe = probe.added(waves[0], level)
+
+
+def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
+    data = _data(*_site([WALL], ends=5, count=60, side=0.7, turned=2.0))
+    groups, shape, values = _bare(data)
+    parts = compressed(groups, shape, values)
+    planes, _ = find_mirrors(parts, parts, shape, values, WAVELENGTH, 1)
+    plane = planes[0].numpy() * np.sign(planes[0, 0].item())
+    assert np.arccos(plane[:3] @ WALL[:3]) < 0.05
+    assert plane[3] + plane[:3] @ data.site.origin == pytest.approx(WALL[3], abs=0.05)
+
+
+def test_no_wall_is_kept_where_there_is_none():
+    data = _data(*_site([], ends=4, count=50, side=0.4, turned=2.0))
+    field, _ = initialise(data, np.arange(len(data)), ChannelSettings(mirrors=2, directions=False))
+    assert field.shape.sequences == () and not len(field.objects().planes)
+
+
+def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
+    plane = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 3.0]], dtype=torch.float64)
+    end, middle = torch.tensor([1.0, 0, 0]).double(), torch.zeros(3).double()
+    assert mirrored(plane, ((0,), (1,), (1, 0)), end, middle).tolist() == [0.0, 1.0, 0.0]
+
+
+def test_planes_outlive_storing():
+    data = _data(*_site([WALL], count=40))
+    _, shape, values = _bare(data)
+    shape = replace(shape, sequences=((0,),))
+    wall = torch.from_numpy(WALL - np.r_[0, 0, 0, WALL[:3] @ data.site.origin])[None]
+    power = torch.tensor([0.1, 0.5, 0.02, 0.3, 0.01, 0.01], dtype=torch.float64)
+    field = ChannelField(data.site, shape, replace(values, power=power, planes=wall), (1, 1))
+    field.condition(data, np.arange(len(data)))
+    batch = data.batch(np.arange(9))
+    again = restored(data.site, field.state())
+    torch.testing.assert_close(again.answer(batch).mean, field.answer(batch).mean)
+    np.testing.assert_allclose(again.objects().planes, wall.numpy())
+    assert "mirrors" in again.terms
+
+
+@pytest.mark.slow
+def test_walls_of_a_room_are_found_together_and_serve_an_antenna_never_heard():
+    rng, size, carrier = np.random.default_rng(0), (6.0, 4.0, 2.6), 920e6
+    wavenumber = 2 * np.pi * carrier / 299792458.0
+    place = np.c_[rng.uniform(1.5, 4.5, 150), rng.uniform(1, 3, 150), rng.uniform(0.8, 1.1, 150)]
+    end = np.c_[rng.uniform(0.4, 5.6, 15), rng.uniform(0.4, 3.6, 15), np.full(15, 2.3)]
+    mirror = images(Room.uniform(size, -0.6), 2)
+    away = np.linalg.norm(place[:, None, None] - mirror.of(end)[None], axis=-1)
+    channel = (np.exp(-1j * wavenumber * away) / away) @ mirror.gain
+    heard = np.arange(12)
+    data = from_arrays(
+        {
+            "tx_position": place,
+            "station_position": end[heard],
+            "csi": channel[:, heard],
+            "carrier_hz": np.array(carrier),
+            "frequency_hz": np.array([carrier]),
+        }
+    )
+    fold = make_split(data.moving, SplitSettings(name="random"), place=data.place).folds[0]
+    rows, batch = np.concatenate([fold.train, fold.val]), data.batch(fold.test)
+    errors, unheard = [], []
+    for mirrors in (0, 8):
+        field, _ = initialise(data, rows, ChannelSettings(mirrors=mirrors))
+        with torch.no_grad():
+            errors.append(nmse(field.answer(batch).mean.numpy(), batch.target.numpy()))
+            own = []
+            for number in (12, 13, 14):
+                where = torch.from_numpy(end[number] - data.site.origin).expand(len(place), 3)
+                turned = torch.eye(3).expand(len(place), 3, 3)
+                moving = torch.from_numpy(place - data.site.origin)
+                told_of = field(moving, Pose(where, turned)).mean.reshape(-1).numpy()
+                true = channel[:, number]
+                scale = np.vdot(told_of, true) / np.vdot(told_of, told_of).real
+                own.append(nmse(scale * told_of, true))
+            unheard.append(np.mean(own))
+    assert errors[1] < 0.5 * errors[0]
+    assert unheard[1] < 0.5 * unheard[0]
+    offsets = np.sort(np.abs(field.objects().planes[:, 3]))
+    assert len(offsets) >= 4

@@ -1,0 +1,224 @@
+"""Channels of several static ends in one field."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rooms import WAVELENGTH, nmse
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.models.channels.complex_gp import ComplexGP
+from gsparc.models.channels.covariance import Shape, Values, diffuse_of, directional, prior, ways
+from gsparc.models.channels.field import ChannelField, restored
+from gsparc.models.channels.initial import initialise
+from gsparc.models.channels.kernels import sphere
+from gsparc.models.channels.settings import ChannelSettings
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.per_station import for_links
+from gsparc.models.terms import EffectSettings
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.conditional import learns
+from gsparc.training.context import FitContext
+
+K = 2 * np.pi / WAVELENGTH
+QUICK = ChannelSettings(tied=12, narrow=5.0, knots=4, angles=8, rows=60)
+
+
+def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), runs=None):
+    """A transmitter in a flat patch, antennas above it: direct wave, leakage, waves mostly from the ends."""
+    rng = np.random.default_rng(seed)
+    place = np.c_[rng.uniform(0, 0.7, (count, 2)), np.full(count, 0.2)]
+    end = np.c_[rng.uniform(-1, 2, (ends, 2)), np.full(ends, 1.8)]
+    waves, channel = sphere(150).numpy(), np.empty((count, ends), complex)
+    for number, true in enumerate(end + shift):
+        away = np.linalg.norm(place - true, axis=1)
+        towards = (true - place.mean(0)) / np.linalg.norm(true - place.mean(0))
+        gains = rng.standard_normal((150, 2)) @ [1, 1j] * np.exp(2 * waves @ towards) / 60
+        h = np.exp(-1j * K * away) / away + np.exp(1j * K * place @ waves.T) @ gains
+        gain = np.exp(1j * turned * rng.standard_normal()) * rng.uniform(0.5, 2)
+        channel[:, number] = gain * (h + 0.3 * np.exp(2j * np.pi * rng.random()))
+    channel += 0.05 * (rng.standard_normal((count, ends, 2)) @ [1, 1j])
+    if runs is not None:
+        channel[runs == 1] *= np.exp(0.9j)
+    arrays = {"tx_position": place, "station_position": end, "csi": channel, "carrier_hz": np.array(2.4e9)}
+    run = {} if runs is None else {"run": runs}
+    return from_arrays({**arrays, **run, "frequency_hz": np.array([2.4e9])})
+
+
+def _fold(data):
+    return make_split(data.moving, SplitSettings(name="random"), place=data.place).folds[0]
+
+
+def _known(fold):
+    return np.concatenate([fold.train, fold.val])
+
+
+def _tied(data, rows):
+    middle = torch.from_numpy(data.moving).mean(0)
+    angles = sphere(16)[:8]
+    shape = Shape(angles, 5.0, True, True, False, middle, 20.0)
+    power = torch.rand(len(shape.names), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
+    lengths = torch.tensor([0.6, 0.4], dtype=torch.float64)
+    tilt = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
+    values = Values(power, lengths[0], lengths[1], torch.tensor([0.01, -0.02, 0.0]).double(), tilt)
+    field = ChannelField(data.site, shape, values, (1, 1))
+    field.condition(data, rows)
+    return field
+
+
+def test_knots_add_up_and_mirrored_directions_count_alike():
+    middle = torch.zeros(3, dtype=torch.float64)
+    half = sphere(800)
+    half = half[half[:, 2] > 0]
+    shape = Shape(half, 8.0, False, False, False, middle, 10.0)
+    ends = torch.tensor([[1.0, 0.5, 2.0], [1.0, 0.5, -2.0]], dtype=torch.float64)
+    found = ways(shape, ends, 5)
+    torch.testing.assert_close(found.sum(-1), torch.ones(2, len(half)).double())
+    torch.testing.assert_close(found[0], found[1], atol=0.05, rtol=0)
+
+
+def test_each_end_has_the_covariance_of_its_own_powers():
+    data = _ceiling()
+    field = _tied(data, np.arange(len(data)))
+    shape, values, slots = field.shape, field._held, [one.group.slot for one in field.weights]
+    places = field.weights[0].group.places[:10]
+    powers = directional(shape, values, slots)
+    together = diffuse_of(shape, values, K, powers, places, places)
+    for number in (0, 3):
+        alone = diffuse_of(shape, values, K, powers[number : number + 1], places, places)[0]
+        torch.testing.assert_close(together[number], alone)
+        level = prior(replace(shape, direct=False, constant=False), values, slots[number], places)
+        torch.testing.assert_close(alone.diagonal().real, level)
+    assert not torch.allclose(powers[0], powers[1])
+
+
+def test_one_field_of_all_ends_is_better_than_plain_processes():
+    data = _ceiling(shift=(0.03, -0.02, 0.0))
+    fold = _fold(data)
+    field, notes = initialise(data, _known(fold), QUICK)
+    assert len(field.stations) == 6 and any("angles to ends" in note for note in notes)
+    assert not learns(field)  # the likelihood of all rows has found its parameters
+    batch, plain = data.batch(fold.test), for_links(ComplexGP, data)
+    plain.fit(data, fold, FitContext())
+    with torch.no_grad():
+        own = nmse(field.answer(batch).mean.numpy(), batch.target.numpy())
+    assert own < 0.7 * nmse(plain.answer(batch).mean.numpy(), batch.target.numpy())
+
+
+def test_an_end_that_was_never_heard_has_the_direct_wave():
+    data = _ceiling(ends=9, turned=0.2)
+    known, left = np.flatnonzero(data.station < 7), np.flatnonzero(data.station >= 7)
+    field, _ = initialise(data, known, QUICK)
+    batch, same = data.batch(left), data.batch(known)
+    with torch.no_grad():
+        found = field.answer(batch)
+        of_places = field(batch.tx, batch.rx)
+        torch.testing.assert_close(of_places.mean, found.mean)
+        heard = field.answer(same)
+    missed = (found.mean - batch.target).abs().square().mean()
+    assert missed < 0.9 * batch.target.abs().square().mean()
+    assert 0.2 < float(missed / found.variance.mean()) < 4
+    assert found.unknown.mean() > 3 * heard.unknown.mean()
+
+
+def test_phases_that_nothing_tells_leave_little_to_say_of_an_end():
+    data = _ceiling(ends=9, turned=30.0)
+    field, _ = initialise(data, np.flatnonzero(data.station < 7), QUICK)
+    batch = data.batch(np.flatnonzero(data.station >= 7))
+    with torch.no_grad():
+        found = field.answer(batch)
+    assert found.unknown.mean() > 0.7
+    mean, target = found.mean.flatten().to(torch.complex128), batch.target.flatten().to(torch.complex128)
+    one = batch.station == 7
+    overlap = torch.vdot(mean[one], target[one]).abs() / (mean[one].norm() * target[one].norm())
+    assert overlap > 0.3  # its shape is right
+
+
+def test_runs_of_all_ends_differ_by_one_phase():
+    runs = np.arange(80) % 2
+    data = _ceiling(runs=runs)
+    fold = _fold(data)
+    field, _ = initialise(data, _known(fold), QUICK)
+    found = field.runs.factors[1] / field.runs.factors[0]
+    torch.testing.assert_close(found.abs(), torch.ones(()).double())
+    assert abs(abs(float(found.angle())) - 0.9) < 0.1
+    batch = data.batch(fold.test)
+    with torch.no_grad():
+        right, turned = field.answer(batch).mean, field(batch.tx, batch.rx, batch.station).mean
+    target = batch.target.numpy()
+    assert nmse(right.numpy(), target) < 0.5 * nmse(turned.numpy(), target)
+
+
+def test_there_and_back_with_angles_to_ends(tmp_path):
+    data = _ceiling()
+    field = _tied(data, np.arange(300))
+    torch.save(field.state(), tmp_path / "state.pt")
+    again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    batch = data.batch(np.arange(300, 400))
+    with torch.no_grad():
+        before, after = field.answer(batch), again.answer(batch)
+    torch.testing.assert_close(after.mean, before.mean)
+    torch.testing.assert_close(after.variance, before.variance)
+
+
+def test_stations_together_are_asked_for_any_pair():
+    data = _ceiling(ends=4, count=50)
+    rows = np.flatnonzero(data.station < 3)
+    method = for_links(Gsparc, data)
+    method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
+    again = for_links(Gsparc, data)
+    again.restore(data.site, method.state())
+    places = data.site.stations.position + data.site.origin
+    here = np.array([0.3, 0.3, 0.2])
+    for one in (method, again):
+        asked = Predictor(one, data.site)
+        own = asked.csi(tx=here, rx=places[1])
+        np.testing.assert_allclose(asked.at(1).csi(tx=here), own, rtol=1e-5)
+        elsewhere = asked.predict(tx=here[None].repeat(2, 0), rx=places[[1, 3]])
+        assert elsewhere.confidence[0] > elsewhere.confidence[1] + 0.2
+    batch = data.batch(rows[:40])
+    torch.testing.assert_close(again.answer(batch).mean, method.answer(batch).mean)
+
+
+def test_methods_of_one_end_are_refused_as_before():
+    data = _ceiling(ends=3, count=30)
+    rows = np.arange(len(data))
+    with pytest.raises(ValueError, match="stations=each"):
+        for_links(ImageSourceGP, data).fit(
+            data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together")
+        )
+
+
+CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")
+def test_measured_ceiling_in_squares():
+    from gsparc.data.modules.techtile import Techtile
+
+    data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
+    split = make_split(data.moving, SplitSettings(name="blocks", side_m=0.6), place=data.place)
+    fold = split.folds[0]
+    field, _ = initialise(data, _known(fold), ChannelSettings())
+    plain, batch = for_links(ComplexGP, data), data.batch(fold.test)
+    plain.fit(data, fold, FitContext())
+    with torch.no_grad():
+        own = nmse(field.answer(batch).mean.numpy(), batch.target.numpy())
+    assert own < 0.55 * nmse(plain.answer(batch).mean.numpy(), batch.target.numpy())
+
+
+@pytest.mark.slow
+def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
+    """Rows of a later station carry its number, of which a site of one end knew nothing."""
+    data = _ceiling(ends=2, count=30)
+    fold = _fold(data)
+    method = for_links(lambda: Gsparc(EffectSettings(phase=False)), data)
+    method.fit(data, fold, FitContext(stations="each"))
+    batch = data.batch(fold.test)
+    by_place, by_row = method.predict(batch.tx, batch.rx), method.answer(batch)
+    torch.testing.assert_close(by_place.mean, by_row.mean)

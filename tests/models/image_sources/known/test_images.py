@@ -1,0 +1,71 @@
+"""Images in known walls against those of the simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from rooms import PILLAR, shoebox
+
+from gsparc.data.walls import SceneWalls, box_faces
+from gsparc.models.image_sources.clutter.blocking import visible_share
+from gsparc.models.image_sources.clutter.unfold import Unfolding
+from gsparc.models.image_sources.known.images import affordable, hiding, start_amplitudes, visible_sequences
+from gsparc.models.image_sources.known.mirrors import Mirrors
+from gsparc.physics.mirror_planes import images
+
+ROOM = SceneWalls(tuple(box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5]))), PILLAR)
+
+
+def scene(order: int, most: int = 200, walls: SceneWalls = ROOM, hidden: bool = True):
+    told, _, _ = shoebox(80, pillar=True, max_order=order)
+    mirrors = Mirrors.of(walls, np.zeros(3))
+    transmitter, places = torch.from_numpy(told.tx[0]), torch.from_numpy(told.rx)
+    indices = mirrors.mirroring(0.25)
+    return told, mirrors, visible_sequences(mirrors, indices, transmitter, places, order, most, hidden)
+
+
+def test_all_images_are_the_simulators_and_as_visible():
+    told, mirrors, sequences = scene(3)
+    transmitter = torch.from_numpy(told.tx[0])
+    found, true = images(transmitter, mirrors.planes, sequences).numpy(), told.images.of(told.tx[0])
+    apart = np.linalg.norm(found[:, None] - true[None], axis=-1)
+    assert sequences[0] == () and (apart.min(1) < 1e-6).all() and len(set(apart.argmin(1))) == len(sequences)
+    assert (
+        np.abs(told.visible.mean(0)[np.setdiff1d(np.arange(len(true)), apart.argmin(1))]).max(initial=0)
+        < 0.05
+    )
+    paths = Unfolding.of(transmitter, mirrors.planes, sequences).paths(torch.from_numpy(told.rx))
+    seen = visible_share(paths, mirrors.clutter, mirrors.planes) > 0.5
+    assert (seen.numpy() == told.visible[:, apart.argmin(1)].T).mean() > 0.97
+
+
+def test_the_strongest_are_kept_and_come_first():
+    _, _, few = scene(2, most=8)
+    assert len(few) == 8 and few[0] == () and all(len(sequence) == 1 for sequence in few[1:5])
+    assert scene(2, most=1)[2] == ((),)
+
+
+def test_a_wall_that_reflects_to_nobody_has_no_image_but_hides():
+    """A small plate beside the transmitter: its shadow falls on receivers, its reflections do not."""
+    told, _, _ = shoebox(80, max_order=1)
+    plate = told.tx[0] + np.array([[0.3, -1, -1], [0.3, 1, -1], [0.3, 1, 1], [0.3, -1, 1.0]])
+    walls = SceneWalls((plate,), PILLAR[:0])
+    mirrors = Mirrors.of(walls, np.zeros(3))
+    far = torch.from_numpy(told.rx[told.rx[:, 0] > told.tx[0, 0] + 0.5])
+    transmitter = torch.from_numpy(told.tx[0])
+    sequences = visible_sequences(mirrors, [0], transmitter, far, 2, 20, True)
+    assert sequences == ((),) and len(hiding(mirrors, sequences, transmitter, far).patches) == 1
+    assert len(visible_sequences(mirrors, [0], transmitter, far, 2, 20, False)) == 2
+    behind = far + torch.tensor([-100.0, 0, 0])
+    assert len(hiding(mirrors, sequences, transmitter, behind).patches) == 0
+
+
+def test_long_sequences_are_of_the_largest_walls():
+    assert [affordable(6, length) for length in (1, 2, 3)] == [6, 6, 6]
+    assert [affordable(100, length) for length in (1, 2, 3)] == [100, 55, 15]
+    assert affordable(0, 2) == 0
+
+
+def test_amplitudes_fall_with_the_order():
+    found = start_amplitudes(((), (0,), (0, 1)), 2.0).exp()
+    assert torch.allclose(found, torch.tensor([2.0, 1.2, 0.72]))

@@ -1,0 +1,326 @@
+"""Paths, boxes and patches against the exact simulator and brute force; then learned in small rooms."""
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gains import gains
+from rooms import PILLAR, WAVELENGTH, shoebox
+
+from gsparc.models.image_sources.clutter import finite_mirrors, search
+from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles, tangents, visible_share
+from gsparc.models.image_sources.clutter.boxes import find_box
+from gsparc.models.image_sources.clutter.finite_mirrors import find_mirrors, find_patch, walls
+from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
+from gsparc.models.image_sources.clutter.residual import Residual
+from gsparc.models.image_sources.clutter.search import find_clutter
+from gsparc.models.image_sources.clutter.unfold import Unfolding
+from gsparc.models.image_sources.gp_likelihood import Scene
+from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.physics.mirror_planes import all_sequences
+from gsparc.processes.worker import Ended, ended_by
+
+SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
+TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
+WALLS = torch.tensor(
+    [[1.0, 0, 0, 0], [1, 0, 0, 4], [0, 1, 0, 0], [0, 1, 0, 3], [0, 0, 1, 0], [0, 0, 1, 2.5]],
+    dtype=torch.float64,
+)
+TABLE = torch.tensor([0.0, 0, 1, 0.75], dtype=torch.float64)
+
+
+def _sequences(order: int) -> tuple:
+    """Every image of the shoebox once: of both orders of perpendicular walls the sorted one."""
+    sequences = all_sequences(list(range(6)), order)
+    kept = [w for w in sequences if len(w) < 2 or w[0] // 2 == w[1] // 2 or w[0] < w[1]]
+    return ((), *kept)
+
+
+def _scene(clutter: Clutter, order: int = 1) -> Scene:
+    sequences, law = _sequences(order), KernelVisibility(0.95, 0.6, 1.5)
+    return Scene(TRANSMITTER, WALLS, sequences, torch.zeros(len(sequences)), -4.0, law, clutter)
+
+
+def _rows(count: int, seed: int = 0) -> Rows:
+    position = torch.from_numpy(np.random.default_rng(seed).uniform(0.1, 0.9, (count, 3))) * SIZE
+    frequency = torch.full((count,), 2.4e9, dtype=torch.float64)
+    return Rows(position, frequency, torch.zeros(count, 1, dtype=torch.complex64), torch.arange(count))
+
+
+def _room() -> torch.Tensor:
+    return torch.stack([torch.zeros(3), SIZE.float()])
+
+
+def _box() -> torch.Tensor:
+    return torch.from_numpy(PILLAR.reshape(1, 6)).float()
+
+
+def _boxed(box: torch.Tensor) -> Clutter:
+    return Clutter(box, torch.zeros(0, 4), ())
+
+
+def _table() -> tuple[torch.Tensor, Clutter]:
+    """Planes with a table top, and its patch: 1.2 to 2.6 m, 0.8 to 2.2 m."""
+    corners = torch.tensor([[1.2, 0.8, 0.75], [2.6, 2.2, 0.75]]) @ tangents(TABLE).T
+    patch = torch.cat([corners.amin(0), corners.amax(0)])
+    return torch.cat([WALLS, TABLE[None]]), Clutter(torch.zeros(0, 6), patch[None], (6,))
+
+
+def test_a_box_hides_what_the_exact_simulator_says():
+    told, _, _ = shoebox(150, pillar=True, snr_db=60.0)
+    scene = _scene(_boxed(_box()), order=2)
+    places = torch.from_numpy(told.rx.copy())
+    seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes, soft=1e-4).T.numpy()
+    true = told.images.of(told.tx[0])
+    at_noise_floor = 0.0
+    for k, source in enumerate(scene.sources.numpy()):
+        image = np.linalg.norm(true - source, axis=1).argmin()
+        assert np.linalg.norm(true[image] - source) < 1e-6
+        at_noise_floor += ((seen[:, k] > 0.5) == told.visible[:, image]).mean() / len(scene.sequences)
+    assert at_noise_floor > 0.98  # the rest are chords shorter than the margin
+
+
+def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
+    places = _rows(20).position
+    paths = Unfolding.of(TRANSMITTER, WALLS, ((0, 2), (2,))).paths(places)
+    torch.testing.assert_close(paths.start[:, :, 0], places.float().expand(2, -1, -1))
+    torch.testing.assert_close(paths.end[:, :, -1], TRANSMITTER.float().expand(2, 20, 3))
+    torch.testing.assert_close(paths.end[:, :, :-1], paths.start[:, :, 1:])
+    assert paths.valid.all()
+    scene = Scene(TRANSMITTER, WALLS, ((0, 2), (2,)), torch.zeros(2), 0.0)
+    straight = torch.cdist(scene.sources, places)
+    length = (paths.end - paths.start).norm(dim=-1).sum(-1)
+    torch.testing.assert_close(length.double(), straight, rtol=1e-4, atol=1e-4)
+
+
+def test_a_sequence_beyond_its_mirror_is_not_valid():
+    behind = torch.tensor([[-1.0, 1.0, 1.0]], dtype=torch.float64)
+    assert not Unfolding.of(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
+
+
+def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
+    planes, clutter = _table()
+    scene = Scene(TRANSMITTER, planes, ((), (6,)), torch.zeros(2), 0.0, clutter=clutter)
+    above_middle = [2.5, 1.9, 1.0]
+    above_beside = [3.9, 2.9, 0.8]  # the reflection would lie beyond the edge
+    under = [2.4, 1.8, 0.2]
+    seen = scene.visible_share(torch.tensor([above_middle, above_beside, under], dtype=torch.float64))
+    assert (seen[:, 1] > 0.5).tolist() == [True, False, False]
+    assert (seen[:, 0] > 0.5).tolist() == [True, True, False]
+
+
+def test_concatenated_scenes_do_not_interact():
+    planes, clutter = _table()
+    places = _rows(15).position
+    one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
+    two = _scene(_boxed(_box()))
+    unfolding = Unfolding.concatenate([one.unfolding, two.unfolding.with_offset(len(planes))])
+    obstacles = Obstacles.concatenate(
+        [Obstacles.of(s.clutter, s.planes, len(s.sequences)) for s in (one, two)]
+    )
+    together = obstacles.visible_share(unfolding.paths(places))
+    torch.testing.assert_close(
+        together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
+    )
+
+
+def test_batched_queries_and_variance_include_clutter():
+    rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
+    phased = [PhasedScene(_scene(_boxed(_box())), torch.arange(7.0), 0.2)]
+    phased.append(PhasedScene(_scene(Clutter.none()), torch.arange(7.0), 0.2))
+    members = [PhasedPosterior(rows, each) for each in phased]
+    queries = _rows(6, seed=5).position
+    tone = torch.tensor([2.4e9], dtype=torch.float64)
+    means, variance, _ = Query(members).means(queries, tone)
+    for member, mean in zip(members, means, strict=True):
+        asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
+        waves = member.phased.unobstructed(asked) * torch.polar(torch.ones(()), -member.phased.phase)
+        expected = (waves[:, :, None] * gains(member, queries)).sum(1)
+        torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
+    bare = Query(members[1:]).means(queries, tone)[1]
+    assert not torch.allclose(variance, bare)
+
+
+def test_residual_is_the_same_likelihood():
+    rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
+    residual = Residual(rows, PhasedScene(_scene(_boxed(_box())), torch.arange(7.0), 0.2))
+    scene = residual.phased.scene
+    seen = scene.visible_share(rows.position).T
+    expected = PhasedPosterior(rows, residual.phased).conditioned.nll
+    assert residual.nll(seen, scene.log_amplitude).item() == pytest.approx(expected, rel=1e-4)
+    gains = residual.nats_per_source(seen, scene.log_amplitude)
+    quiet = scene.log_amplitude.clone()
+    quiet[2] = -30.0  # as if its constant part were not there
+    lost = residual.nll(seen, quiet) - residual.nll(seen, scene.log_amplitude)
+    assert gains[2].item() == pytest.approx(lost.item(), abs=1e-2)
+
+
+def test_score_is_what_the_best_multiple_gains():
+    rows = replace(_rows(20), target=torch.randn(20, 1, dtype=torch.complex64))
+    phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
+    residual = Residual(rows, phased)
+    seen, log_amplitude = torch.ones(7, 20), residual.phased.scene.log_amplitude
+    scorer = residual.scorer(seen, log_amplitude)
+    change = torch.randn(20, 8, dtype=torch.complex64)
+    score, multiple = scorer.score_positive(change)
+    best = int(score.argmax())
+    moved = rows.target[:, 0] - multiple[best] * change[:, best]
+    posterior = [
+        PhasedPosterior(replace(rows, target=target[:, None]), residual.phased).conditioned.nll
+        for target in (rows.target[:, 0], moved)
+    ]
+    assert score[best].item() == pytest.approx(posterior[0] - posterior[1], rel=0.02)
+
+
+def _truth(scene: Scene, rows: Rows, noise: float = 0.02) -> Rows:
+    """What such a scene would be measured as, in unit power."""
+    torch.manual_seed(0)
+    target = scene.waves(rows).sum(1, keepdim=True)
+    target = target + noise * torch.randn(target.shape, dtype=torch.complex64)
+    return replace(rows, target=target / target.abs().square().mean().sqrt())
+
+
+def test_the_pillar_is_found_by_its_shadow():
+    rows = _truth(_scene(_boxed(_box())), _rows(150))
+    phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
+    residual = Residual(rows, phased)
+    scene = residual.phased.scene
+    scorer = residual.scorer(torch.ones(7, 150), scene.log_amplitude)
+    box, score = find_box(
+        scorer, scene.unfolding.paths(rows.position), phased.unobstructed(rows), _room(),
+        torch.Generator().manual_seed(0), draws=500,
+    )  # fmt: skip
+    assert score > 20
+    middle = (box[:2] + box[3:5]) / 2
+    torch.testing.assert_close(middle, torch.tensor([1.8, 1.4]), atol=0.25, rtol=0)
+
+
+def _beside_a_table(count: int) -> tuple:
+    """Rows of a room with a table, what its walls alone leave unexplained, the table, and the walls."""
+    planes, clutter = _table()
+    sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
+    true = Scene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
+    rows = _truth(true, _rows(count))
+    residual = Residual(rows, PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2))
+    scene = residual.phased.scene
+    scorer = residual.scorer(torch.ones(7, count), scene.log_amplitude)
+    return rows, scorer, clutter, walls(scene.planes, scene.sequences)
+
+
+def test_a_table_top_is_found_by_its_reflections():
+    rows, scorer, clutter, numbers = _beside_a_table(200)
+    best = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)[0]
+    assert best.plane[2].abs() == 1
+    assert (best.plane[3] * best.plane[2] - 0.75).abs() < WAVELENGTH
+    assert best.score > 15
+    lower, upper = best.patch.view(2, 2)
+    middle = (lower + upper) / 2
+    torch.testing.assert_close(
+        middle, (clutter.patches[0, :2] + clutter.patches[0, 2:]) / 2, atol=0.4, rtol=0
+    )
+
+
+def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
+    """A raster of 35 cm cells over 40 km asked for six terabytes."""
+    rows, scorer, _, numbers = _beside_a_table(60)
+    whole = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)
+    monkeypatch.setattr(finite_mirrors, "BLOCK_CELLS", 2e4)  # the raster in parts is the same
+    parts = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)
+    assert len(whole) > 0 and [m.score for m in parts] == [m.score for m in whole]
+    with caplog.at_level("INFO"):
+        assert find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 1e4 * _room(), 3) == []
+    assert "no search for small mirrors" in caplog.text
+
+
+def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
+    """It looked at neither clock nor interrupt: `budget_s=60` was at 150 s and going."""
+    rows, scorer, _, numbers = _beside_a_table(60)
+    spent: list[float] = []
+
+    def unwanted() -> bool:
+        spent.append(time.thread_time())
+        return spent[-1] > spent[0] + 0.5
+
+    with ended_by(unwanted), pytest.raises(Ended):
+        find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 4 * _room(), 3)
+    assert max(np.diff([*spent, time.thread_time()])) < 0.5
+    room, cells = 20 * _room(), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            finite_mirrors, "_raster", lambda *a: cells.append((len(a[4]), a[7])) or _nothing(len(a[4]))
+        )
+        patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
+        find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers[:1], room, 3)
+    count = sum(planes for planes, _ in cells) * math.prod(
+        finite_mirrors._cells(room, finite_mirrors.tangents(WALLS[numbers[0]]), cells[0][1])
+    )
+    assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
+
+
+def _nothing(count: int) -> tuple:
+    return torch.zeros(count), torch.zeros(count, 4)
+
+
+def test_clutter_found_before_the_clock_is_kept_and_an_unwanted_search_ends():
+    """A round of everything went on after the clock; now each step is left in the middle."""
+    rows, *_ = _beside_a_table(60)
+    phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
+    looks: list[int] = []
+    late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
+    found = find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
+    assert isinstance(found, PhasedScene) and len(looks) < 60
+    with ended_by(lambda: True), pytest.raises(Ended):
+        find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
+
+
+def test_an_infinite_mirror_becomes_finite():
+    planes, clutter = _table()
+    sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
+    true = Scene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
+    rows = _truth(true, _rows(250))
+    phased = PhasedScene(replace(true, clutter=Clutter.none()), torch.zeros(10), 0.2)
+    residual = Residual(rows, phased)
+    scene, paths = residual.phased.scene, true.unfolding.paths(rows.position)
+    scorer = residual.scorer(torch.ones(10, 250), scene.log_amplitude)
+    generator = torch.Generator().manual_seed(0)
+    patch, score = find_patch(
+        scorer, paths, sequences, 6, TABLE, phased.unobstructed(rows), _room(), generator
+    )  # fmt: skip
+    assert score > 10
+    learned, told = (
+        visible_share(paths.take([7]), Clutter(clutter.boxes, each[None], (6,)), planes) > 0.5
+        for each in (patch, clutter.patches[0])
+    )
+    assert (learned == told).float().mean() > 0.85
+
+
+def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    for name, value in {"EPOCHS": 1, "BOXES": 2, "MIRRORS": 1}.items():
+        monkeypatch.setattr(search, name, value)
+    for clutter, boxes in ((_boxed(_box()), True), (Clutter.none(), False)):
+        rows = _truth(_scene(clutter), _rows(150))
+        start = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
+        found = find_clutter(rows, start, generator)
+        assert bool(len(found.scene.clutter.boxes)) == boxes
+        bare, learned = (PhasedPosterior(rows, each).conditioned.nll for each in (start, found))
+        assert learned <= bare
+    assert not len(found.scene.clutter)
+
+
+def test_walls_of_equal_phase_shift_give_a_phase_prior():
+    scene = _scene(Clutter.none())
+    phase = torch.tensor([0.3, *[0.3 + np.pi] * 6]) + 0.1 * torch.tensor([0.0, 1, -1, 1, -1, 1, -1])
+    phase_prior = ReflectionPhasePrior.of(PhasedScene(scene, phase, 0.2))
+    assert phase_prior.turn == pytest.approx(np.pi)
+    assert phase_prior.concentration > 3
+    expected = phase_prior.expected(phase[0], ((0, 1),))
+    assert torch.cos(expected - 0.3).item() == pytest.approx(1.0, abs=1e-5)
+    scattered = PhasedScene(scene, torch.arange(7.0) * 2.1, 0.2)
+    assert ReflectionPhasePrior.of(scattered).concentration < phase_prior.concentration

@@ -1,0 +1,307 @@
+"""A transmitter that moves before several antennas: all share the sources, each has its own images."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from rooms import nmse
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import SplitSettings, make_split
+from gsparc.models.image_sources.backprojection import quick_score, score
+from gsparc.models.image_sources.clutter.residual import Residual, _cost
+from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, steering
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.refine import refine
+from gsparc.models.image_sources.rows import gather, static_array
+from gsparc.models.image_sources.search_cache import SearchCache
+from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.physics.mirror_planes import bisector, images, orientations, reflect
+from gsparc.physics.waves import LIGHT
+from gsparc.processes import worker
+from gsparc.processes.factor import ROUNDING, Factor
+from gsparc.training.context import FitContext
+
+CARRIER = 2.4e9
+CENTRE, SIZE = np.array([1.7, 0.4, 2.0]), (3.0, 2.5)
+WALLS = ((1.0, None), (0.7, (0, 0.0)), (0.6, (1, 0.0)), (0.6, (0, SIZE[0])), (0.5, (1, SIZE[1])))
+QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0}
+
+
+def _channels(places, antennas, tones):
+    """Direct path and four walls: (S, A, K) of places (S, 3) and antennas (A, 3)."""
+    total = 0
+    for gain, mirror in WALLS:
+        image = antennas.copy()
+        if mirror is not None:
+            image[:, mirror[0]] = 2 * mirror[1] - image[:, mirror[0]]
+        far = np.linalg.norm(places[:, None] - image, axis=-1)[..., None]
+        total = total + gain * np.exp(-2j * np.pi * tones * far / LIGHT) / far
+    return total
+
+
+def _uplink(count=100, antennas=4, tones=None, rotation=None, noise=1e-3, seed=0):
+    """A transmitter at `count` places before a static array half a wavelength apart along its x axis."""
+    rng = np.random.default_rng(seed)
+    tones = np.array([CARRIER]) if tones is None else tones
+    places = rng.uniform([0.2, 0.2, 0.6], [SIZE[0] - 0.2, SIZE[1] - 0.2, 1.6], (count, 3))
+    array = np.c_[np.arange(antennas) * LIGHT / CARRIER / 2, np.zeros((antennas, 2))]
+    rotation = np.eye(3) if rotation is None else rotation
+    channels = _channels(places, CENTRE + array @ rotation.T, tones)
+    power = noise * (np.abs(channels) ** 2).mean()
+    channels = channels + np.sqrt(power / 2) * (rng.standard_normal((*channels.shape, 2)) @ [1, 1j])
+    arrays = {
+        "tx_position": places, "rx_position": CENTRE, "rx_rotation": rotation, "array_position": array,
+        "csi": channels, "frequency_hz": tones,
+    }  # fmt: skip
+    data = from_arrays(arrays, {"name": "uplink"})
+    return data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
+
+
+def _error(method, data, rows):
+    batch = data.batch(rows)
+    return nmse(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy())
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    data, fold = _uplink()
+    method = ImageSourceGP(**QUICK)
+    method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
+    return method, data, fold
+
+
+def test_four_antennas_at_a_hundred_places(fitted):
+    method, data, fold = fitted
+    assert _error(method, data, fold.test) < 0.02
+    assert (method.factors == 1).all()
+    true = [CENTRE]
+    for _, (axis, wall) in WALLS[1:]:
+        image = CENTRE.copy()
+        image[axis] = 2 * wall - image[axis]
+        true.append(image)
+    found = (method.members[0].scene.sources + method.frame.middle).numpy() + data.site.origin
+    assert np.linalg.norm(np.array(true)[:, None] - found, axis=-1).min(1).max() < 0.05
+
+
+def test_a_stored_model_answers_as_before(fitted, tmp_path):
+    method, data, fold = fitted
+    torch.save(method.state(), tmp_path / "state.pt")
+    again = ImageSourceGP()
+    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    assert _error(again, data, fold.test) == pytest.approx(_error(method, data, fold.test), rel=1e-3)
+
+
+def test_paths_of_each_antenna_sum_to_the_prediction(fitted):
+    method, data, fold = fitted
+    batch = data.batch(fold.test[:5])
+    gain, delay, direction, _ = method.paths(batch.tx, batch.rx)
+    assert gain.shape == delay.shape == (5, 4, method.size()) and direction.shape == (5, method.size(), 3)
+    assert torch.allclose(gain.sum(-1), method.predict(batch.tx, batch.rx).mean[..., 0], atol=1e-4)
+    antennas = torch.from_numpy(static_array(data.site, 4) + data.site.static_position)
+    direct = torch.linalg.vector_norm(
+        torch.from_numpy(data.moving[fold.test[:5]])[:, None] - antennas, dim=-1
+    )
+    assert (delay[:, :, 0] * LIGHT - direct).abs().max() < 0.01
+
+
+def test_both_directions_have_the_same_channels(fitted):
+    """Reciprocity: from a sender at an antenna to where the transmitter was is the way back."""
+    method, data, fold = fitted
+    scene, middle = method.members[0].scene, method.frame.middle
+    antennas = torch.from_numpy(static_array(data.site, 4)) + scene.transmitter
+    place = torch.from_numpy(data.moving[fold.test[:3]]) - middle
+    there = torch.cdist(
+        images(antennas, scene.planes, scene.sequences).flatten(0, 1), place
+    )  # antenna's images
+    reversed_sequences = [sequence[::-1] for sequence in scene.sequences]
+    back = torch.stack(
+        [torch.cdist(images(p, scene.planes, reversed_sequences), antennas) for p in place], -1
+    )
+    torch.testing.assert_close(there.view(4, -1, 3), back.transpose(0, 1))
+
+
+def test_orientation_of_first_and_second_order():
+    """Mirrors in planes of any slant: the image of an antenna is that of the centre plus Q a."""
+    draws = torch.Generator().manual_seed(0)
+    planes = torch.randn(3, 4, generator=draws, dtype=torch.float64)
+    centre, antenna = torch.randn(2, 3, generator=draws, dtype=torch.float64)
+    sequences = [(), (0,), (2,), (0, 1), (2, 1)]
+    turned = orientations(planes, sequences)
+    torch.testing.assert_close(
+        images(centre + antenna, planes, sequences), images(centre, planes, sequences) + turned @ antenna
+    )
+    normal = planes[0, :3] / planes[0, :3].norm()
+    householder = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
+    torch.testing.assert_close(turned[1], householder)
+    torch.testing.assert_close(torch.linalg.det(turned), torch.tensor([1.0, -1, -1, 1, 1]).double())
+    halfway = bisector(centre, images(centre, planes, sequences)[1])
+    torch.testing.assert_close(
+        reflect(centre + antenna, halfway), images(centre + antenna, planes, sequences)[1]
+    )
+
+
+def _rows_and_scene():
+    data, fold = _uplink(40)
+    rows = gather(data, fold.train, 100, 0)
+    static = torch.from_numpy(data.site.static_position)
+    planes = torch.tensor([[1.0, 0, 0, -data.site.origin[0]]]).double()
+    scene = Scene(static, planes, ((), (0,)), torch.zeros(2), -5.0)
+    return rows, scene
+
+
+def test_gradient_by_planes_and_position_is_that_of_the_likelihood():
+    rows, scene = _rows_and_scene()
+    assert len(rows) <= 100 and len(rows.element.unique()) == 4
+    moved = replace(scene, planes=scene.planes + torch.tensor([0, 0, 0, 0.004]).double())
+    before = Posterior(rows, moved).nll
+    assert Posterior(rows, refine(rows, moved, 10)).nll < before - 1
+
+
+def test_quick_scores_of_an_array_are_those_without_a_covariance():
+    rows, scene = _rows_and_scene()
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double() + 3
+    spread = reflect(rows.static_ends(scene.transmitter)[:, None], bisector(scene.transmitter, points))
+    waves = steering(rows, spread)
+    slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
+    torch.testing.assert_close(quick_score(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
+    assert score(rows, spread, Posterior(rows, scene).conditioned)[0].shape == (300,)
+    with pytest.raises(ValueError, match="images of each"):
+        steering(rows, points)
+
+
+def test_rotated_array_and_tones(tmp_path):
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    data, fold = _uplink(100, antennas=2, tones=CARRIER + 5e6 * np.arange(3), rotation=turn)
+    method = ImageSourceGP(**QUICK)
+    method.fit(data, fold, FitContext(tmp_path))
+    assert _error(method, data, fold.test) < 0.02
+    rows = np.arange(len(data))[:, None, None]
+    turned = replace(data, rx_rotation=np.where(rows == 3, np.eye(3), data.rx_rotation))
+    with pytest.raises(ValueError, match="row 3: the static receiver of 2 antennas is turned"):
+        method.fit(turned, fold, FitContext(tmp_path))
+
+
+def test_antennas_with_phases_of_their_own(tmp_path):
+    """Cables of unknown length: no source was found."""
+    data, fold = _uplink(100)
+    factors = np.array([1.0, 0.8 * np.exp(2.0j), 1.2 * np.exp(-1.0j), np.exp(0.5j)])
+    turned = replace(data, target=(data.target * factors[:, None]).astype(np.complex64))
+    method = ImageSourceGP(**QUICK)
+    report = method.fit(turned, fold, FitContext(tmp_path))
+    assert _error(method, turned, fold.test) < 0.02
+    left = method.factors.numpy() * factors
+    assert np.allclose(left, left[0], rtol=0.05)
+    assert any("factors of the 4 antennas" in note for note in report.notes)
+
+
+def test_antennas_of_unknown_places_are_outputs_of_their_own():
+    data, fold = _uplink(30, antennas=2)
+    rows = gather(replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0)
+    assert rows.target.shape == (len(fold.train), 2) and rows.array is None
+
+
+def _ofdm(count, noise):
+    """Receivers with 4 antennas and 52 tones at 5.18 GHz in a room, hardly any noise."""
+    rng = np.random.default_rng(1)
+    places = rng.uniform([0.2, 0.2, 0.5], [2.8, 2.3, 1.5], (count, 3))
+    tones = 5.18e9 + 312500.0 * np.arange(-26, 26)
+    array = np.c_[np.zeros(4), (np.arange(4) - 1.5) * LIGHT / 5.18e9 / 2, np.zeros(4)]
+    channels = np.stack([_channels(p + array, CENTRE[None], tones)[:, 0] for p in places])
+    shape, power = channels.shape, noise * (np.abs(channels) ** 2).mean()
+    channels = channels + np.sqrt(power / 2) * (rng.standard_normal((*shape, 2)) @ [1, 1j])
+    data = from_arrays(
+        {
+            "tx_position": CENTRE, "rx_position": places, "array_position": array, "csi": channels,
+            "frequency_hz": tones,
+        }
+    )  # fmt: skip
+    return data, make_split(data.moving, SplitSettings(seed=0)).folds[0]
+
+
+def test_ofdm_with_hardly_any_noise(tmp_path):
+    """It ended in "cholesky: not positive-definite": rows over noise exceeded what float32 can add to 1."""
+    data, fold = _ofdm(100, 1e-9)
+    method = ImageSourceGP(**QUICK)
+    method.fit(data, fold, FitContext(tmp_path))
+    assert _error(method, data, fold.test) < 0.02
+
+
+def test_rows_draw_antennas_so_that_places_are_many():
+    data, fold = _ofdm(60, 1e-3)
+    rows = gather(data, fold.train, 2 * len(fold.train), 0)
+    assert len(rows.receiver.unique()) == len(fold.train) and len(rows) == 2 * len(fold.train)
+
+
+def test_the_inner_matrix_of_hardly_any_noise_has_a_factor():
+    """`I + C^T C` of whitened columns: 1e9 beside the 1 of two columns alike."""
+    one = 1e3 * torch.randn(2000, 1, generator=torch.Generator().manual_seed(0))
+    columns = torch.cat([one, one * (1 + 1e-7)], 1)
+    single = columns.T @ columns + torch.eye(2)
+    assert torch.linalg.cholesky_ex(single)[1] > 0
+    assert torch.isfinite(_cost(columns, one[:, 0], 0.0))
+
+
+def test_clutter_is_looked_for_without_noise():
+    rows, scene = _rows_and_scene()
+    silent = replace(scene, log_noise=-40.0, visibility=KernelVisibility(0.999, 5.0, 50.0))
+    again = Residual(rows, PhasedScene(silent, torch.zeros(2), 0.15))
+    assert np.isfinite(again.nll(torch.ones(2, len(rows)), silent.log_amplitude).item())
+
+
+def test_a_ridge_is_no_larger_than_rounding_explains():
+    """As many rows of one place: rank one, mended by noise under the stated bound."""
+    ones = torch.ones(300, 300)
+    lower = Factor.of(ones).lower
+    assert lower.dtype == torch.float32
+    assert (lower.double() @ lower.double().T - ones).abs().max() <= 16 * ROUNDING * 300
+    with pytest.raises(ValueError, match="no Cholesky factor"):
+        Factor.of(ones - 1e-2 * torch.eye(300))
+
+
+def test_budget_is_kept(tmp_path):
+    """To a tenth and a step, however many searches are asked for."""
+    data, fold = _uplink(100)
+    method = ImageSourceGP(searches=6, search_rows=220, margin=8.0)
+    started = time.monotonic()
+    report = method.fit(data, fold, FitContext(tmp_path, budget_s=4.0))
+    assert time.monotonic() - started < 4.4 + 2.0 and report.seconds < 4.4 + 2.0
+
+
+def test_an_interrupt_ends_all_searches_and_names_the_checkpoint(tmp_path, monkeypatch):
+    data, fold = _uplink(100)
+    begun = time.monotonic()
+
+    def interrupt(*unused):
+        time.sleep(0.5)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gsparc.models.image_sources.ensemble._watch", interrupt)
+    with pytest.raises(KeyboardInterrupt, match=r"0 finished; go on with ckpt_path=.*last\.ckpt"):
+        ImageSourceGP(searches=2, margin=8.0).fit(data, fold, FitContext(tmp_path))
+    assert time.monotonic() - begun < 0.5 + 2.0 + 1.0
+    assert SearchCache(None, tmp_path / "last.ckpt").spent.wall > 0
+
+
+def test_a_worker_ends_when_asked():
+    worker.ask()
+    with worker.ended_by(lambda: True), pytest.raises(worker.Ended):
+        Factor.of(torch.eye(2))
+    Factor.of(torch.eye(2))
+
+
+def test_one_antenna_is_a_case_of_several():
+    """The same likelihood with an array of one antenna at the static end's place."""
+    rows, scene = _rows_and_scene()
+    mine = rows.take(torch.nonzero(rows.element == 0).flatten())
+    alone = replace(mine, array=None, element=None)
+    assert Posterior(mine, scene).nll == pytest.approx(Posterior(alone, scene).nll, rel=1e-4)
+    phased = [
+        PhasedPosterior(each, PhasedScene.of(each, scene, 0.4)).conditioned.nll for each in (mine, alone)
+    ]
+    assert phased[0] == pytest.approx(phased[1], rel=1e-4)

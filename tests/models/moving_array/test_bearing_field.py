@@ -1,0 +1,149 @@
+"""Sources seen by a moving array as a field: its parts, its gradients, what it does not know."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from boxes import room_of_spectra
+
+from gsparc.field.initial import InitSettings
+from gsparc.models.moving_array.bearing_field import BearingField, restored
+from gsparc.models.moving_array.checks import site_problem
+from gsparc.models.moving_array.initialise import bearings
+from gsparc.training.context import FitContext
+
+ROWS = np.arange(0, 160, 2)
+INIT = InitSettings(searches=1, max_sources=9)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return room_of_spectra()
+
+
+@pytest.fixture(scope="module")
+def found(data, tmp_path_factory):
+    return bearings(data, ROWS, INIT, False, FitContext(tmp_path_factory.mktemp("run")))
+
+
+@pytest.fixture
+def field(data, found):
+    """A copy of its own, with all that conditioning leaves."""
+    again = restored(data.site, found[0].state())
+    again.condition(data, ROWS)
+    return again
+
+
+def missed(field, data, rows):
+    batch = data.batch(rows)
+    return float((field(batch.tx, batch.rx).mean - batch.target).square().mean())
+
+
+def test_sources_are_found_within_the_settings(data, found):
+    field, report = found
+    assert field.count == 9 and field.terms == ("moving_array", "residual") and report.seconds > 0
+    assert [tuple(place.shape) for place in field.parameters()] == [(8, 3)]  # the transmitter stays
+    assert "1 searches" in report.notes[0]
+    assert site_problem(data) is None
+    bare = dataclasses.replace(data, site=dataclasses.replace(data.site, array=None))
+    assert "which array" in str(site_problem(bare))
+
+
+def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
+    batch = data.batch(np.arange(1, 31, 2))
+    posterior, method = field(batch.tx, batch.rx), field.method
+    explained, mean, energy, _ = method.query()(method.where(batch.tx, batch.rx))
+    torch.testing.assert_close(posterior.explained, explained.clamp(0, 1))
+    added = method.basis.of(mean - explained)
+    torch.testing.assert_close(added.square().sum(1), energy, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(
+        posterior.mean, (explained + method.basis.images(added)).clamp(0, 1), rtol=0, atol=1e-4
+    )
+    assert missed(field, data, np.arange(1, 160, 2)) < float(
+        (explained.clamp(0, 1) - batch.target).square().mean()
+    )
+    assert posterior.variance.shape == posterior.unknown.shape == (15,)
+
+
+def test_nothing_is_known_a_hundred_metres_away(data, field):
+    batch = data.batch(ROWS[:8])
+    here = field(batch.tx, batch.rx)
+    moved = dataclasses.replace(batch.rx, position=batch.rx.position + torch.tensor([100.0, 0, 0]))
+    there = field(batch.tx, moved)
+    assert here.unknown.max() < 0.5 and (there.unknown == 1).all()
+    assert (there.variance > here.variance).all()
+    prior = 2 * data.target[ROWS].astype(np.float64).var(0).mean() / 255**2
+    np.testing.assert_allclose(there.variance, prior, rtol=0.05)
+
+
+def test_more_rows_condition_it_better(data, field):
+    places = [place.detach().clone() for place in field.places]
+    test = np.arange(1, 160, 4)
+    before = missed(field, data, test)
+    field.condition(data, np.concatenate([ROWS, np.arange(3, 160, 4)]))
+    assert missed(field, data, test) < before
+    assert len(field.left_out().rows) == 120
+    for old, new in zip(places, field.places, strict=True):
+        torch.testing.assert_close(old, new.detach())
+    field.condition(data, ROWS)
+    assert missed(field, data, test) == pytest.approx(before, rel=1e-3)
+
+
+def test_left_out_rows_are_about_as_wrong_as_new_ones(data, field):
+    left = field.left_out()
+    np.testing.assert_array_equal(left.rows, ROWS)
+    error = (left.mean - data.batch(ROWS).target).square().mean((1, 2))
+    torch.testing.assert_close(left.variance, error, rtol=1e-4, atol=1e-7)
+    assert 0.5 < float(error.mean()) / missed(field, data, np.arange(1, 160, 2)) < 2
+
+
+def test_the_gradient_is_that_of_finite_differences(data, field):
+    batch = data.batch(np.concatenate([ROWS[:6], [1, 3]]))  # rows it knows, and others
+    place = field.places[0]
+    field.loss(batch).mean().backward()
+    way = torch.randn(place.shape, generator=torch.Generator().manual_seed(0))
+    slope = float((place.grad * way).sum())
+    values, step = [], 2e-3
+    for sign in (1, -1):
+        with torch.no_grad():
+            place += sign * step * way
+            values.append(float(field.loss(batch).double().mean()))
+            place -= sign * step * way
+    assert slope == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.02)
+    assert field.loss(batch).shape == (8,)
+
+
+def test_steps_lower_the_error_of_sources_out_of_place(data, field):
+    with torch.no_grad():
+        place = field.places[0]
+        place += 0.3 * torch.randn(place.shape, generator=torch.Generator().manual_seed(1))
+    field.condition(data, ROWS)
+    optimiser, batch = torch.optim.Adam(field.parameters(), lr=0.02), data.batch(ROWS)
+    first = float(field.loss(batch).mean().detach())
+    for _ in range(15):
+        optimiser.zero_grad()
+        field.loss(batch).mean().backward()
+        optimiser.step()
+    assert float(field.loss(batch).mean().detach()) < first
+
+
+def test_a_restored_field_answers_the_same(data, field, tmp_path):
+    with torch.no_grad():
+        field.places[0] += 0.01  # not yet conditioned on
+    torch.save(field.state(), tmp_path / "state.pt")
+    again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    batch = data.batch(np.arange(1, 20, 2))
+    ours, theirs = (vars(one(batch.tx, batch.rx)) for one in (field, again))
+    for name, value in ours.items():
+        torch.testing.assert_close(value, theirs[name])
+    torch.testing.assert_close(field.places[0], again.places[0])
+    assert isinstance(again, BearingField)
+    for asked in (again.left_out, lambda: again.loss(batch)):
+        with pytest.raises(ValueError, match="condition the field"):
+            asked()
+
+
+def test_an_empty_set_of_rows_is_refused(data, field):
+    with pytest.raises(ValueError, match="empty"):
+        field.condition(data, ROWS[:0])

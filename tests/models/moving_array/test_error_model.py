@@ -1,0 +1,103 @@
+"""Expected errors against known ones, at synthetic places."""
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.models.moving_array.error_model import ErrorModel, _variance, fit_error_model
+from gsparc.processes.kernel import Kernel
+
+KERNEL, REACH, PRIOR = Kernel.of_one(1.0, 0.1), 2.0, 0.05
+
+
+def fit(places, errors, observed):
+    errors, observed = (torch.from_numpy(value).float() for value in (errors, observed))
+    return fit_error_model(places, errors, observed, KERNEL, REACH, PRIOR)
+
+
+def far(queries, places):
+    return torch.cdist(*(torch.from_numpy(value) for value in (queries, places))).float()
+
+
+def said_of(model, places, queries, observed):
+    return model.relative_error(far(queries, places), torch.from_numpy(observed).float())[0].numpy()
+
+
+def features(count, seed=0):
+    rng = np.random.default_rng(seed)
+    mean, added, peak = (rng.uniform(0.5, 1.5, count) for _ in range(3))
+    return np.column_stack([np.log(mean), np.log(added), peak])
+
+
+@pytest.fixture(scope="module")
+def half_bad():
+    """One half of a floor errs ten times as much as the other."""
+    rng = np.random.default_rng(0)
+    places = np.column_stack([rng.uniform(0, 10, 400), rng.uniform(0, 8, 400), np.full(400, 1.3)])
+    truth = np.where(places[:, 0] > 5, 0.3, 0.03)
+    return fit(places, truth * rng.lognormal(-0.125, 0.5, 400), features(400)), places
+
+
+def test_the_error_of_each_half_is_predicted(half_bad):
+    here = np.column_stack([np.linspace(1, 9, 9), np.full(9, 4.0), np.full(9, 1.3)])
+    said = said_of(*half_bad, here, features(9, 1))
+    assert said[:4].max() < 0.06 and said[5:].min() > 0.18
+    assert said[:4].mean() == pytest.approx(0.03, rel=0.4) and said[5:].mean() == pytest.approx(0.3, rel=0.4)
+
+
+def test_a_feature_correlated_with_the_error_is_used():
+    rng = np.random.default_rng(1)
+    places, observed = rng.uniform(0, 10, (300, 3)), features(300)
+    model = fit(places, 0.1 * np.exp(2 * observed[:, 1]), observed)
+    said = said_of(model, places, rng.uniform(2, 8, (100, 3)), features(100, 2))
+    assert np.corrcoef(np.log(said), features(100, 2)[:, 1])[0, 1] > 0.95
+
+
+def test_the_error_grows_far_away_and_stays_finite(half_bad):
+    away = np.array([[10.0, 4, 1.3], [13.0, 4, 1.3], [1e4, 4, 1.3]])
+    near, off, lost = said_of(*half_bad, away, features(3))
+    assert near < off < lost and np.isfinite(lost)
+
+
+def test_nothing_is_known_far_away(half_bad):
+    """The error there is that of an image drawn at random; near rows it is the relative one."""
+    away = np.array([[5.0, 4, 1.3], [1e2, 4, 1.3]])
+    model, places = half_bad
+    observed = torch.from_numpy(features(2)).float()
+    unknown, variance = model.expected(far(away, places), observed, torch.tensor([0.01, 0.01]))
+    assert unknown[0] < 0.6 and unknown[1] == 1
+    assert variance[0] < 0.01 and float(variance[1]) == pytest.approx(PRIOR)
+
+
+def test_a_variance_needs_the_nearest_rows_only():
+    rng = np.random.default_rng(3)
+    places, queries = rng.uniform(0, 5, (300, 3)) * [1, 1, 0.1], rng.uniform(1, 4, (20, 3)) * [1, 1, 0.1]
+    model = fit(places, rng.lognormal(-2, 0.3, 300), features(300))
+    distance = far(queries, places)
+    row = distance.argmin(1)
+    at = torch.from_numpy(places)
+    cross, gram = KERNEL.between(torch.from_numpy(queries), at).numpy(), KERNEL.gram(at).numpy()
+    exact = 1.1 - (cross * np.linalg.solve(gram, cross.T).T).sum(1)
+    near = _variance(KERNEL, distance.gather(1, model.near[row]), model.precision[row]).numpy()
+    assert (near > exact - 1e-6).all() and (near < 1.5 * exact).all() and near.mean() < 1.1 * exact.mean()
+
+
+def test_a_column_that_never_changed_is_not_extrapolated():
+    """Rows that were all alike in something; a query unlike them once got an error of nothing."""
+    rng = np.random.default_rng(2)
+    places, observed = rng.uniform(0, 10, (50, 3)), features(50)
+    constant, other = observed.copy(), observed.copy()
+    constant[:, 0], other[:, 0] = 0.0, np.log(0.2)
+    model = fit(places, rng.lognormal(-2, 0.3, 50), constant)
+    np.testing.assert_allclose(
+        said_of(model, places, places, other), said_of(model, places, places, constant)
+    )
+
+
+def test_few_rows_and_a_restored_model_predict_the_same():
+    places = np.eye(3)
+    model = fit(places, np.array([0.1, 0.2, 0.3]), features(3))
+    again = ErrorModel.from_state(model.state())
+    one, two = (said_of(d, places, places + 0.1, features(3)) for d in (model, again))
+    np.testing.assert_array_equal(one, two)
+    assert (one > 0).all() and np.isfinite(one).all()

@@ -1,0 +1,162 @@
+"""The moving-array model on exact rooms: it must find the image sources and render them from anywhere."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from boxes import ROOM, TRANSMITTER, room_of_spectra
+from scipy.optimize import nnls
+
+from gsparc.data.splits import SplitSettings, make_split
+from gsparc.evaluation.scores import score
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.moving_array.method import MovingArrayField
+from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, powers
+from gsparc.ops import SphereGrid
+from gsparc.physics.lags import Lags
+from gsparc.simulate.shoebox import images
+from gsparc.training.context import FitContext
+
+SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return room_of_spectra()
+
+
+@pytest.fixture(scope="module")
+def fold(data):
+    return make_split(data.moving, SplitSettings(test_fraction=0.3)).folds[0]
+
+
+@pytest.fixture(scope="module")
+def fitted(data, fold, tmp_path_factory):
+    method = MovingArrayField(search=SEARCH, components=64)
+    assert method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run"))).seconds > 0
+    return method
+
+
+def test_the_strong_images_are_found(data):
+    """The transmitter and images in the near walls, from pictures alone; the far ones are 14 dB weaker."""
+    site = data.site
+    space = Lags(site.array, site.grid, site.wavelength)
+    power = torch.from_numpy(data.target[:60].astype(np.float32) / 255) ** 2
+    receivers = torch.from_numpy(data.moving[:60]).float()
+    found = find_sources(space.of(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, seed=0)
+    mirrored = images(ROOM, 1).of(TRANSMITTER)
+    above = mirrored[mirrored[:, 2] > 0] - site.origin
+    distance = np.linalg.norm(above[:, None] - found.numpy()[None], axis=-1).min(1)
+    assert distance[0] < 0.1 and (distance < 0.25).sum() >= 3
+
+
+def test_a_search_ends_with_its_seconds():
+    """One of 60 sources took 13 s of 4: sources are then fewer, and the refinement's schedule shorter."""
+    rng = np.random.default_rng(0)
+    grid = SphereGrid.hemisphere(15, 60)
+    array = np.c_[np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4), np.zeros(16)] * 0.06
+    space = Lags(array, grid, 0.125)
+    power = torch.from_numpy(rng.uniform(size=(20, 15, 60)).astype(np.float32))
+    receivers = torch.from_numpy(rng.uniform(size=(20, 3)).astype(np.float32))
+    settings = dataclasses.replace(SEARCH, sources=40, per_round=4, least_gain=0.0)
+    looks = iter(np.linspace(1.0, -1.0, 20))
+
+    def search(seconds):
+        return find_sources(space.of(power), receivers, None, torch.eye(3), space, grid, settings, 0, seconds)
+
+    few = search(lambda: float(next(looks)))
+    assert 4 <= len(few) < 40 and next(looks) < 0  # the last look said that there are none left
+    assert torch.isfinite(search(lambda: 0.0)).all() and len(search(lambda: 0.0)) == 4
+
+
+def test_it_beats_the_process_on_images(data, fold, fitted, tmp_path):
+    rival = GaussianProcess()
+    rival.fit(data, fold, FitContext(tmp_path))
+    split = make_split(data.moving, SplitSettings(test_fraction=0.3))
+    ours, theirs = (score((m,), data, split, "test").figures() for m in (fitted, rival))
+    assert ours["psnr_db"] > theirs["psnr_db"] + 0.5 and fitted.size() > 5
+
+
+def test_confidence_falls_away_from_the_measurements(data, fold, fitted):
+    near = data.batch(fold.train[:8])
+    far = dataclasses.replace(near.rx, position=near.rx.position + torch.tensor([20.0, 0, 0]))
+    here, there = fitted.predict(near.tx, near.rx), fitted.predict(near.tx, far)
+    assert (here.confidence > there.confidence).all() and (here.variance < there.variance).all()
+    assert torch.isfinite(there.mean).all() and there.mean.min() >= 0 and there.mean.max() <= 1
+
+
+def test_a_restored_model_predicts_the_same(data, fold, fitted, tmp_path):
+    batch = data.batch(fold.test)
+    torch.save(fitted.state(), tmp_path / "state.pt")
+    again = MovingArrayField()
+    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    one, two = (m.predict(batch.tx, batch.rx) for m in (fitted, again))
+    torch.testing.assert_close(one.mean, two.mean)
+    torch.testing.assert_close(one.confidence, two.confidence)
+
+
+def test_several_searches_are_averaged(data, fold, fitted, tmp_path):
+    twice = MovingArrayField(search=SEARCH, components=64, searches=2)
+    notes = twice.fit(data, fold, FitContext(tmp_path)).notes
+    assert "2 searches" in notes[0] and twice.size() > fitted.size() and len(twice.trends) == 2
+    assert not torch.equal(twice.trends[0].sources, twice.trends[1].sources)
+    torch.testing.assert_close(twice.trends[0].sources, fitted.trends[0].sources)
+    split = make_split(data.moving, SplitSettings(test_fraction=0.3))
+    one, two = (score((m,), data, split, "test").figures()["psnr_db"] for m in (fitted, twice))
+    assert two > one - 0.3
+
+
+def test_a_budget_is_spent_on_searches_while_they_help(data, fold, tmp_path):
+    quick = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
+    method = MovingArrayField(search=quick, components=16)
+    report = method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3, budget_clock="processor"))
+    assert len(method.trends) == 1 and report.limited_by == "processor"  # which was not reported
+    report = method.fit(data, fold, FitContext(tmp_path, budget_s=600.0))
+    assert len(method.trends) > 1 and report.seconds < 300 and report.limited_by is None
+    assert not method.resumable
+
+
+def test_powers_are_the_best_that_are_not_negative():
+    rng = np.random.default_rng(0)
+    atoms, lags = (torch.from_numpy(rng.normal(size=s)).float() for s in ((3, 6, 20), (3, 20)))
+    found = powers(lags, atoms, 0.1).numpy()
+    for row, one, asked in zip(found, atoms.numpy(), lags.numpy(), strict=True):
+        stacked = np.vstack([one.T, np.sqrt(0.1) * np.eye(6)])
+        np.testing.assert_allclose(row, nnls(stacked, np.r_[asked, np.zeros(6)])[0], atol=1e-3)
+
+
+def test_the_variance_is_about_the_error(data, fold, fitted):
+    split = make_split(data.moving, SplitSettings(test_fraction=0.3))
+    found = score((fitted,), data, split, "test")
+    assert 0.4 < found.variance.mean() / found.samples["mse"].mean() < 2.5
+    assert found.confidence.min() > 0 and found.confidence.max() < 1
+
+
+def test_power_spectra_are_recognised(fold, tmp_path):
+    method = MovingArrayField(search=dataclasses.replace(SEARCH, sources=9, steps=0), components=0)
+    method.fit(room_of_spectra(scale="power"), fold, FitContext(tmp_path))
+    assert method.exponent == 1 and method.residual.axes.shape[0] == 0
+
+
+def test_unusable_data_are_refused(data, fold, tmp_path):
+    def refused(words, **changes):
+        site = dataclasses.replace(data.site, **changes)
+        with pytest.raises(ValueError, match=words):
+            MovingArrayField().fit(dataclasses.replace(data, site=site), fold, FitContext(tmp_path))
+
+    refused("moving receiver", static_end="rx")
+    refused("which array", array=None)
+    turned = data.rx_rotation.copy()
+    turned[3] = np.diag([-1.0, -1.0, 1.0])
+    with pytest.raises(ValueError, match="one orientation"):
+        MovingArrayField().fit(dataclasses.replace(data, rx_rotation=turned), fold, FitContext(tmp_path))
+    rng = np.random.default_rng(0)
+    noise = dataclasses.replace(data, target=rng.integers(0, 255, data.target.shape).astype(np.uint8))
+    with pytest.raises(ValueError, match="cannot have measured"):
+        MovingArrayField(search=SEARCH).fit(noise, fold, FitContext(tmp_path))
+
+
+def test_grid_is_the_sites_own():
+    grid = SphereGrid.hemisphere(30, 120)
+    assert room_of_spectra(count=20).site.grid == grid

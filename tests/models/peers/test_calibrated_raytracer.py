@@ -1,0 +1,208 @@
+"""Materials learned in a known scene; tracing is slow, and skipped with its remedy without Sionna."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold
+from gsparc.models import checkpoint, loading
+from gsparc.models.peers.calibrated_raytracer import CalibratedRayTracer
+from gsparc.simulate import llvm
+from gsparc.simulate.calibration import (
+    GENERIC,
+    Material,
+    Replay,
+    apply,
+    calibrate,
+    gain_and_scale,
+    student,
+    used_materials,
+)
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.scenes.build import SceneSettings, known_scene, names_scene
+from gsparc.training.context import FitContext
+
+STATION = np.array([-2.5, 0.0, 3.0])
+CARRIER_HZ = 3.5e9
+PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
+TRUE = Material(4.0, 0.2)
+GAIN_DB = 17.0
+ALL = np.arange(60)
+FOLD = Fold(ALL[:40], ALL[40:45], ALL[45:])
+
+
+def places(count: int = 60) -> np.ndarray:
+    return np.random.default_rng(0).uniform([-4, -4, 0.5], [4, 4, 4], (count, 3))
+
+
+def measurements(power: np.ndarray, **attributes):
+    arrays = {"rssi": power, "rx_position": places(len(power)), "tx_position": STATION}
+    return from_arrays(arrays | {"carrier_hz": np.array(CARRIER_HZ)}, attributes)
+
+
+def said(scene: SceneSettings) -> dict[str, str]:
+    return {"scene": json.dumps(asdict(scene))}
+
+
+def test_slopes_of_the_residuals_density():
+    residual, scale = np.array([-20.0, -1.0, 0.3, 5.0]), 2.5
+    slopes = student(residual, scale)[1]
+    for row, step in enumerate(1e-5 * np.eye(4)):
+        change = student(residual + step, scale)[0] - student(residual - step, scale)[0]
+        assert slopes[row] == pytest.approx(change / 2e-5, rel=1e-6)
+
+
+def test_gain_and_scale_are_the_likeliest():
+    rng = np.random.default_rng(0)
+    missed = 7 + 3 * rng.standard_t(4, 200)
+    gain, scale = gain_and_scale(missed)
+    least = student(gain - missed, scale)[0]
+    assert gain == pytest.approx(7, abs=0.8) and scale == pytest.approx(3, rel=0.2)
+    for other in ((gain + 0.1, scale), (gain - 0.1, scale), (gain, scale * 1.03), (gain, scale / 1.03)):
+        assert student(other[0] - missed, other[1])[0] > least
+
+
+@pytest.mark.parametrize("scene, words", [
+    (None, "name no scene of triangles; say model.scene="), ("nowhere.osm", "nowhere.osm is not here"),
+])  # fmt: skip
+def test_where_no_scene_is_known_it_says_so_in_one_line(scene, words):
+    method = CalibratedRayTracer(scene=scene)
+    with pytest.raises(ValueError, match=words) as raised:
+        method.fit(measurements(np.ones(60)), FOLD, FitContext())
+    assert "\n" not in str(raised.value) and str(raised.value).startswith("calibrated_raytracer: ")
+
+
+def test_a_room_without_triangles_names_no_scene():
+    boxy = SceneSettings("box", 30, CARRIER_HZ, 0.0, 1, room={"size_m": [6, 5, 3]})
+    assert not names_scene(said(boxy)) and not names_scene({}) and not names_scene({"scene": "a street"})
+    street = SceneSettings("canyon", 30, CARRIER_HZ, 0.0, 1, builtin="simple_street_canyon")
+    assert names_scene(said(street)) and known_scene(None, said(street), 2e9).carrier_hz == 2e9
+
+
+def test_without_the_ray_tracer_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(llvm.SimulatorMissing, match="make sionna") as raised:
+        CalibratedRayTracer(scene="floor_wall").fit(measurements(np.ones(60)), FOLD, FitContext())
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("settings", [{"start": "glass"}, {"steps": -1}, {"depth": 9}, {"samples": 0}])
+def test_settings_that_cannot_be_are_refused(settings):
+    with pytest.raises(ValueError):
+        CalibratedRayTracer(**settings)
+
+
+def test_other_data_are_refused():
+    own = measurements(np.ones(60))
+    unknown = from_arrays({"rssi": np.ones(60), "rx_position": places(), "tx_position": STATION})
+    assert CalibratedRayTracer().problem(own) is None
+    assert "carrier" in CalibratedRayTracer().problem(unknown)
+
+
+@pytest.fixture(scope="module")
+def wall():
+    try:
+        llvm.prepare()
+    except llvm.SimulatorMissing as missing:
+        pytest.skip(str(missing))
+    return RayTracer("floor_wall", STATION, CARRIER_HZ, Sampling(20_000, 100))
+
+
+@pytest.mark.slow
+def test_gradients_are_the_powers_own(wall):
+    """Every slope by a material equals a difference of the likelihood."""
+    names = list(used_materials(wall))
+    replay = Replay(wall, places(), PLAIN)
+    weights = np.random.default_rng(1).normal(size=60)
+    at = {name: TRUE.logarithms() + 0.3 * number for number, name in enumerate(names)}
+
+    def value(levels: dict[str, np.ndarray]) -> tuple[float, np.ndarray]:
+        return replay.decibels(levels, lambda db: (float(weights @ db), weights))
+
+    slopes = value(at)[1]
+    assert len(slopes) == 2 * len(names) and np.abs(slopes).max() > 0.1
+    for number, slope in enumerate(slopes):
+        name, which = names[number // 2], number % 2
+        step = 0.02 * np.eye(2)[which]
+        up, down = (value({**at, name: at[name] + sign * step})[0] for sign in (1, -1))
+        assert slope == pytest.approx((up - down) / 0.04, rel=0.03, abs=0.02 * np.abs(slopes).max())
+
+
+@pytest.mark.slow
+def test_steps_compile_nothing(wall):
+    """Flags of paths were changed in place: each step had a longer kernel than the one before."""
+    import drjit as dr
+
+    materials = {name: TRUE.logarithms() for name in used_materials(wall)}
+    replay, longest = Replay(wall, places(), PLAIN), []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for _ in range(3):
+            dr.kernel_history()
+            replay.decibels(materials, lambda db: (0.0, np.ones(60)))
+            longest.append(max(kernel.get("operation_count", 0) for kernel in dr.kernel_history()))
+    assert longest[1] == longest[2]
+
+
+@pytest.mark.slow
+def test_a_replay_is_the_trace(wall):
+    apply(wall, dict.fromkeys(used_materials(wall), TRUE))
+    traced = wall.trace(places(), PLAIN).received_power()
+    np.testing.assert_allclose(Replay(wall, places(), PLAIN).powers(), traced, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_gain_and_powers_elsewhere_are_found_again(wall):
+    """Not the materials one by one: sheets resonate, and several explain the powers alike."""
+    materials, learned = used_materials(wall), slice(0, 60)
+    apply(wall, dict.fromkeys(materials, TRUE))
+    measured = 10 * np.log10(wall.trace(places(90), PLAIN).received_power()) + GAIN_DB
+    start = dict.fromkeys(materials, GENERIC)
+    apply(wall, start)
+    replay = Replay(wall, places(90)[learned], PLAIN)
+    found = calibrate(replay, start, replay.powers(), measured[learned], 80)
+    assert found.gain_db == pytest.approx(GAIN_DB, abs=0.3) and found.scale_db == 0.5
+    again = 10 * np.log10(wall.trace(places(90)[60:], PLAIN).received_power()) + found.gain_db
+    assert np.sqrt(np.mean((again - measured[60:]) ** 2)) < 0.5
+
+
+@pytest.mark.slow
+def test_it_predicts_where_nobody_measured_and_is_stored(wall, tmp_path):
+    apply(wall, dict.fromkeys(used_materials(wall), TRUE))
+    power = wall.trace(places(), PLAIN).received_power() * 10 ** (GAIN_DB / 10)
+    scene = SceneSettings("floor_wall", 30, CARRIER_HZ, 0.0, 1, builtin="floor_wall")
+    data = measurements(power, **said(scene))
+    settings = {"depth": 2, "diffraction": False, "samples": 20_000, "batch": 100}
+    test = data.batch(FOLD.test)
+    error = {}
+    for steps in (0, 60):
+        method = CalibratedRayTracer(steps=steps, **settings)
+        assert method.fit(data, FOLD, FitContext()).seconds > 0
+        said_db, true_db = (10 * torch.log10(v[:, 0]) for v in (method.answer(test).mean, test.target))
+        error[steps] = float((said_db - true_db).square().mean().sqrt())
+    assert error[60] < 0.3 and error[60] < 0.5 * error[0]
+    config = "model: {_target_: gsparc.models.peers.calibrated_raytracer.CalibratedRayTracer, depth: 2, "
+    config += "diffraction: false, samples: 20000, batch: 100}"
+    checkpoint.save(tmp_path / "model.ckpt", method, config)
+    again, _ = loading.load(tmp_path / "model.ckpt")
+    torch.testing.assert_close(again.answer(test).mean, method.answer(test).mean, rtol=1e-4, atol=0)
+
+
+@pytest.mark.slow
+def test_channels_are_predicted_up_to_one_factor(wall):
+    apply(wall, dict.fromkeys(used_materials(wall), TRUE))
+    tones = CARRIER_HZ + np.linspace(-2e7, 2e7, 4)
+    csi = wall.trace(places(), PLAIN).responses(tones, np.zeros((1, 3)), wall.wavelength) * 3j
+    data = from_arrays(
+        {"csi": csi, "rx_position": places(), "tx_position": STATION, "frequency_hz": tones},
+        said(SceneSettings("floor_wall", 30, CARRIER_HZ, 0.0, 4, builtin="floor_wall")),
+    )
+    method = CalibratedRayTracer(depth=2, diffraction=False, samples=20_000, batch=100)
+    method.fit(data, FOLD, FitContext())
+    test = data.batch(FOLD.test)
+    missed = (method.answer(test).mean - test.target).abs().square().sum() / test.target.abs().square().sum()
+    assert missed < 0.05

@@ -1,0 +1,222 @@
+"""Each peer on a scene where its own idea must work."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from known_arrays import array_site, measure, room_vectors, walk
+from scenes import error, fold_of, lobes, room, shadowed, wandering
+from scipy.special import eval_legendre
+
+from gsparc.data.campaigns.rfid import planar_array
+from gsparc.models.baselines.kriging import fit_variogram
+from gsparc.models.peers.directions import virtual_transmitters
+from gsparc.models.peers.radiance import fourier_legendre, terms
+from gsparc.models.registry import method_class
+from gsparc.ops import Pose, SphereGrid
+from gsparc.training.context import FitContext
+
+
+def fitted(name, data, fold, tmp_path, **settings):
+    torch.set_num_threads(1)
+    method = method_class(name)(**settings)
+    method.fit(data, fold, FitContext(tmp_path))
+    return method
+
+
+def test_fourier_legendre_is_what_it_says():
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    series = fourier_legendre(directions, 4, 3)
+    assert series.shape == (50, terms(4, 3))
+    x, y, z = directions.numpy().T
+    wanted = eval_legendre(4, z) * np.sin(2 * np.arctan2(y, x))
+    assert np.allclose(series[:, 4 * 7 + 4], wanted)
+
+
+def test_gsrf_lets_opposite_phases_cancel(tmp_path):
+    """Real Gaussians in one place can only add up."""
+    data, fold = lobes(tmp_path)
+    method = fitted("gsrf", data, fold, tmp_path, count=2, max_steps=1, degree=1, order=1)
+    net = method.network
+    with torch.no_grad():
+        net.field.means[:] = torch.as_tensor(data.rx_position[0]) + torch.tensor([[0, 0, 2.0], [0, 0, 2.001]])
+        net.field.opacity_logits[:] = torch.tensor([0.0, 8.0])  # 0.5 of the first, the rest of the second
+        net.coefficients[:] = 0
+        net.coefficients[0, 0, 0] = 1.0
+    batch, brightest = data.batch(fold.test[:1]), []
+    for phase in (1.0, -1.0):
+        with torch.no_grad():
+            net.coefficients[1, 0, 0] = phase
+            brightest.append(float(net(batch.tx, batch.rx).max()))
+    assert brightest[1] < 0.35 * brightest[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "share"),
+    [
+        ("gsrf", {"count": 60, "max_steps": 150, "rate": 8e-3}, 0.75),
+        ("swiftwrf", {"count": 60, "max_steps": 200, "rate": 5e-3, "octaves": 2}, 0.5),
+        ("wrfgs", {"count": 60, "max_steps": 200, "octaves": 2}, 0.75),
+        pytest.param(
+            "nerf2",
+            {
+                "width": 32,
+                "depth": 4,
+                "samples": 12,
+                "rays": 512,
+                "octaves": 2,
+                "max_steps": 800,
+                "rate": 5e-3,
+            },
+            0.75,
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_lobes_that_come_and_go_are_learned(tmp_path, name, settings, share):
+    data, fold = lobes(tmp_path)
+    known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
+    assert error(fitted(name, data, fold, tmp_path, **settings), data, fold.test) < share * known
+
+
+@pytest.mark.parametrize(("name", "share"), [("swiftwrf", 0.05), ("wrfgs", 0.15)])
+def test_deformed_gaussians_follow_what_moves(tmp_path, name, share):
+    """A few Gaussians are enough when they move along; standing still they would show the mean picture."""
+    data, fold = wandering()
+    known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
+    method = fitted(name, data, fold, tmp_path, count=40, max_steps=150, rate=8e-3, octaves=1)
+    assert error(method, data, fold.test) < share * known
+
+
+def test_swiftwrf_sums_in_any_order(tmp_path):
+    data, fold = lobes(tmp_path)
+    net = fitted("swiftwrf", data, fold, tmp_path, count=30, max_steps=1).network
+    batch = data.batch(fold.test[:1])
+    with torch.no_grad():
+        whole = net(batch.tx, batch.rx)
+        strengths, parts = net.strengths.clone(), torch.zeros_like(whole)
+        for half in (slice(None, 15), slice(15, None)):
+            net.strengths.zero_()
+            net.strengths[half] = strengths[half]
+            parts += net(batch.tx, batch.rx)
+    assert torch.allclose(whole, parts, rtol=0.02, atol=1e-3)
+
+
+def test_ngrf_finds_the_waves_of_a_room_that_interpolation_cannot(tmp_path):
+    data, fold, _ = room(160)
+    plain = error(fitted("gp", data, fold, tmp_path), data, fold.test)
+    method = fitted("ngrf", data, fold, tmp_path, count=30, max_steps=400, rate=5e-3)
+    assert error(method, data, fold.test) < min(0.5 * plain, 0.3)
+
+
+def test_ngrf_shows_its_waves_through_an_array(tmp_path):
+    """Sixteen elements in a traced room, a tag carried along a path."""
+    grid, array = SphereGrid.hemisphere(18, 36), planar_array(4, 4, 0.16)
+    tx = walk(120)
+    data = measure(array_site(grid, array), tx, room_vectors(tx, 1, array)[0])
+    fold = fold_of(data)
+    known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
+    method = fitted("ngrf", data, fold, tmp_path, count=40, max_steps=400, rate=5e-3)
+    assert error(method, data, fold.test) < 0.75 * known
+
+
+def test_rays_that_meet_by_chance_are_no_virtual_transmitter():
+    """Of 126 in a conference room 100 had fewer than five rays, some of them taken from the true ones."""
+    data, _, sources = room(60, directions=True)
+    rays = [d.astype(float) for d in data.directions]
+    for i in (0, np.linalg.norm(data.rx_position[1:] - data.rx_position[0], axis=1).argmin() + 1):
+        towards = sources.mean(0) + np.array([0.3, 0.2, 0.1]) - data.rx_position[i]
+        rays[i] = np.vstack([rays[i], towards / np.linalg.norm(towards)])
+    found, seen = virtual_transmitters(data.rx_position, rays)
+    nearest = np.linalg.norm(found[:, None] - sources[None], axis=-1)
+    assert (nearest.min(0) < 0.02).all(), "every image is found"
+    assert (nearest.min(1) < 0.02).all(), "and what is found is an image"
+    own = np.stack([rows[: len(sources)] for rows in seen])
+    assert (nearest[own, np.arange(len(sources))] < 0.02).all() and seen[0][-1] == -1
+
+
+def test_newrf_asks_the_neighbours_how_many_paths_there_are(tmp_path):
+    """A query had as many as training receivers have on average."""
+    data, fold, _ = room(40, directions=True)
+    net = fitted("newrf", data, fold, tmp_path, width=8, samples=8, max_steps=1, neighbours=3).network
+    votes = torch.zeros(6, 6)
+    votes[:3, 0] = votes[3:, 1:] = votes[0, 1] = 1  # one of the first three sees another
+    places = torch.eye(3)[:1] * torch.tensor([0.0, 0.1, 0.2, 9.0, 9.1, 9.2])[:, None]
+    net.found = {"places": places, "virtual": torch.rand(6, 3), "votes": votes}
+    assert net.search(places[[1, 4]], False)[1].sum(1).tolist() == [1, 5]
+
+
+def test_newrf_opaque_samples_give_no_nan(tmp_path):
+    """An opacity that rounds to 1 left a transmittance of exp(-inf + inf)."""
+    data, fold, _ = room(40, directions=True)
+    method = fitted("newrf", data, fold, tmp_path, width=8, samples=8, max_steps=1)
+    with torch.no_grad():
+        last = [layer for layer in method.network.network if isinstance(layer, torch.nn.Linear)][-1]
+        last.bias[2] = 200.0
+    batch = data.batch(fold.train[:4])
+    loss = method.network.loss(batch, torch.Generator().manual_seed(0))
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert all(torch.isfinite(p.grad).all() for p in method.network.parameters() if p.grad is not None)
+
+
+def test_newrf_predicts_where_no_direction_was_measured(tmp_path):
+    data, fold, _ = room(80, directions=True)
+    settings = {"width": 48, "depth": 3, "octaves": 3, "samples": 24, "max_steps": 250, "rate": 4e-3}
+    method = fitted("newrf", data, fold, tmp_path, **settings)
+    where = data.batch(fold.test)
+    plain = error(fitted("gp", data, fold, tmp_path), data, fold.test)
+    assert error(method, data, fold.test) < 0.3 * min(plain, 1.0)
+    moved = Pose(where.rx.position + 0.5, where.rx.rotation)
+    assert not torch.allclose(method.predict(where.tx, where.rx).mean, method.predict(where.tx, moved).mean)
+
+
+def test_kriging_knows_how_far_shadows_reach(tmp_path):
+    data, fold = shadowed()
+    decibels = 10 * np.log10(data.target)
+    law = fit_variogram(data.moving, decibels)
+    assert 0.5 < law.range / 2.0 < 2 and 0.5 < law.total / 36 < 2
+    method = fitted("kriging", data, fold, tmp_path)
+    batch = data.batch(fold.test)
+    said = method.predict(batch.tx, batch.rx)
+    miss = 10 * np.log10(said.mean.numpy()) - decibels[fold.test]
+    known = 10 * np.log10(fitted("mean", data, fold, tmp_path).predict(batch.tx, batch.rx).mean.numpy())
+    assert (miss**2).mean() < 0.7 * ((known - decibels[fold.test]) ** 2).mean()
+    sure = said.confidence.numpy()
+    assert (miss[sure > np.median(sure)] ** 2).mean() < (miss[sure <= np.median(sure)] ** 2).mean()
+    far = Pose(batch.rx.position[:1] + 1000.0, batch.rx.rotation[:1])
+    assert method.predict(batch.tx[:1], far).confidence < 0.05
+
+
+def test_kriging_serves_spectra_and_repeated_places(tmp_path):
+    data, fold = lobes(tmp_path)
+    data.tx[fold.train[1]] = data.tx[fold.train[0]]
+    method = fitted("kriging", data, fold, tmp_path)
+    assert error(method, data, fold.test) < 0.5 * error(fitted("mean", data, fold, tmp_path), data, fold.test)
+
+
+def test_kriging_maps_the_power_of_channels(tmp_path, campaign, folds):
+    """A channel's power is kriged in decibels; a map of power knows no phase between its points."""
+    data, fold = campaign("csi", 60), folds(60).folds[0]
+    method = fitted("kriging", data, fold, tmp_path)
+    batch = data.batch(fold.test)
+    said = method.predict(batch.tx, batch.rx).mean
+    assert said.shape == batch.target.shape and said.is_complex()
+    again = fitted("kriging", data, fold, tmp_path)
+    again.restore(data.site, method.state())
+    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said)
+    rows = data.batch(fold.train)  # at a measured place the map is the measurement, less the nugget
+    method.variogram = type(method.variogram)(0.0, method.variogram.total, method.variogram.range)
+    method._solve()
+    there = method.predict(rows.tx, rows.rx).mean
+    assert torch.allclose(there, rows.target, atol=1e-2 * float(rows.target.abs().max()))
+
+
+def test_kriging_of_silent_training_channels_is_silent(tmp_path, campaign, folds):
+    """Silence has no decibels: a traceback about infinities came."""
+    data, fold = campaign("csi", 40), folds(40).folds[0]
+    data.target[np.concatenate([fold.train, fold.val])] = 0
+    method = fitted("kriging", data, fold, tmp_path)
+    batch = data.batch(fold.test)
+    assert method.predict(batch.tx, batch.rx).mean.abs().max() < 1e-15

@@ -1,0 +1,172 @@
+"""What every peer trained by gradient keeps to: its budget, its kinds, its checkpoint, the test rows."""
+
+from __future__ import annotations
+
+import time
+from itertools import count
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from clocks import wound
+from scenes import lobes, room
+
+from gsparc.models import checkpoint, loading
+from gsparc.models.method import HasGaussians
+from gsparc.models.peers.trained import rate_factor
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
+
+SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
+CHANNELS = ("gsrf", "ngrf", "newrf")
+SMALL = {"gsrf": {"count": 40}, "wrfgs": {"count": 40}, "swiftwrf": {"count": 40}, "ngrf": {"count": 20},
+         "newrf": {"width": 16, "samples": 8}, "nerf2": {"width": 16, "samples": 8, "rays": 64}}  # fmt: skip
+
+
+def brief(name: str, **more):
+    return method_class(name)(**{**SMALL[name], "max_steps": 3, **more})
+
+
+def scene(kind: str, tmp_path, moving: str = "tx"):
+    return lobes(tmp_path, moving) if kind == "spectrum" else room(40, directions=True)[:2]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "moving"),
+    [("spectrum", n, end) for n in SPECTRA for end in ("tx", "rx")] + [("csi", n, "rx") for n in CHANNELS],
+)
+def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
+    torch.set_num_threads(1)
+    data, fold = scene(kind, tmp_path, moving)
+    method = brief(name)
+    assert method.fit(data, fold, FitContext(tmp_path)).seconds > 0
+    batch = data.batch(fold.test)
+    said = method.predict(batch.tx, batch.rx).mean
+    assert said.shape == batch.target.shape and said.dtype == batch.target.dtype
+    assert torch.isfinite(torch.view_as_real(said) if said.is_complex() else said).all()
+    cls = method_class(name)
+    config = {"model": {"_target_": f"{cls.__module__}.{cls.__name__}", **SMALL[name]}}
+    checkpoint.save(tmp_path / "model.ckpt", method, yaml.safe_dump(config))
+    again = loading.load(tmp_path / "model.ckpt")[0]
+    # Another object may choose another of the equally good summation orders.
+    torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, said, rtol=1e-5, atol=1e-6)
+    twin = brief(name)
+    twin.fit(data, fold, FitContext(tmp_path))
+    assert torch.equal(twin.predict(batch.tx, batch.rx).mean, said), "the same steps give the same model"
+
+
+@pytest.mark.parametrize("name", ["gsrf", "newrf"])
+def test_no_test_row_is_looked_at(tmp_path, name):
+    data, fold, _ = room(40, directions=True)
+    batch = data.batch(fold.test)
+    answers = []
+    for rubbish in (False, True):
+        if rubbish:
+            data.target[fold.test] = np.nan
+            for i in fold.test:
+                data.directions[i] = np.full_like(data.directions[i], np.nan)
+        method = brief(name)
+        method.fit(data, fold, FitContext(tmp_path))
+        answers.append(method.predict(batch.tx, batch.rx).mean)
+    assert torch.equal(*answers)
+
+
+def test_the_budget_ends_training_and_the_schedule_reaches_its_end(tmp_path, monkeypatch):
+    """Against a clock of equal steps: how long a step takes on a busy machine is not what is tested."""
+    data, fold = lobes(tmp_path)
+    seen, ticks = [], count()
+    monkeypatch.setattr("gsparc.models.peers.trained.rate_factor", lambda p: seen.append(p) or rate_factor(p))
+    monkeypatch.setattr("gsparc.training.time_budget.time.process_time", lambda: next(ticks) * 0.05)
+    torch.set_num_threads(1)
+    method = brief("swiftwrf", max_steps=None, budget_s=0.5)
+    assert method.fit(data, fold, FitContext(tmp_path)).limited_by == "processor"  # whatever the run's is
+    assert len(set(seen)) == method.steps > 3 and 0.8 < seen[-1] < 1 and sorted(seen) == seen
+    assert rate_factor(0.0) < 0.1 < rate_factor(0.05) and rate_factor(1.0) < 0.05
+
+
+def test_steps_that_are_given_repeat_exactly_or_the_clock_is_named(tmp_path, monkeypatch):
+    """The schedule followed the seconds where these were ahead: three runs, three models, and no word."""
+    data, fold = lobes(tmp_path)
+    clock, weights = wound(monkeypatch).process_time, []
+    for slow_s in (0.0, 0.2, 9.0):
+        method = brief("swiftwrf", budget_s=1.0)
+        build = method.build
+        method.build = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
+        report = method.fit(data, fold, FitContext(tmp_path))
+        assert report.limited_by == ("processor" if slow_s > 1 else None)
+        assert method.steps == (1 if slow_s > 1 else 3)
+        weights.append(torch.cat([w.flatten() for w in method.fitted().state_dict().values()]))
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+
+
+def test_budgets_are_processor_time(tmp_path):
+    torch.set_num_threads(1)
+    data, fold = lobes(tmp_path)
+    before = time.process_time()
+    brief("swiftwrf", max_steps=None, budget_s=0.5).fit(data, fold, FitContext(tmp_path))
+    assert 0.4 < time.process_time() - before < 3
+
+
+def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):
+    fold = folds(30).folds[0]
+    for name, kind in (("swiftwrf", "csi"), ("gsrf", "rssi")):
+        method = brief(name)
+        with pytest.raises(ValueError, match=f"{name}: predicts .*holds {kind}"):
+            method.fit(campaign(kind, 30), fold, FitContext(tmp_path))
+    with pytest.raises(ValueError, match="newrf: needs directions of arrival"):
+        brief("newrf").fit(campaign("csi", 30, "tx"), fold, FitContext(tmp_path))
+    with pytest.raises(ValueError, match=r"ngrf: spectra need .* array"):
+        brief("ngrf").fit(campaign("spectrum", 30), fold, FitContext(tmp_path))
+    with pytest.raises(ValueError, match="gsrf: not fitted"):
+        brief("gsrf").predict(torch.zeros(1, 3), None)
+    with pytest.raises(ValueError, match="budget_s > 0"):
+        brief("gsrf", budget_s=0)
+
+
+def test_a_loss_that_is_not_finite_stops_training(tmp_path):
+    data, fold, _ = room(40)
+    data.target[fold.train] = np.nan
+    with pytest.raises(RuntimeError, match="NaN or infinite at step 0"):
+        brief("ngrf").fit(data, fold, FitContext(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "kind"), [("gsrf", "spectrum"), ("gsrf", "csi"), ("wrfgs", "spectrum")])
+def test_a_peer_shows_its_gaussians_and_what_they_emit(tmp_path, name, kind):
+    data, fold = lobes(tmp_path) if kind == "spectrum" else room(40, directions=True)[:2]
+    method = brief(name)
+    assert isinstance(method, HasGaussians)
+    with pytest.raises(ValueError, match="not fitted"):
+        method.gaussians(torch.zeros(1, 3), None)
+    method.fit(data, fold, FitContext(tmp_path))
+    one, other = (data.batch(fold.test[i : i + 1]) for i in (0, 1))
+    cloud, elsewhere = (method.gaussians(batch.tx, batch.rx) for batch in (one, other))
+    np.testing.assert_allclose(cloud.means, method.network.field.means.detach(), rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(cloud.quats, axis=1), 1)
+    assert len(cloud) == method.size() and (cloud.strengths >= 0).all() and np.ptp(cloud.strengths) > 0
+    assert (cloud.strengths != elsewhere.strengths).any()
+    both = data.batch(fold.test[:2])
+    square = (cloud.strengths**2 + elsewhere.strengths**2) / 2
+    np.testing.assert_allclose(method.gaussians(both.tx, both.rx).strengths ** 2, square, rtol=1e-5)
+
+
+def test_planar_gaussians_are_shown_in_the_directions_that_they_brighten(tmp_path):
+    data, fold = lobes(tmp_path)
+    method = brief("swiftwrf")
+    method.fit(data, fold, FitContext(tmp_path))
+    network, batch = method.network, data.batch(fold.test[:1])
+    with torch.no_grad():
+        network.strengths.zero_()
+        network.strengths[7] = 0.9
+    cloud = method.gaussians(batch.tx, batch.rx)
+    receiver = data.site.static_position
+    np.testing.assert_allclose(np.linalg.norm(cloud.means - receiver, axis=1), 1, rtol=1e-5)
+    assert cloud.strengths.argmax() == 7
+    brightest = int(method.predict(batch.tx, batch.rx).mean[0].argmax())
+    towards = data.site.grid.directions().reshape(-1, 3)[brightest].double().numpy()
+    turn = np.eye(3) if data.site.rx_rotation is None else data.site.rx_rotation
+    assert turn @ towards @ (cloud.means[7] - receiver) > 0.95
+    moving, fold = lobes(tmp_path, "rx")
+    method.fit(moving, fold, FitContext(tmp_path))
+    with pytest.raises(ValueError, match="a receiver that moves"):
+        method.gaussians(batch.tx, batch.rx)

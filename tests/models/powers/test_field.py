@@ -1,0 +1,269 @@
+"""The field of powers: the plain process without Gaussians, known walls, rows left out, slopes, state."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.data.walls import read_walls
+from gsparc.field.initial import InitSettings
+from gsparc.models import fields
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.haste import haste
+from gsparc.models.image_sources.known.mirrors import counted
+from gsparc.models.powers.field import (
+    PowerField,
+    initialise,
+    restored,
+)
+from gsparc.ops import Pose
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import Nearest
+from gsparc.processes.trend import Trend
+from gsparc.training.context import FitContext
+
+STATION = (5.0, 20.0, 3.0)
+TOWN_WALL = "walls: [{corners_m: [[25, 18, 0], [25, 45, 0], [25, 45, 12], [25, 18, 12]]}]"
+
+
+def town(count: int, walls: bool = True, seed: int = 0) -> Measurements:
+    """A square before a station: a law, a wall of 15 dB, 2 dB of shadowing over 5 m, 1 dB of noise."""
+    rng = np.random.default_rng(seed)
+    places = np.c_[rng.uniform(10, 50, count), rng.uniform(0, 40, count), np.full(count, 1.5)]
+    decibels = -30 - 25 * np.log10(np.linalg.norm(places - STATION, axis=1))
+    if walls:
+        height = 20 + (places[:, 1] - 20) * (25 - 5) / (places[:, 0] - 5)  # where a path crosses x = 25 m
+        decibels = decibels - 15.0 * ((places[:, 0] > 25) & (height > 18))
+    waves = rng.normal(size=(3, 100)) / 5
+    decibels += 2 * np.cos(places @ waves + rng.uniform(0, 2 * np.pi, 100)) @ rng.normal(size=100) / 7
+    decibels += rng.standard_normal(count)
+    return from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
+
+
+def weak(data: Measurements, share: float) -> Measurements:
+    """The same by a receiver that hears nothing of the weaker rows."""
+    level = np.quantile(data.target, share)
+    silent = data.target[:, 0] < level
+    target = np.where(silent[:, None], level, data.target)
+    return replace(data, target=target, mask=~silent[:, None], censored=silent)
+
+
+def db(power: torch.Tensor) -> np.ndarray:
+    return 10 * np.log10(power.numpy().astype(float)).reshape(-1)
+
+
+def small_field(data: Measurements, two: bool = True) -> PowerField:
+    """Invented settings."""
+    kernel = Kernel((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel((5.0,), (1.0,), 0.2, 9.0)
+    return PowerField(data.site, Trend(-70.0), kernel)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_without_gaussians_it_is_the_plain_process(share):
+    data = town(160)
+    data = weak(data, share) if share else data
+    rows = np.arange(120)
+    field, notes = initialise(data, rows)
+    field.condition(data, rows)
+    plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
+    said = plain.fit(data, Fold(rows, rows[:0], np.arange(120, 160)), FitContext()).notes
+    told, found = plain.predict(batch.tx, batch.rx), field(batch.tx, batch.rx)
+    assert field.count == 0 and found.explained is None and field.terms == ("residual",)
+    assert torch.allclose(found.mean, told.mean, rtol=1e-5)
+    assert torch.allclose(found.variance, told.variance, rtol=1e-4)
+    assert torch.allclose(found.unknown, 1 - told.confidence, atol=1e-5)
+    assert said[0] == f"gp: {notes[0]}"
+
+
+@pytest.fixture(scope="module")
+def blocked(tmp_path_factory):
+    """A town of 260 rows with a known wall, and the field of 160 of them."""
+    data, rows = town(260), np.arange(160)
+    file = tmp_path_factory.mktemp("walls") / "town.yaml"
+    file.write_text(TOWN_WALL, encoding="utf-8")
+    field, notes = initialise(
+        data, rows, walls=counted(read_walls(file), data.site.origin, data.site.static_position)
+    )
+    field.condition(data, rows)
+    return data, field, notes
+
+
+def test_a_known_wall_explains_powers_behind_it(blocked):
+    data, field, notes = blocked
+    batch = data.batch(np.arange(160, 260))
+    plain, _ = initialise(data, np.arange(160))
+    plain.condition(data, np.arange(160))
+    truth = db(batch.target)
+    errors = [np.mean((db(f(batch.tx, batch.rx).mean) - truth) ** 2) for f in (field, plain)]
+    assert field.terms == ("power", "residual") and errors[0] < 0.7 * errors[1], (errors, notes)
+
+
+def test_far_away_the_variance_is_the_priors(blocked):
+    data, field, _ = blocked
+    near = data.batch(np.arange(5))
+    far = Pose(near.rx.position + torch.tensor([0.0, 1e7, 0.0]), near.rx.rotation)
+    there, here = field(near.tx, far), field(near.tx, near.rx)
+    assert here.unknown.max() < 0.6 and there.unknown.min() > here.unknown.max()
+    bare = small_field(data)
+    bare.condition(data, np.arange(50))
+    there = bare(near.tx, far)
+    prior = 9.0 * (1 + 0.2 + 1)  # the level's own variance is learned, all else is not
+    spread = there.variance.sqrt() / (math.log(10) / 10 * there.mean[:, 0])
+    assert torch.all(spread.square() > 0.5 * prior) and torch.all(spread.square() <= prior * 1.001)
+
+
+def test_left_out_rows_are_predicted_without_them():
+    data = town(30)
+    field = small_field(data)
+    rows = np.arange(25)
+    field.condition(data, rows)
+    found = field.left_out()
+    assert np.array_equal(found.rows, rows)
+    for i in (0, 7, 24):
+        field.condition(data, np.delete(rows, i))
+        batch = data.batch(np.array([i]))
+        told = field(batch.tx, batch.rx)
+        assert torch.allclose(found.mean[i], told.mean[0], rtol=1e-4)
+        assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("two", [True, False])
+def test_slopes_of_the_loss(two):
+    data = town(20)
+    field, batch = small_field(data, two), data.batch(np.arange(20))
+    field.loss(batch).sum().backward()
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            if name == "share_logit" and not two:
+                continue
+            flat, slopes = parameter.view(-1), parameter.grad.view(-1)
+            for i in range(min(len(flat), 4)):
+                ends, value = [], flat[i].item()
+                for step in (-1e-5, 1e-5):
+                    flat[i] = value + step
+                    ends.append(float(field.loss(batch).sum()))
+                flat[i] = value
+                assert float(slopes[i]) == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-4, abs=1e-6), name
+
+
+def test_the_loss_is_the_density_of_each_row_given_the_others():
+    data = town(12)
+    field = small_field(data)
+    field.condition(data, np.arange(12))
+    found, loss = field.left_out(), field.loss(data.batch(np.arange(12)))
+    slope = math.log(10) / 10 * found.mean[:, 0]
+    spread = (found.variance.sqrt() / slope).square()
+    error = torch.from_numpy(db(found.mean) - db(data.targets(np.arange(12))))
+    told = 0.5 * (torch.log(2 * math.pi * spread) + error**2 / spread)
+    assert torch.allclose(loss, told.double(), rtol=1e-3)
+
+
+def test_rows_that_were_not_measured_cost_nothing():
+    data = weak(town(30), 0.3)
+    silent = torch.from_numpy(data.censored)
+    loss = small_field(data).loss(data.batch(np.arange(30)))
+    assert silent.any() and not loss[silent].any() and loss[~silent].all()
+
+
+def test_state_makes_it_again(blocked, tmp_path):
+    data, field, _ = blocked
+    torch.save(field.state(), tmp_path / "field.pt")
+    again = restored(data.site, torch.load(tmp_path / "field.pt", weights_only=True))
+    batch = data.batch(np.arange(200, 230))
+    for name in ("mean", "variance", "unknown"):
+        one, other = (getattr(f(batch.tx, batch.rx), name) for f in (field, again))
+        assert torch.allclose(one, other, rtol=1e-5), name
+    assert torch.allclose(field.left_out().mean, again.left_out().mean, rtol=1e-4)
+    assert torch.equal(field.mean_at(batch.tx, batch.rx), again.mean_at(batch.tx, batch.rx))
+
+
+def test_both_ends_may_move():
+    data = town(60)
+    rng = np.random.default_rng(0)
+    tx = np.array(STATION) + rng.normal(size=(60, 3))
+    arrays = {
+        "rx_position": data.rx_position + data.site.origin,
+        "tx_position": tx,
+        "rssi_db": db(data.targets(np.arange(60))),
+    }
+    data = from_arrays(arrays, {"name": "two ends"})
+    assert data.site.static_end is None
+    field, _ = initialise(data, np.arange(50))
+    field.condition(data, np.arange(50))
+    batch = data.batch(np.arange(50, 60))
+    assert torch.isfinite(field(batch.tx, batch.rx).mean).all()
+
+
+def test_what_cannot_be_is_refused():
+    data = town(20)
+    with pytest.raises(ValueError, match="at least one row"):
+        initialise(data, np.arange(0))
+    with pytest.raises(ValueError, match="rssi"):
+        initialise(replace(data, site=replace(data.site, kind="csi")), np.arange(9))
+    with pytest.raises(ValueError, match="condition it first"):
+        small_field(data).left_out()
+
+
+def powers_of(data: Measurements, rows: np.ndarray, init: InitSettings) -> PowerField:
+    field, _ = fields.powers(data, rows, init, True, FitContext())
+    return field
+
+
+def test_settings_of_little_time_are_chosen_on_fewer_rows():
+    budgets = [FitContext(budget_s=seconds).time_budget() for seconds in (1e-3, 1e6)]
+    few, every = (haste(budget, 0.5, 9999) for budget in budgets)
+    assert few.rows == 150 and few.late() and every.rows == 1000 and not every.late()
+    assert [budget.limited for budget in budgets] == [True, False] and haste(None, 0.5, 9).rows == 1000
+
+
+@pytest.mark.parametrize("rows", [20, 60])
+def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
+    data, rows, test = town(260), np.arange(rows), np.arange(160, 260)
+    (tmp_path / "town.yaml").write_text(TOWN_WALL, encoding="utf-8")
+    batch = data.batch(test)
+    errors = []
+    for init in (InitSettings("scene", file=str(tmp_path / "town.yaml")), InitSettings()):
+        field = powers_of(data, rows, init)
+        errors.append(float(np.sqrt(np.mean((db(field(batch.tx, batch.rx).mean) - db(batch.target)) ** 2))))
+    assert errors[0] < 0.75 * errors[1], errors
+
+
+def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch):
+    data, field = blocked[0], blocked[1]
+    rows = np.arange(240)
+    field.condition(data, rows)
+    batch = data.batch(np.arange(240, len(data)))
+    whole, left = db(field(batch.tx, batch.rx).mean), field.left_out()
+    monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
+    near = copy.deepcopy(field)
+    near.condition(data, rows)
+    assert isinstance(near.process.posterior, Nearest) and near.terms == field.terms
+    assert np.sqrt(np.mean((db(near(batch.tx, batch.rx).mean) - whole) ** 2)) < 0.3
+    assert np.array_equal(near.left_out().rows, left.rows)
+    assert np.sqrt(np.mean((db(near.left_out().mean) - db(left.mean)) ** 2)) < 0.4
+    again = restored(data.site, near.state())
+    assert torch.equal(again(batch.tx, batch.rx).mean, near(batch.tx, batch.rx).mean)
+    assert torch.equal(again.left_out().mean, near.left_out().mean)
+
+
+def test_left_out_rows_are_told_from_silent_ones_at_their_place(monkeypatch):
+    """Among very many rows the nearest to a row could be a silent one of the same place."""
+    one = town(150, walls=False)
+    twice = np.tile(np.arange(150), 2)
+    places, decibels = one.moving[twice] + one.site.origin, db(torch.from_numpy(one.target[twice]))
+    data = from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
+    silent = np.arange(300) >= 150
+    data = replace(data, mask=~silent[:, None], censored=silent)
+    monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
+    field = small_field(data, two=False)
+    field.condition(data, np.arange(300))
+    assert isinstance(field.process.posterior, Nearest) and len(field.at) == 150
+    assert (field.process.posterior.noise[field.at] <= field.process.kernel.noise).all()

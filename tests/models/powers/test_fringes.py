@@ -1,0 +1,152 @@
+"""Coherent waves from powers alone: the fit, its worth beside a process, and the field with both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.models.powers.field import initialise, restored
+from gsparc.models.powers.fringes import Blend, sampled
+from gsparc.models.powers.waves import basis_of, decibels_of, fit_waves
+from gsparc.ops import Pose
+
+LIGHT, WAVELENGTH = 299_792_458.0, 0.3
+PLANE = Path(__file__).parents[4] / "shared" / "data" / "real" / "techtile-power-reci-rf-1.npz"
+
+
+def plane(count: int, seed: int = 0) -> Measurements:
+    """Half a metre square under twelve sources that interfere, with 0.5 dB of noise."""
+    rng = np.random.default_rng(seed)
+    places = np.c_[rng.uniform(0, 0.6, (count, 2)), np.zeros(count)]
+    sources = np.c_[rng.uniform(-3, 3, (12, 2)), rng.uniform(1, 2, 12)]
+    far = np.linalg.norm(places[:, None] - sources, axis=-1)
+    field = np.exp(-2j * np.pi * far / WAVELENGTH) / far @ np.exp(2j * np.pi * rng.uniform(size=12))
+    decibels = 10 * np.log10(np.abs(field) ** 2 + 1e-3) + 0.5 * rng.standard_normal(count)
+    return from_arrays(
+        {"rx_position": places, "rssi_db": decibels, "frequency_hz": LIGHT / WAVELENGTH}, {"name": "plane"}
+    )
+
+
+def db(power: torch.Tensor) -> np.ndarray:
+    return 10 * np.log10(power.numpy().astype(float)).reshape(-1)
+
+
+@pytest.fixture(scope="module")
+def interfering():
+    data, rows = plane(500), np.arange(400)
+    field, notes = initialise(data, rows, seed=0)
+    field.condition(data, rows)
+    return data, field, notes
+
+
+def test_a_basis_is_of_unit_power_where_it_was_made():
+    places = np.random.default_rng(0).uniform(0, 0.6, (300, 3)) * [1, 1, 0]
+    columns = basis_of(places, WAVELENGTH).columns(places)
+    assert (np.abs(columns) ** 2).sum(1).mean() == pytest.approx(1.0)
+    assert 20 < columns.shape[1] < 60
+
+
+def test_powers_are_fitted_by_waves():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0, 0.5, (400, 3)) * [1, 1, 0]
+    columns = basis_of(places, WAVELENGTH).columns(places)
+    count = columns.shape[1]
+    true = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / 2**0.5
+    decibels = decibels_of(columns @ true)
+    found = [decibels_of(columns @ fit_waves(columns, decibels, rng)) for _ in range(4)]
+    assert min(np.median(np.abs(one - decibels)) for one in found) < 0.5
+
+
+def test_fringes_predict_better_than_the_process_alone(interfering):
+    data, field, notes = interfering
+    batch = data.batch(np.arange(400, 500))
+    plain, _ = initialise(data, np.arange(400), fringes=False)
+    plain.condition(data, np.arange(400))
+    errors = [np.mean((db(f(batch.tx, batch.rx).mean) - db(batch.target)) ** 2) for f in (field, plain)]
+    assert field.terms == ("phase", "residual") and errors[0] < 0.95 * errors[1], (errors, notes)
+
+
+def test_far_from_all_rows_the_process_is_left_alone(interfering):
+    data, field, _ = interfering
+    batch = data.batch(np.arange(3))
+    far = Pose(batch.rx.position + 100.0, batch.rx.rotation)
+    there = field(batch.tx, far)
+    decibels, spread, share = (v.numpy() for v in field.process.answer(field._places(batch.tx, far)))
+    assert np.allclose(db(there.mean), decibels, atol=1e-4) and np.allclose(there.unknown, share)
+    slope = np.log(10) / 10 * there.mean[:, 0].numpy()
+    assert np.allclose(there.variance.numpy(), spread * slope**2, rtol=1e-4)
+
+
+def test_rows_are_predicted_by_solutions_that_never_saw_them(interfering):
+    data, field, _ = interfering
+    found = field.left_out()
+    fringes = field.fringes
+    assert np.array_equal(found.rows, np.arange(400)) and set(fringes.blind) == set(range(5))
+    error = db(found.mean) - db(data.targets(found.rows))
+    batch = data.batch(np.arange(400))
+    seen = db(field(batch.tx, batch.rx).mean) - db(batch.target)
+    assert np.mean(error**2) > np.mean(seen**2)
+
+
+def test_slopes_of_places(interfering):
+    data, field, _ = interfering
+    batch = data.batch(np.arange(400, 404))
+    mean = field.mean_at(batch.tx, batch.rx)
+    assert torch.allclose(mean, field(batch.tx, batch.rx).mean, rtol=1e-4)
+    places = batch.rx.position.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(field.mean_at(batch.tx, Pose(places, batch.rx.rotation)).sum(), places)
+    assert torch.isfinite(slope).all() and slope.abs().max() > 0
+
+
+def test_state_makes_it_again(interfering, tmp_path):
+    data, field, _ = interfering
+    torch.save(field.state(), tmp_path / "field.pt")
+    again = restored(data.site, torch.load(tmp_path / "field.pt", weights_only=True))
+    batch = data.batch(np.arange(400, 420))
+    for name in ("mean", "variance", "explained", "unknown"):
+        one, other = (getattr(f(batch.tx, batch.rx), name) for f in (field, again))
+        assert torch.allclose(one, other, rtol=1e-5), name
+    assert torch.allclose(field.left_out().mean, again.left_out().mean, rtol=1e-4)
+
+
+def test_few_rows_have_no_fringes():
+    data, rows = plane(100), np.arange(100)
+    field, notes = initialise(data, rows)
+    assert field.fringes is None and "too few for" in notes[-1]
+
+
+def test_what_is_sampled():
+    places = plane(200).moving
+    assert sampled(places, WAVELENGTH) and not sampled(places, 0.01) and not sampled(places, None)
+    assert not sampled(np.hstack([places, places]), WAVELENGTH) and not sampled(places[:1], WAVELENGTH)
+
+
+def test_a_blend_goes_from_rows_to_groups_to_nothing():
+    share, factor = Blend((0.1, 0.2), (0.2, 0.6), (0.9, 0.7)).at(np.array([0.0, 0.15, 0.3, 1.5, 5.0]), 1.0)
+    assert np.allclose(share, [0.2, 0.4, 0.6, 0.3, 0.0]) and np.allclose(factor, [0.9, 0.8, 0.7, 0.85, 1.0])
+
+
+@pytest.mark.slow
+def test_a_measured_plane():
+    if not PLANE.exists():
+        pytest.skip(f"{PLANE} is not there")
+    file = np.load(PLANE)
+    loud = np.flatnonzero(file["rssi_db"] > -75)
+    chosen = np.random.default_rng(0).permutation(loud)[:1800]
+    data = from_arrays(
+        {name: file[name][chosen] for name in ("rx_position", "rssi_db")}
+        | {"frequency_hz": file["frequency_hz"]}, {"name": "measured"},
+    )  # fmt: skip
+    square = np.floor(data.moving[:, :2] / 0.3).astype(int) @ [1, 100]
+    test = np.isin(square, np.unique(square)[::5])
+    batch, errors = data.batch(np.flatnonzero(test)), []
+    for fringes in (True, False):
+        field, _ = initialise(data, np.flatnonzero(~test), fringes)
+        field.condition(data, np.flatnonzero(~test))
+        errors.append(np.mean((db(field(batch.tx, batch.rx).mean) - db(batch.target)) ** 2))
+    assert errors[0] < errors[1], errors

@@ -1,0 +1,317 @@
+"""Powers of many ends in one field: exact conditioning, stations never heard, silent rows, wiring, state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from releases import real
+
+import gsparc
+from gsparc.data.modules.ble import BLE
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.field.initial import InitSettings
+from gsparc.models import checkpoint, loading
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.per_station import for_links
+from gsparc.models.powers.together import field as together
+from gsparc.models.powers.together.field import JointPowerField, initialise, most_each, restored
+from gsparc.models.powers.together.law import SiteLaw, fit_site_law
+from gsparc.models.powers.together.learning import learn_shared, left_out_loss, start
+from gsparc.models.powers.together.posterior import End, given
+from gsparc.models.powers.together.prior import Prior, grid
+from gsparc.models.powers.together.rows import heard_rows, places_of, thinned
+from gsparc.models.powers.together.unheard import for_unheard
+from gsparc.models.registry import method_class
+from gsparc.models.terms import EffectSettings, plan
+from gsparc.ops import Pose
+from gsparc.training.context import FitContext
+
+POSTS = np.array([[0.0, 0, 6], [60, 5, 6], [5, 55, 6], [50, 60, 6], [30, -5, 6], [-5, 30, 6]])
+LEVELS = np.array([0.0, 4.0, -5.0, 2.0, -2.0, 3.0])
+
+
+@cache
+def town(count: int = 90, shared_db: float = 4.0, posts: int = 6) -> Measurements:
+    """A square before six stations: a law, what all hear alike at a place, a residual of each, noise."""
+    rng = np.random.default_rng(3)
+    walk = np.c_[rng.uniform(8, 50, (count, 2)), np.full(count, 1.5)]
+    far = np.linalg.norm(walk[:, None] - POSTS[:posts], axis=-1)
+    decibels = -20 - 30 * np.log10(far) + LEVELS[:posts]
+    decibels += smooth(walk, 12, rng, 1)[:, 0, None] * shared_db
+    decibels += 2 * smooth(walk, 8, rng, posts) + rng.standard_normal(far.shape)
+    return from_arrays(
+        {"tx_position": walk, "station_position": POSTS[:posts], "rssi_db": decibels}, {"name": "town"}
+    )
+
+
+def smooth(places: np.ndarray, length: float, rng: np.random.Generator, count: int) -> np.ndarray:
+    """(n, count) fields of variance 1."""
+    waves = rng.normal(size=(2, 200)) / length
+    phases = places[:, :2] @ waves + rng.uniform(0, 2 * np.pi, 200)
+    return np.cos(phases) @ rng.normal(size=(200, count)) / 10
+
+
+def prior_of(data: Measurements) -> Prior:
+    """Invented settings with every term."""
+    law = SiteLaw(-60.0, 2.5, 2.0, 1.5, 5.0, 0.4)
+    places = torch.from_numpy(data.moving[::40])
+    low, high = torch.tensor([-10.0, -10, 0]).double(), torch.tensor([70.0, 70, 6]).double()
+    departures = torch.zeros(len(data.site.stations), 5, dtype=torch.float64)
+    departures[1] = 0.3
+    own = torch.tensor([4.0, 20.0, 5.0, 9.0, 1.5]).double().log()
+    one = torch.tensor(2.0).double().log()
+    return Prior(law, own, departures, one * 3, one * 2, one, places, grid(low, high, 16), 3.0)
+
+
+def rows_of(data: Measurements, rows: np.ndarray | None = None):
+    rows = np.arange(len(data)) if rows is None else rows
+    return heard_rows(data, rows, places_of(data, rows)[0])
+
+
+def dense(rows, prior: Prior) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance (n, n) of rows with noise, and values (n,) less the law, by what the prior says of pairs."""
+    moving, still = torch.from_numpy(rows.moving), torch.from_numpy(rows.still)
+    decades = prior.law.decades(moving, still)
+    columns, lacks = prior.shared(moving, decades, prior.shadows(moving, still))
+    total = columns @ columns.T + torch.diag(lacks)
+    for number in rows.stations:
+        own = np.flatnonzero(rows.station == number)
+        terms = prior.law.terms(decades[own])
+        block = prior.process(number, moving[own], moving[own]) + terms @ terms.T
+        total[np.ix_(own, own)] += block + prior.noise(number) * torch.eye(len(own))
+    return total.numpy(), rows.decibels - prior.law.mean(decades).numpy()
+
+
+def db(power: torch.Tensor) -> np.ndarray:
+    return 10 * np.log10(power.numpy().astype(float)).reshape(-1)
+
+
+def spread_db(found) -> np.ndarray:
+    return np.sqrt(found.variance.numpy()) / (np.log(10) / 10 * found.mean.numpy()[:, 0])
+
+
+def test_it_is_the_dense_process():
+    data = town(40)
+    prior, every = prior_of(data), rows_of(data)
+    known, asked = every.at(np.arange(0, 200)), every.at(np.arange(200, 240))
+    posterior, _, _ = given(known, prior)
+    gram, values = dense(every, prior)
+    inner = np.linalg.solve(gram[:200, :200], np.c_[values[:200], gram[:200, 200:]])
+    mean = gram[200:, :200] @ inner[:, 0]
+    variance = gram[200:, 200:].diagonal() - (gram[200:, :200] * inner[:, 1:].T).sum(1)
+    for number in asked.stations:
+        own = np.flatnonzero(asked.station == number)
+        ends = torch.from_numpy(asked.moving[own]), torch.from_numpy(asked.still[own])
+        said = posterior.answer(*ends, number)
+        law = asked.decibels[own] - values[200:][own]
+        assert np.allclose(said[0].numpy(), law + mean[own], atol=1e-8)
+        assert np.allclose(said[1].numpy(), variance[own], atol=1e-8)
+        assert np.allclose(posterior.mean_of(*ends, number).numpy(), said[0].numpy())
+
+
+def test_left_out_rows_and_the_likelihood():
+    data = town(25)
+    prior, every = prior_of(data), rows_of(data)
+    gram, values = dense(every, prior)
+    inverse = np.linalg.inv(gram)
+    error, variance = inverse @ values / inverse.diagonal(), 1 / inverse.diagonal()
+    posterior, _, kept = given(every, prior)
+    for own, found in zip(kept, posterior.left_out().values(), strict=True):
+        assert np.allclose(found[0].numpy(), error[own]) and np.allclose(found[1].numpy(), variance[own])
+    ends = [End.of(every, number, prior) for number in every.stations]
+    told = 0.5 * (error**2 / variance + np.log(2 * np.pi * variance)).sum()
+    assert np.isclose(float(left_out_loss(prior, ends)), told)
+
+
+def test_the_law_of_a_site():
+    law = fit_site_law(rows_of(town(90, 0.0)))
+    assert abs(law.exponent - 3) < 0.7 and 2 < law.levels_db < 9, law
+
+
+def test_settings_become_likelier():
+    rows = rows_of(town())
+    begin = start(rows, fit_site_law(rows), 6, 0)
+    ends = [End.of(rows, number, begin) for number in rows.stations]
+    _, density = learn_shared(begin, rows)
+    assert density > -float(left_out_loss(begin, ends)) / len(rows.rows) + 0.01
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """A field of 60 of 90 places."""
+    data = town()
+    fold = make_split(data.moving, SplitSettings(val_fraction=0), place=data.place, station=data.station)
+    rows = fold.folds[0].train
+    field, notes = initialise(data, rows)
+    field.condition(data, rows)
+    return data, fold.folds[0], field, notes
+
+
+def test_what_all_hear_alike_is_found(learned):
+    data, fold, field, notes = learned
+    assert field.unheard.columns, notes
+    batch = data.batch(fold.test)
+    error = db(field(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
+    found = field(batch.tx, batch.rx, batch.station)
+    assert np.mean(np.abs(error) < 1.645 * spread_db(found)) > 0.8
+    bare = JointPowerField(data.site, field.places, field.heard.without(), field.heard)
+    bare.condition(data, fold.train)
+    plain = db(bare(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
+    assert np.mean(error**2) < 1.02 * np.mean(plain**2), notes
+
+
+def test_a_station_never_heard_gains_from_the_others():
+    data = town()
+    rows = np.flatnonzero(data.station != 3)
+    asked = data.batch(np.flatnonzero(data.station == 3))
+    field, notes = initialise(data, rows)
+    field.condition(data, rows)
+    found = field(asked.tx, asked.rx)
+    error = db(found.mean) - db(asked.target)
+    places = torch.from_numpy(data.moving[asked.index.numpy()])
+    still = torch.from_numpy(POSTS[3] - data.site.origin).expand(len(places), 3)
+    law = field.heard.law
+    by_law = law.mean(law.decades(places, still)).numpy() - db(asked.target)
+    assert error.std() < 0.85 * by_law.std(), notes
+    assert np.mean(np.abs(error) < 2.6 * spread_db(found)) > 0.8
+    assert spread_db(found).min() > 2  # its level is not known
+
+
+def test_either_end_may_be_the_station(learned):
+    data, fold, field, _ = learned
+    batch = data.batch(fold.test[:20])
+    turned = Pose(batch.tx, batch.rx.rotation)
+    there, back = field(batch.tx, batch.rx), field(batch.rx.position, turned)
+    assert torch.allclose(there.mean, back.mean, rtol=1e-4)
+    assert torch.allclose(there.mean, field(batch.tx, batch.rx, batch.station).mean, rtol=1e-4)
+
+
+def test_it_is_restored(learned):
+    data, fold, field, _ = learned
+    twin = restored(data.site, field.state())
+    batch = data.batch(fold.test)
+    for station in (batch.station, torch.full((len(batch),), -1)):
+        one, other = (each(batch.tx, batch.rx, station) for each in (field, twin))
+        for name in ("mean", "variance", "unknown"):
+            assert torch.allclose(getattr(one, name), getattr(other, name), rtol=1e-5), name
+    ours, theirs = field.left_out(), twin.left_out()
+    assert np.array_equal(ours.rows, theirs.rows) and torch.allclose(ours.mean, theirs.mean)
+    assert field.loss(batch).shape == (len(batch),)
+
+
+def test_silent_rows_say_that_powers_are_low():
+    data = town(60)
+    level = np.quantile(data.target, 0.3)
+    quiet = data.target[:, 0] < level
+    silent = replace(
+        data, target=np.where(quiet[:, None], level, data.target), mask=~quiet[:, None], censored=quiet
+    )
+    prior, rows = prior_of(data), np.arange(len(data))
+    errors = []
+    for used in (rows, rows[~quiet]):
+        field = JointPowerField(data.site, places_of(data, rows)[0], prior, prior)
+        field.condition(silent, used)
+        batch = data.batch(np.flatnonzero(quiet))
+        errors.append(np.mean((db(field(batch.tx, batch.rx, batch.station).mean) - db(batch.target)) ** 2))
+    assert errors[0] < errors[1]
+    assert initialise(silent, rows)[1]
+
+
+def test_a_station_whose_place_nobody_gave():
+    data = town(90, 0.0)
+    gone = data.site.stations.position.copy()
+    gone[2] = np.nan
+    site = replace(data.site, stations=replace(data.site.stations, position=gone))
+    field, notes = initialise(replace(data, site=site), np.arange(len(data)), shared=False)
+    field.condition(replace(data, site=site), np.arange(len(data)))
+    assert any("place of station" in note for note in notes)
+    assert np.linalg.norm((field.places - data.site.stations.position)[2, :2]) < 40
+    batch = replace(data, site=site).batch(np.flatnonzero(data.station == 2)[:5])
+    assert torch.isfinite(field(batch.tx, batch.rx, batch.station).mean).all()
+
+
+def test_rows_are_thinned_at_places_that_stations_share():
+    few = thinned(rows_of(town()), 20, 0)
+    assert np.array_equal(np.bincount(few.station), [20] * 6)
+    assert len(np.unique(few.moving, axis=0)) == 20
+    assert most_each(1) == together.MOST_EACH and 3_500 < most_each(12) < together.MOST_EACH
+
+
+def test_what_it_refuses():
+    data = town()
+    with pytest.raises(ValueError, match="several stations"):
+        initialise(replace(data, site=replace(data.site, stations=None)), np.arange(4))
+    with pytest.raises(ValueError, match="at least one row"):
+        initialise(data, np.arange(0))
+    with pytest.raises(ValueError, match="stations=each"):
+        plan(EffectSettings(), InitSettings(name="scene", file="walls.yaml"), data, 0)
+    with pytest.raises(ValueError, match="condition it first"):
+        prior = prior_of(data)
+        JointPowerField(data.site, POSTS, prior, prior).left_out()
+
+
+def test_gsparc_learns_stations_together(tmp_path):
+    data = town()
+    fold = make_split(data.moving, SplitSettings(), place=data.place, station=data.station).folds[0]
+    method = for_links(Gsparc, data)
+    report = method.fit(data, fold, FitContext(tmp_path, stations="together"))
+    assert any("6 stations in one model" in note for note in report.notes)
+    batch = data.batch(fold.test)
+    said = method.answer(batch)
+    assert torch.allclose(said.mean, method.predict(batch.tx, batch.rx).mean, rtol=1e-4)
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    twin, _ = loading.load(tmp_path / "m.ckpt")
+    assert torch.allclose(said.mean, twin.answer(batch).mean, rtol=1e-5)
+    predictor = gsparc.load(tmp_path / "m.ckpt")
+    place, number = data.tx[fold.test[0]] + data.site.origin, int(data.station[fold.test[0]])
+    post = POSTS[number]
+    one = predictor.at(number).rssi(tx=place)
+    assert np.allclose(one, said.mean[0].numpy() * data.site.target_scale, rtol=1e-3)
+    assert np.allclose(one, predictor.rssi(tx=place, rx=post), rtol=1e-3)
+    assert np.isfinite(predictor.rssi(tx=place, rx=post + np.array([20.0, 20, 0]))).all()  # no station
+
+
+def test_stations_at_one_place_are_told_apart_by_their_numbers():
+    data = town()
+    position = data.site.stations.position.copy()
+    position[1] = position[0]  # a sector, or the same one after its gain changed
+    data = replace(data, site=replace(data.site, stations=replace(data.site.stations, position=position)))
+    data = replace(data, rx_position=position[data.station])
+    far = np.linalg.norm(data.tx - data.rx_position, axis=1)
+    decibels = -20 - 30 * np.log10(far) + 10 * (data.station == 1)
+    data = replace(data, target=(10 ** (decibels / 10)).astype(np.float32)[:, None])
+    rows = np.flatnonzero(data.station < 4)
+    method = for_links(Gsparc, data)
+    method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
+    batch = data.batch(np.flatnonzero(data.station < 2))
+    assert np.abs(db(method.answer(batch).mean) - db(batch.target)).max() < 2
+
+
+def test_halls_gain_over_a_process_of_each_sensor():
+    data = BLE(file=str(real("real/ble-hall-1.npz"))).load()
+    fold = make_split(
+        data.moving, SplitSettings(name="blocks", side_m=3.0), place=data.place, station=data.station
+    ).folds[0]
+    errors = []
+    for make, stations in ((Gsparc, "together"), (method_class("gp"), "each")):
+        method = for_links(make, data)
+        method.fit(data, fold, FitContext(stations=stations))
+        batch = data.batch(fold.test)
+        errors.append(np.mean((db(method.answer(batch).mean) - db(batch.target)) ** 2))
+    assert errors[0] < errors[1], errors
+
+
+def test_the_error_of_a_gain_is_that_of_stations():
+    every = rows_of(town())
+    prior, _ = learn_shared(start(every, fit_site_law(every), 6, 0), every)
+    turned = every.at(np.argsort(every.station, kind="stable"))
+    one, other = (for_unheard(rows, prior, 1.0, 0).gain for rows in (every, turned))
+    assert one is not None and other is not None
+    assert np.isclose(one.squares, other.squares, rtol=0.3) and np.isclose(one.error, other.error, rtol=0.5)
+    assert one.error > 0.05 * one.squares

@@ -1,0 +1,252 @@
+"""The static-array model end to end: renderer, Gaussian process, kernel choice, state, queries."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from known_arrays import array_site, measure, spectra, walk
+
+from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.load import load, split_for
+from gsparc.data.splits import Fold, Split, indices_hash
+from gsparc.evaluation.scores import score
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.models import checkpoint, loading
+from gsparc.models.array_vectors import splat_init
+from gsparc.models.array_vectors.cross_validation import tune
+from gsparc.models.array_vectors.vector_gp import aligned_by, mirror_elements, refine_alignment, twin
+from gsparc.models.registry import method_class
+from gsparc.models.splat.array import ArrayField
+from gsparc.ops import SphereGrid
+from gsparc.physics.array_response import steering
+from gsparc.physics.bartlett import SpectrumRenderer
+from gsparc.processes.kernel import SmoothRough
+from gsparc.training.context import FitContext
+
+SMALL = FieldSettings(count=64)
+
+
+def _fold(rows, seed=0):
+    order = np.random.default_rng(seed).permutation(rows)
+    cut = rows // 5
+    return Fold(np.sort(order[2 * cut :]), np.sort(order[cut : 2 * cut]), np.sort(order[:cut]))
+
+
+def _split(rows):
+    folds = (_fold(rows),)
+    return Split("known", folds, indices_hash(folds))
+
+
+@pytest.mark.parametrize("grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)])
+@pytest.mark.parametrize("height", [0.0, 0.07])
+def test_renderer_equals_the_plain_beamformer(grid, height):
+    """With and without the half-turn shortcut: on any grid, and with an element out of the plane [m]."""
+    array = planar_array()
+    array[3, 2] = height
+    rng = np.random.default_rng(0)
+    site, background = array_site(grid, array), torch.from_numpy(rng.random((grid.height, grid.width)))
+    h = torch.from_numpy(rng.normal(size=(3, 16)) + 1j * rng.normal(size=(3, 16))) / 30
+    share = torch.tensor([[0.0], [0.5], [1.0]], dtype=torch.float64)
+    expected = (spectra(site, h).square() + share[:, :, None].square() * background.square()).sqrt()
+    renderer = SpectrumRenderer(*site.array_geometry(), background)
+    extended = torch.cat([h, share.to(h.dtype)], 1).to(torch.complex64)
+    assert renderer.half_turn == (grid.width == 10 and height == 0)
+    torch.testing.assert_close(renderer(extended).double(), expected, atol=2e-4, rtol=1e-4)
+    predicted = torch.empty(3, grid.height, grid.width)
+    renderer.draw(extended, predicted)
+    torch.testing.assert_close(predicted, renderer(extended).clamp(max=1))
+
+
+def test_renderer_gradient():
+    site = array_site(SphereGrid.hemisphere(4, 6), planar_array(2, 2))
+    renderer = SpectrumRenderer(*site.array_geometry(), torch.rand(4, 6)).double()
+    h = torch.randn(2, 5, dtype=torch.complex128)
+    real = torch.view_as_real(h).clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: renderer(torch.view_as_complex(v)), [real])
+
+
+def test_antennas_at_one_place_are_no_array(tmp_path):
+    """A Fourier transform of no lags ended in the library's words."""
+    site = array_site(SphereGrid.hemisphere(4, 6), np.zeros((4, 3)))
+    data = measure(site, walk(12), np.ones((12, 4), complex))
+    with pytest.raises(ValueError, match="all antennas of the declared array are at one place"):
+        ArrayField(SMALL).fit(data, _fold(12), FitContext(tmp_path))
+
+
+def test_alignment_undoes_phases_and_twins(known_campaign):
+    """Scrambled vectors of a smooth field predict each other again."""
+    data, truth = known_campaign
+    partner, rng = mirror_elements(data.site.array), np.random.default_rng(1)
+    scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
+    mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
+    mixed[::3] = twin(mixed[::3], partner)
+    kernel = SmoothRough.of_one(0.2, 1e-3)
+    inverse = np.linalg.inv(kernel.gram(torch.from_numpy(data.tx)).numpy())
+    vectors = aligned_by(mixed, data.tx, partner, kernel)
+    left_out = vectors - (inverse @ vectors) / np.diag(inverse)[:, None]
+    overlap = np.abs((left_out.conj() * vectors).sum(1)) / np.linalg.norm(left_out, axis=1)
+    assert np.median(overlap) > 0.99
+    assert np.allclose(refine_alignment(vectors, inverse, partner, 1), vectors, atol=0.02)
+
+
+def test_cross_validation_with_gaps_equals_refitting(known_campaign):
+    """The block formula gives what a process fitted without those samples gives."""
+    from gsparc.models.array_vectors import cross_validation
+
+    data, truth = known_campaign
+    x, v = data.tx[:30], truth[:30] / np.linalg.norm(truth[:30], axis=1, keepdims=True)
+    kernel, at = SmoothRough.of_one(0.15, 0.01), torch.from_numpy(x)
+    distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
+    matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
+    samples = cross_validation._Samples(
+        np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
+    )
+    unknown, predicted = samples.predictions(kernel, np.linalg.inv(kernel.gram(at).numpy()), v)
+    error = samples.error(predicted)
+    far = distance[7] > 0.03
+    cross = kernel.between(at[far], at[7:8]).numpy()
+    weights = np.linalg.solve(kernel.gram(at[far]).numpy(), cross)[:, 0]
+    assert unknown[0, 0] == pytest.approx(1 - weights @ cross[:, 0], rel=1e-6)
+    assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
+
+
+def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
+    data, truth = known_campaign
+    images = data.target.reshape(160, -1).astype(np.float32) / 255
+    matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()
+    scaled = truth / np.abs(truth @ matrix.conj()).max(1, keepdims=True)
+    chosen = tune(scaled, data.tx, images, matrix, data.site.wavelength, mirror_elements(data.site.array))
+    a, b = chosen.error_model()
+    assert 0.05 < chosen.kernel.length < 1.0 and a > 0 and b > 0
+    assert np.corrcoef(chosen.unknown, np.log(chosen.error))[0, 1] > 0.5
+
+
+def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
+    data, _ = known_campaign
+    split = _split(160)
+    method = ArrayField(SMALL)
+    report = method.fit(data, split.folds[0], FitContext(tmp_path))
+    assert report.seconds > 0 and (tmp_path / "array_recovery.csv").exists()
+    nearest = method_class("nearest")()
+    nearest.fit(data, split.folds[0], FitContext(tmp_path))
+    ours, theirs = (score([m], data, split) for m in (method, nearest))
+    assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    again, _ = loading.load(tmp_path / "model.ckpt")
+    batch = data.batch(split.folds[0].test)
+    one, other = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
+    assert torch.equal(one.mean, other.mean) and torch.equal(one.variance, other.variance)
+    assert again.size() == 64
+
+
+def test_confidence_falls_and_error_grows_with_distance(known_campaign, tmp_path):
+    data, _ = known_campaign
+    method = ArrayField(SMALL)
+    method.fit(data, _fold(160), FitContext(tmp_path))
+    batch = data.batch(np.array([40]))
+    away = torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.3], [0, 0, 5.0]])
+    found = method.predict(batch.tx + away, batch.rx)
+    assert (found.confidence.diff() < 0).all() and (found.variance.diff() > 0).all()
+    assert found.confidence[-1] == 0 and found.mean.min() >= 0 and found.mean.max() <= 1
+    background = method.fitted().response.background
+    torch.testing.assert_close(found.mean[-1], background, atol=1e-3, rtol=0)
+
+
+def test_position_errors_cost_smoothly(known_campaign, tmp_path):
+    """The sensitivity hook: millimetres change a spectrum by little, centimetres by more."""
+    data, _ = known_campaign
+    method = ArrayField(SMALL)
+    method.fit(data, _fold(160), FitContext(tmp_path))
+    batch = data.batch(np.arange(0, 160, 8))
+    still = method.predict(batch.tx, batch.rx).mean
+    moved = [method.predict(batch.tx + shift, batch.rx).mean for shift in (0.001, 0.01, 0.1)]
+    error = [float((m - still).square().mean().sqrt()) for m in moved]
+    assert error[0] < 0.02 and error[0] < error[1] < error[2]
+
+
+def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, tmp_path, monkeypatch):
+    data, _ = known_campaign
+    whole, few = ArrayField(SMALL), ArrayField(SMALL)
+    whole.fit(data, _fold(160), FitContext(tmp_path))
+    few.settings = replace(
+        few.settings, emission=replace(few.settings.emission, encoding=EncodingSettings(anchors=40))
+    )
+    few.fit(data, _fold(160), FitContext(tmp_path))
+    assert few.fitted().emission.encoding.width == 40 and whole.fitted().emission.encoding.width == 128
+    batch = data.batch(_fold(160).test)
+    said = [m.predict(batch.tx, batch.rx).mean for m in (whole, few)]
+    assert (said[0] - said[1]).square().mean() < 5e-3 * batch.target.square().mean()
+    monkeypatch.setattr(splat_init, "MOST_ROWS", 60)
+    few.fit(data, _fold(160), FitContext(tmp_path))
+    assert few.fitted().emission.encoding.width == 40
+    again = few.predict(batch.tx, batch.rx).mean
+    errors = [(found - batch.target).square().mean() for found in (again, said[1])]
+    assert errors[0] < 1.5 * errors[1], errors
+
+
+def test_refuses_what_has_no_array(campaign, tmp_path):
+    with pytest.raises(ValueError, match="no antenna array"):
+        ArrayField().fit(campaign("spectrum", 12), _fold(12), FitContext(tmp_path))
+    with pytest.raises(RuntimeError, match="not been trained"):
+        ArrayField().predict(torch.zeros(1, 3), None)
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_very_few_rows(known_campaign, tmp_path, rows):
+    data, _ = known_campaign
+    method = ArrayField(SMALL)
+    method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 10)), FitContext(tmp_path))
+    batch = data.batch(np.arange(4))
+    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
+
+
+def test_duplicate_positions(known_campaign, tmp_path):
+    data, _ = known_campaign
+    data = replace(data, tx=np.repeat(data.tx[::4], 4, axis=0))
+    method = ArrayField(SMALL)
+    method.fit(data, _fold(160), FitContext(tmp_path))
+    batch = data.batch(np.arange(4))
+    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
+
+
+@pytest.mark.slow
+def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
+    """Real spectra: paired differences to the image GP."""
+    data = load({"name": "rfid", "root": str(real_rfid)})
+    ahead = {}
+    for name in ("random", "grouped"):
+        split = split_for({"name": name}, data)
+        scores = []
+        for kind in (ArrayField, method_class("gp")):
+            methods = [kind() for _ in split.folds]
+            for method, fold in zip(methods, split.folds, strict=True):
+                method.fit(data, fold, FitContext(tmp_path))
+            scores.append(score(methods, data, split))
+        ahead[name] = [
+            (scores[0].samples[k] - scores[1].samples[k]).mean() for k in ("ssim_gauss", "psnr_db")
+        ]
+    assert ahead["random"][0] > 0 and ahead["random"][1] > 0
+    assert ahead["grouped"][0] > 0.02 and ahead["grouped"][1] > 0.5
+
+
+@pytest.mark.slow
+def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
+    data = load({"name": "rfid", "root": str(real_rfid)})
+    method = ArrayField()
+    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
+    batch, times = data.batch(np.array([0])), []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for _ in range(300):
+            begin = time.perf_counter()
+            method.predict(batch.tx, batch.rx)
+            times.append(time.perf_counter() - begin)
+    finally:
+        torch.set_num_threads(threads)
+    assert np.median(times[50:]) < 1e-3

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
+from gsparc.models.splat.closed_form import learn_prior, learn_process, warm_start
+from gsparc.ops import Pose
+
+KERNEL = EmissionSettings(EncodingSettings("kernel"), activation="linear", init_bias=0.0)
+RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
+ROWS = np.arange(40)
+
+
+def started(data, emission=KERNEL, count: int = 150, on: bool = False) -> GaussianModel:
+    torch.manual_seed(0)
+    process = learn_process(data, ROWS, 1024, 0)
+    settings = ModelSettings(
+        field=FieldSettings(count=count, placement="sphere"),
+        emission=emission,
+        attenuation=AttenuationSettings(inverse_distance=on),
+    )
+    model = GaussianModel(settings, data.site, RECEIVER, prior=process.prior)
+    warm_start(model, data, ROWS, RECEIVER, process)
+    return model
+
+
+def error(model, data, rows) -> float:
+    batch = data.batch(rows)
+    with torch.no_grad():
+        return float((model(batch.tx, batch.rx).mean - batch.target).square().mean())
+
+
+def spread(data) -> float:
+    images = data.targets(np.arange(len(data)))
+    return float((images - images.mean(0)).square().mean())
+
+
+@pytest.fixture(scope="module")
+def smooth(campaign):
+    """Images that are smooth in both direction and position."""
+    data = campaign("spectrum", rows=48)
+    from scipy.ndimage import gaussian_filter
+
+    images = data.target.astype(np.float32) / 255
+    images = np.stack([gaussian_filter(image, 3, mode="nearest") for image in images])
+    images = 0.1 + 0.8 * (images - images.min()) / np.ptp(images)
+    return dataclasses.replace(data, target=images.astype(np.float32))
+
+
+@pytest.mark.parametrize("on", [False, True])
+def test_the_start_explains_training_and_unseen_rows(smooth, on):
+    model = started(smooth, on=on)
+    assert error(model, smooth, ROWS) < 0.15 * spread(smooth)
+    assert error(model, smooth, np.arange(40, 48)) < 0.5 * spread(smooth)
+
+
+def test_more_gaussians_explain_more(smooth):
+    errors = [error(started(smooth, count=n), smooth, ROWS) for n in (5, 40, 300)]
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_a_network_with_hidden_units_has_no_closed_form(smooth):
+    with pytest.raises(ValueError, match=r"set model\.emission\.hidden=0"):
+        started(smooth, emission=dataclasses.replace(KERNEL, hidden=4))
+
+
+def test_the_prior_comes_from_the_given_rows_alone(smooth):
+    poisoned = smooth.target.copy()
+    poisoned[40:] = np.nan
+    clean = learn_prior(smooth, ROWS, 1024, 0)
+    other = learn_prior(dataclasses.replace(smooth, target=poisoned), ROWS, 1024, 0)
+    assert clean.length == other.length and clean.noise == other.noise
+    assert torch.equal(clean.anchors, torch.from_numpy(smooth.moving[ROWS]).float())
+
+
+def test_anchors_are_capped_and_drawn_by_seed(smooth):
+    few = [learn_prior(smooth, ROWS, 10, seed).anchors for seed in (0, 0, 1)]
+    assert len(few[0]) == 10 and torch.equal(few[0], few[1]) and not torch.equal(few[0], few[2])
+
+
+def test_holes_of_masked_spectra_are_filled_not_learned(smooth):
+    mask = np.ones(smooth.target.shape, bool)
+    mask[:, :4] = np.random.default_rng(0).uniform(size=(len(mask), 4, 24)) < 0.8
+    holes = np.where(mask, smooth.target, np.float32(0))
+    model = started(dataclasses.replace(smooth, target=holes, mask=mask))
+    assert error(model, smooth, ROWS) < 0.2 * spread(smooth)
+    naive = started(dataclasses.replace(smooth, target=holes))
+    assert error(naive, smooth, ROWS) > 2 * error(model, smooth, ROWS)
+
+
+def test_what_is_unknown_far_away_and_near_the_rows(smooth):
+    """A hundred metres outside a splatted model was as sure as beside its rows."""
+    model = started(smooth)
+    assert model.error is not None
+    batch = smooth.batch(ROWS)
+    with torch.no_grad():
+        near, far = (model(tx, batch.rx).unknown for tx in (batch.tx, batch.tx + 100.0))
+        sure, variance = model.error(near)
+        unsure, most = model.error(far)
+    assert (far == 1).all() and (unsure == 0).all() and (sure > 0.3).float().mean() > 0.9
+    assert float(variance.mean()) < 0.5 * float(most.mean())
+    assert 0.3 * spread(smooth) < float(most.mean()) < 3 * spread(smooth)
+
+
+def test_rows_without_their_neighbours_are_as_a_fit_without_them(smooth):
+    """The kernel stays: what is left out is the rows alone."""
+    process = learn_process(smooth, ROWS, 1024, 0)
+    settings = ModelSettings(
+        field=FieldSettings(count=150, placement="sphere"), emission=KERNEL,
+        attenuation=AttenuationSettings(inverse_distance=False),
+    )  # fmt: skip
+    model = GaussianModel(settings, smooth.site, RECEIVER, prior=process.prior)
+    left = warm_start(model, smooth, ROWS, RECEIVER, process)
+    assert left is not None and len(left.centres) == len(ROWS)
+    errors = ((left.predicted - left.images[left.centres]) ** 2).mean(-1)
+    nearest = np.nanmean(errors[0])
+    shown = error(model, smooth, ROWS)
+    assert (
+        shown < nearest < spread(smooth)
+    )  # harder than rows it has seen, easier than knowing the mean alone
+    assert nearest <= np.nanmean(errors[1:])

@@ -1,0 +1,87 @@
+"""Channels of several runs, each with a phase of its own, and channels of which both ends move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from campaigns import compose
+from worlds import World, arrays
+
+from gsparc.commands.train import train
+from gsparc.data.load import split_for
+from gsparc.data.own import from_arrays
+from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.scores import score, unseen_runs
+from gsparc.models import loading
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.image_sources.run_factors import RunFactors
+from gsparc.models.method import Method, Prediction
+from gsparc.training.context import FitContext
+
+
+def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
+    """The default had 17 times the error of complex_gp, whose rows were the same."""
+    world = World("tone", 5, 1, "rx", "metres", "none", "random", 300)
+    np.savez(tmp_path / "own.npz", **arrays(world, 0))
+    said = [
+        "dataset=own",
+        f"dataset.file='{tmp_path / 'own.npz'}'",
+        "model=gsparc",
+        "logger=none",
+        "threads=1",
+    ]
+    facts, objects = train(compose(*said, "budget_s=4", "baselines=[complex_gp]"), tmp_path / "run")
+    assert facts["test/nmse"] < 1.1 * facts["baseline/complex_gp/nmse"] < 0.5
+    data, method = objects.data, objects.methods[0]
+    rows = objects.split.folds[0].test
+    again, _ = loading.load(tmp_path / "run" / "model.ckpt")
+    batch = data.batch(rows)
+    assert torch.allclose(again.answer(batch).mean, method.answer(batch).mean, atol=1e-5)
+    turned = method.answer(batch).mean / method.predict(batch.tx, batch.rx).mean
+    assert len(np.unique(np.round(np.angle(turned.flatten().numpy()), 3))) == 5  # a phase for each run
+
+
+def test_both_ends_may_move_in_channels():
+    data = from_arrays(arrays(World("antennas", 1, 1, "both", "metres", "none", "random", 300), 0))
+    split = split_for({"name": "random"}, data)
+    method = Gsparc()
+    method.fit(data, split.folds[0], FitContext(budget_s=5.0))
+    own, plain = score([method], data, split).figures(), baseline("gp", data, split).scores.figures()
+    assert own["nmse"] < 0.9 * plain["nmse"] and "direct" in method.effects
+
+
+class Turned(Method):
+    """The truth in a phase of its own."""
+
+    name = "turned"
+
+    def __init__(self, data, phase: float) -> None:
+        self.data, self.phase = data, phase
+
+    def answer(self, batch):
+        return Prediction(self.data.targets(batch.index.numpy()) * np.exp(1j * self.phase))
+
+    fit = predict = state = restore = None  # type: ignore[assignment]
+
+
+def test_runs_that_were_not_learned_from_are_scored_after_their_best_phase():
+    data = from_arrays(arrays(World("tones", 5, 1, "tx", "metres", "masked", "runs", 300), 0))
+    split = split_for({"name": "runs"}, data)
+    fold = split.folds[0]
+    assert len(unseen_runs(data, fold, "test")) == 1 and not len(unseen_runs(data, fold, "train"))
+    method = Turned(data, 1.0)
+    assert score([method], data, split).figures()["nmse"] < 1e-10
+    known = score([method], data, split, "train").figures()["nmse"]
+    assert known == pytest.approx(abs(np.exp(1j) - 1) ** 2, rel=1e-4)  # a known run's phase is to be known
+
+
+def test_aligned_channels_are_restored():
+    data = from_arrays(arrays(World("tone", 5, 1, "rx", "metres", "none", "random", 30), 0))
+    factors = torch.polar(torch.arange(1.0, 6.0).double(), torch.arange(5.0).double())
+    runs = RunFactors(np.arange(5), factors)
+    aligned = runs.aligned(data)
+    assert aligned.run is None and RunFactors.several(data, np.arange(30))
+    found = runs.restored(Prediction(aligned.targets(np.arange(30))), torch.from_numpy(data.run))
+    assert torch.allclose(found.mean, data.targets(np.arange(30)), atol=1e-6)
+    assert runs.of(torch.tensor([7])).item() == 1  # nothing is known of that one

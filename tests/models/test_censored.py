@@ -1,0 +1,125 @@
+"""Rows where nothing was heard: the likelihood of "below the level", and a town half of which is silent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.censored import heard, left_out_note
+from gsparc.models.powers.settings import fit_powers
+from gsparc.models.registry import build
+from gsparc.processes.powers import Rows
+from gsparc.training.context import FitContext
+
+STATION = np.array([500.0, 500.0, 20.0])
+SHADOWING_DB, LENGTH_M, NOISE_DB = 7.0, 80.0, 1.5
+
+
+def town(count: int = 500, seed: int = 0) -> tuple[Measurements, np.ndarray, np.ndarray]:
+    """A kilometre of streets, half of it below the sensitivity; true powers [dB], and which were heard."""
+    rng = np.random.default_rng(seed)
+    places = np.c_[rng.uniform(0, 1000, (count, 2)), np.full(count, 1.5)]
+    gap = np.sqrt(3) * cdist(places, places) / LENGTH_M
+    root = np.linalg.cholesky((1 + gap) * np.exp(-gap) + 1e-9 * np.eye(count))
+    law = -20 - 32 * np.log10(np.linalg.norm(places - STATION, axis=1))
+    true = law + SHADOWING_DB * root @ rng.standard_normal(count)
+    level = float(np.median(true))
+    measured = true + NOISE_DB * rng.standard_normal(count)
+    silent = measured < level
+    shown = np.where(silent, level, measured)
+    arrays = {"rx_position": places, "tx_position": STATION, "rssi_db": shown, "carrier_hz": np.array(9e8)}
+    data = from_arrays(arrays, {"name": "town"})
+    return replace(data, censored=silent, mask=~silent[:, None]), true, silent
+
+
+def fold_of(data: Measurements, share: float = 0.6) -> Fold:
+    rows = np.random.default_rng(1).permutation(len(data))
+    cut = round(share * len(rows))
+    return Fold(np.sort(rows[:cut]), rows[:0], np.sort(rows[cut:]))
+
+
+def predicted(model: str, data: Measurements, rows: np.ndarray, asked: np.ndarray):
+    """Mean and deviation [dB] at rows `asked` of a fit to `rows`, and its notes."""
+    method = build({"_target_": model})
+    report = method.fit(data, Fold(rows, rows[:0], asked), FitContext())
+    batch = data.batch(asked)
+    found = method.predict(batch.tx, batch.rx)
+    power = found.mean[:, 0].double()
+    deviation = found.variance.double().sqrt() / (np.log(10) / 10 * power)
+    return (10 * torch.log10(power * data.site.target_scale)).numpy(), deviation.numpy(), report.notes
+
+
+MODELS = ["gsparc.models.baselines.distance_law.DistanceLaw", "gsparc.models.baselines.gp.GaussianProcess"]
+
+
+@pytest.mark.parametrize(("model", "margin"), list(zip(MODELS, (0.93, 0.85), strict=True)))
+def test_silent_rows_tell_of_a_half_silent_town(model, margin):
+    """Over all places, learned from and not: the truth is nearer when silence counts as "below the level"."""
+    ratios, inside = [], []
+    for seed in range(3):
+        data, true, _ = town(seed=seed)
+        fold, everywhere = fold_of(data), np.arange(len(data))
+        told, deviation, _ = predicted(model, data, fold.train, everywhere)
+        untold = predicted(model, data, heard(data, fold.train), everywhere)[0]
+        error = [float(np.sqrt(((one - true) ** 2).mean())) for one in (told, untold)]
+        ratios.append(error[0] / error[1])
+        new = fold.test
+        inside.append(np.abs(told - true)[new] < 1.645 * deviation[new])
+    assert np.mean(ratios) < margin and max(ratios) < 1, ratios
+    assert 0.84 < np.mean(inside) < 0.96, np.mean(inside)  # of 90 %
+
+
+def test_the_process_says_what_it_did_with_silent_rows():
+    data, _, silent = town(200)
+    rows = np.arange(len(data))
+    notes = predicted(MODELS[1], data, rows, rows)[2]
+    assert f"gp: {silent.sum()} rows where nothing was heard are below their level" in notes
+
+
+@pytest.mark.parametrize(
+    "model", ["gsparc.models.baselines.idw.InverseDistance", "gsparc.models.baselines.mean.Mean"]
+)
+def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
+    data, _, silent = town(60)
+    rows = np.arange(len(data))
+    asked = rows[:10]
+    found = build({"_target_": model})
+    notes = found.fit(data, Fold(rows, rows[:0], asked), FitContext()).notes
+    assert notes == (f"{silent.sum()} rows where nothing was heard are not learned from",)
+    assert found.size() == (~silent).sum()
+    again = build({"_target_": model})
+    assert not again.fit(data, Fold(heard(data, rows), rows[:0], asked), FitContext()).notes
+    batch = data.batch(asked)
+    assert torch.equal(found.predict(batch.tx, batch.rx).mean, again.predict(batch.tx, batch.rx).mean)
+
+
+def test_without_censoring_all_rows_were_heard():
+    data, _, _ = town(20)
+    plain = replace(data, censored=None, mask=None)
+    assert np.array_equal(heard(plain, np.array([3, 1])), [3, 1]) and not left_out_note(plain, np.arange(3))
+
+
+def test_nothing_heard_at_all_is_finite():
+    data, _, _ = town(40)
+    deaf = replace(data, censored=np.ones(40, bool), mask=np.zeros((40, 1), bool))
+    for model in MODELS:
+        found, deviation, _ = predicted(model, deaf, np.arange(40), np.arange(40))
+        assert np.isfinite(found).all() and np.isfinite(deviation).all()
+
+
+def test_silent_rows_alone_do_not_make_powers_spread_beyond_any_site():
+    """One row of forty heard, 20 dB above the level: the process fell to 167 dB below it."""
+    data, _, _ = town(40)
+    level = float(10 * np.log10(data.target.max()))
+    quiet = np.arange(40) > 0
+    rows = Rows(data.moving, np.where(quiet, level - 20, level), quiet)
+    process, _ = fit_powers(rows, data.site)
+    assert process.kernel.amplitude < 1001
+    assert process.answer(torch.from_numpy(data.moving))[0].min() > level - 100

@@ -1,0 +1,282 @@
+"""Checkpoints: what goes in comes out, and what should not come in stays out."""
+
+from __future__ import annotations
+
+import collections
+import os
+import pickle
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.models import checkpoint, loading
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.baselines.idw import InverseDistance
+from gsparc.models.checkpoint import CheckpointError
+from gsparc.training.context import FitContext
+
+CONFIG = """
+model: {_target_: gsparc.models.baselines.idw.InverseDistance, neighbours: 3, power: 1.0}
+seed: 4
+"""
+
+
+@pytest.fixture
+def fitted(campaign, folds, tmp_path):
+    data = campaign("spectrum", 30)
+    method = GaussianProcess()
+    method.fit(data, folds(30).folds[0], FitContext(tmp_path))
+    return method, data.batch(folds(30).folds[0].test)
+
+
+def test_predictions_survive_bit_for_bit(fitted, tmp_path):
+    method, batch = fitted
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    again, stored = loading.load(tmp_path / "m.ckpt")
+    before, after = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
+    assert torch.equal(before.mean, after.mean) and torch.equal(before.variance, after.variance)
+    assert stored.method == "gp" and stored.site.grid == method.site.grid
+    for name in ("origin", "box", "static_position", "rx_rotation"):
+        assert np.array_equal(getattr(stored.site, name), getattr(method.site, name))
+    assert stored.site.target_scale == method.site.target_scale and stored.site.array is None
+
+
+def test_the_stored_settings_are_used(campaign, folds, tmp_path):
+    data = campaign("rssi", 20)
+    method = InverseDistance(neighbours=3, power=1.0)
+    method.fit(data, folds(20).folds[0], FitContext(tmp_path))
+    checkpoint.save(tmp_path / "m.ckpt", method, CONFIG)
+    again, stored = loading.load(tmp_path / "m.ckpt")
+    assert (again.neighbours, again.power) == (3, 1.0) and stored.configuration["seed"] == 4
+
+
+def test_extra_keeps_its_shape(fitted, tmp_path):
+    named = collections.namedtuple("Named", "a b")
+    extra = {
+        "optimizer": {
+            "state": {0: {"step": torch.tensor(3.0)}},
+            "groups": [{"lr": 1e-3, "betas": (0.9, 0.99)}],
+        },
+        "rng": torch.get_rng_state(),
+        "numpy": np.arange(3, dtype=np.int64),
+        "scalar": np.float64(0.25),
+        "path": Path("a/b"),
+        "none": None,
+        "ordered": collections.OrderedDict(x=1),
+        "tuple": named(1, 2),
+    }
+    checkpoint.save(tmp_path / "m.ckpt", fitted[0], extra=extra)
+    back = checkpoint.read(tmp_path / "m.ckpt").extra
+    assert back["optimizer"]["groups"] == [{"lr": 1e-3, "betas": (0.9, 0.99)}]
+    assert back["optimizer"]["state"][0]["step"] == 3 and torch.equal(back["rng"], extra["rng"])
+    assert back["scalar"] == 0.25 and back["path"] == "a/b" and back["ordered"] == {"x": 1}
+    assert torch.equal(back["numpy"], torch.arange(3)) and back["tuple"] == (1, 2) and back["none"] is None
+
+
+def test_what_cannot_be_stored_is_named(fitted, tmp_path):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    before = path.read_bytes()
+    with pytest.raises(CheckpointError, match=re.escape("extra.a[1] is a object")):
+        checkpoint.save(path, fitted[0], extra={"a": [1, object()]})
+    assert path.read_bytes() == before
+    with pytest.raises(CheckpointError, match="not been fitted"):
+        checkpoint.save(path, GaussianProcess())
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(fitted, tmp_path, monkeypatch):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    before = path.read_bytes()
+
+    def full(content, file):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(CheckpointError, match="No space"):
+        checkpoint.save(path, fitted[0])
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["m.ckpt"]
+
+
+def test_a_view_does_not_drag_its_storage_along(fitted, tmp_path):
+    checkpoint.save(tmp_path / "small.ckpt", fitted[0])
+    checkpoint.save(tmp_path / "view.ckpt", fitted[0], extra={"row": torch.zeros(1_000_000)[:10]})
+    small, view = ((tmp_path / f"{name}.ckpt").stat().st_size for name in ("small", "view"))
+    assert view < small + 10_000
+
+
+class Hostile:
+    def __reduce__(self):
+        return os.system, (f"touch {self.mark}",)
+
+
+def test_hostile_pickle_is_refused_and_not_run(tmp_path):
+    thing = Hostile()
+    thing.mark = tmp_path / "owned"
+    torch.save({"format": checkpoint.FORMAT, "state": thing}, tmp_path / "m.ckpt")
+    with pytest.raises(CheckpointError, match="could run code"):
+        checkpoint.read(tmp_path / "m.ckpt")
+    (tmp_path / "p.ckpt").write_bytes(pickle.dumps(thing))
+    with pytest.raises(CheckpointError, match="not a gsparc checkpoint"):
+        checkpoint.read(tmp_path / "p.ckpt")
+    assert not (tmp_path / "owned").exists()
+
+
+def rewritten(path: Path, **changes) -> Path:
+    content = torch.load(path, weights_only=True)
+    content.update(changes)
+    torch.save(content, path)
+    return path
+
+
+def test_hostile_config_is_refused_and_not_run(fitted, tmp_path):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    mark = tmp_path / "owned"
+    # Hydra itself blocks os.system and its like; this one it would call.
+    target = "pathlib.Path.touch"
+    rewritten(path, target=target, config=f"model: {{_target_: {target}, _args_: ['{mark}']}}")
+    with pytest.raises(CheckpointError, match="which is not a class of gsparc"):
+        loading.load(path)
+    rewritten(path, target=target, config="")
+    with pytest.raises(CheckpointError, match="which no gsparc or plugin here knows"):
+        loading.load(path)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema_version": 99}, "schema 99"),
+        ({"schema_version": "2"}, "schema '2', this gsparc reads 2 alone; train again"),
+        ({"schema_version": 1}, "schema 1, this gsparc reads 2 alone; train again"),
+        ({"schema_version": None}, "without a schema version, this gsparc reads 2 alone; train again"),
+        ({"format": "other"}, "not a gsparc checkpoint"),
+        ({"site": {}}, "incomplete"),
+        ({"state": 3}, "incomplete"),
+    ],
+)
+def test_wrong_content_is_one_clear_line(fitted, tmp_path, changes, words):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    with pytest.raises(CheckpointError, match=words) as caught:
+        loading.load(rewritten(path, **changes))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_missing_and_damaged_files(fitted, tmp_path):
+    with pytest.raises(CheckpointError, match="no such checkpoint"):
+        checkpoint.read(tmp_path / "none.ckpt")
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    whole = path.read_bytes()
+    for cut in (0, 10, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(CheckpointError):
+            loading.load(path)
+    path.write_bytes(whole)
+    with pytest.raises(CheckpointError, match="cannot be restored"):
+        loading.load(rewritten(path, state={"shape": [1]}))
+
+
+def test_others_may_read_a_checkpoint_as_the_umask_says(fitted, tmp_path):
+    """Models were readable by their owner alone (mode 600), unlike every other file of a run."""
+    before = os.umask(0o027)
+    try:
+        checkpoint.save(tmp_path / "m.ckpt", fitted[0])
+    finally:
+        os.umask(before)
+    assert (tmp_path / "m.ckpt").stat().st_mode & 0o777 == 0o640
+
+
+def test_one_changed_byte_is_seen(fitted, tmp_path):
+    """A byte that changed in a tensor was loaded and answered with."""
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    with zipfile.ZipFile(path) as archive:
+        largest = max(archive.infolist(), key=lambda member: member.file_size)
+    content = bytearray(path.read_bytes())
+    content[largest.header_offset + len(content) // 100 + 200] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"damaged .*CRC"):
+        checkpoint.read(path)
+
+
+def test_an_entry_marked_as_a_folder_is_read_all_the_same(fitted, tmp_path):
+    """torch took such an entry for read and answered with whatever the memory held."""
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    sound = checkpoint.read(path).state
+    content = bytearray(path.read_bytes())
+    entry = content.find(b"PK\x01\x02")
+    while entry >= 0:
+        content[entry + 38] |= 0x10
+        entry = content.find(b"PK\x01\x02", entry + 4)
+    path.write_bytes(content)
+    found = checkpoint.read(path).state
+    assert same(found, sound)
+
+
+def same(one, other) -> bool:
+    """Whether states are equal."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(part, other[name]) for name, part in one.items())
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+
+
+def test_a_damaged_directory_is_no_traceback(fitted, tmp_path):
+    """`zipfile.is_zipfile` raises on some."""
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    whole = path.read_bytes()
+    for place in range(len(whole) - 120, len(whole)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        try:
+            checkpoint.read(path)
+        except CheckpointError as refused:
+            assert "\n" not in str(refused)
+
+
+def test_bytes_in_front_are_not_called_code(fitted, tmp_path):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    path.write_bytes(b"#!" + path.read_bytes())
+    with pytest.raises(CheckpointError, match="not a gsparc checkpoint"):
+        checkpoint.read(path)
+
+
+def test_what_is_not_the_model_is_named(tmp_path):
+    """The searches in a last.ckpt were called weights of another program, a folder no checkpoint at all."""
+    torch.save({"key": "k", "spent_s": 1.0, "searches": {}}, tmp_path / "last.ckpt")
+    with pytest.raises(CheckpointError, match=r"ckpt_path=; the model is model\.ckpt"):
+        checkpoint.read(tmp_path / "last.ckpt")
+    np.savez(tmp_path / "data.npz", rx_position=np.zeros(3))
+    with pytest.raises(CheckpointError, match="an archive, but not a gsparc checkpoint"):
+        checkpoint.read(tmp_path / "data.npz")
+    with pytest.raises(CheckpointError, match="a folder; give the file itself"):
+        checkpoint.read(tmp_path)
+    (tmp_path / "model.ckpt").touch()
+    with pytest.raises(CheckpointError, match=r"a folder; say .*model\.ckpt"):
+        checkpoint.read(tmp_path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("part", ["state", "site"])
+def test_numbers_that_are_not_finite_are_refused_by_name(fitted, tmp_path, part, value):
+    """With a right checksum they gave NaN pixels, wrong finite ones, and a confidence of NaN."""
+    file = tmp_path / "m.ckpt"
+    checkpoint.save(file, fitted[0])
+    content = torch.load(file, weights_only=True)
+    tensors = {
+        k: v for k, v in content[part].items() if isinstance(v, torch.Tensor) and v.is_floating_point()
+    }
+    name, tensor = next(iter(tensors.items()))
+    tensor.view(-1)[0] = value
+    torch.save(content, file)
+    with pytest.raises(CheckpointError, match=rf"m\.ckpt: {part}\.{name}\[0.*\] is NaN or infinite"):
+        checkpoint.read(file)

@@ -1,0 +1,48 @@
+"""Images predicted without their neighbours are what a fit without these rows predicts."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+
+from gsparc.models.baselines.gp import choose_kernel
+from gsparc.models.left_out_images import LeftOut
+
+COUNT, PIXELS = 30, 12
+
+
+@pytest.fixture(scope="module")
+def left() -> LeftOut:
+    draws = np.random.default_rng(0)
+    places = np.c_[draws.uniform(0, 1, (COUNT, 2)), np.zeros(COUNT)]
+    images = np.sin(places @ draws.normal(0, 4, (3, PIXELS))) / 3 + 0.5
+    gaps, centres = np.array([0.0, 0.2, 5.0]), np.array([3, 11, 20])
+    return LeftOut(places, images, centres, gaps, np.zeros((3, 3, PIXELS)))
+
+
+def test_the_process_has_not_seen_what_lies_within_the_gap(left):
+    found = left.by_process()
+    mean, at = left.images.mean(0), torch.from_numpy(left.positions)
+    vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
+    kernel = choose_kernel(left.positions, vectors * lengths, PIXELS)
+    for g, c in [(0, 0), (1, 1), (1, 2)]:
+        i = left.centres[c]
+        far = np.linalg.norm(left.positions - left.positions[i], axis=1) > left.gaps[g]
+        weights = np.linalg.solve(kernel.gram(at[far]).numpy(), left.images[far] - mean)
+        wanted = mean + kernel.between(at[[i]], at[far])[0].numpy() @ weights
+        assert np.allclose(found[g, c], wanted, atol=1e-6)
+    assert np.isnan(found[2]).all()  # nothing lies beyond 5 m
+    assert len(left.at(2, found)[0]) == 0 and len(left.at(0, found)[0]) == 3
+
+
+def test_the_gap_is_as_wide_as_held_out_rows_are_far(left):
+    apart = cdist(left.positions, left.positions)
+    np.fill_diagonal(apart, np.inf)
+    assert left.as_far_as(float(np.median(apart[left.centres].min(1)))) == 0
+    assert left.as_far_as(0.25) == 1 and left.as_far_as(None) == 0
+
+
+def test_it_goes_through_a_checkpoint(left):
+    again = LeftOut.of(left.state())
+    assert again is not None and LeftOut.of(None) is None
+    assert all(np.array_equal(value, vars(again)[key]) for key, value in vars(left).items())

@@ -1,0 +1,107 @@
+"""Runs of many parts: finished ones are taken, none for another, and what is said of how to go on is true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import SplitSettings, make_split
+from gsparc.models import checkpoint, parts
+from gsparc.models.baselines.nearest import Nearest
+from gsparc.models.per_station import PerStation, of_station
+from gsparc.training.context import FitContext
+
+POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
+
+
+class Resumable(Nearest):
+    """Counts its fits, and is interrupted in the one whose turn it is."""
+
+    resumable = takes_budget = True
+    fits, stop_at = 0, 0
+
+    def fit(self, data, fold, context):
+        """See `Method.fit`."""
+        Resumable.fits += 1
+        if Resumable.fits == Resumable.stop_at:
+            raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet")
+        return super().fit(data, fold, context)
+
+
+@pytest.fixture()
+def town():
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    far = np.linalg.norm(walk[:, None] - POSTS, axis=-1)
+    data = from_arrays({"tx_position": walk, "station_position": POSTS, "rssi_db": -20 * np.log10(far)})
+    return data, make_split(data.moving, SplitSettings(), place=data.place, station=data.station).folds[0]
+
+
+def fitted(town, folder, stop_at=0, **more):
+    Resumable.fits, Resumable.stop_at = 0, stop_at
+    method = PerStation(Resumable)
+    method.fit(*town, FitContext(folder, **more))
+    return method
+
+
+def test_stations_were_mixed_up_and_done_again_by_a_resumed_run(town, tmp_path, caplog):
+    """Stopped at antenna 13, "go on with" its file began again at antenna 0 with what 13 had found."""
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        fitted(town, tmp_path / "run", stop_at=3)
+    said = str(stopped.value)
+    assert said.startswith("station 3 of 3 was interrupted, 2 are finished; go on with ckpt_path=")
+    left = said.partition("ckpt_path=")[2]
+    for resume in (left, tmp_path / "run" / "station2" / "last.ckpt"):  # the run, or a file in a part
+        again = fitted(town, tmp_path / "on", resume=type(tmp_path)(resume))
+        assert Resumable.fits == 1
+    whole, batch = fitted(town, tmp_path / "whole"), town[0].batch(town[1].test)
+    assert (again.answer(batch).mean == whole.answer(batch).mean).all()
+    assert len(list((tmp_path / "on").glob("station*/model.ckpt"))) == 3  # it can be gone on from, too
+
+
+def test_a_part_is_not_taken_for_another(town, tmp_path):
+    data = town[0]
+    fitted(town, tmp_path / "run")
+    one, two = (data.subset(np.flatnonzero(data.station == t), of_station(data.site, t)) for t in (0, 1))
+    assert one.site.sha256 != two.site.sha256 != data.site.sha256
+    (tmp_path / "run" / "station1" / "model.ckpt").rename(tmp_path / "run" / "station0" / "model.ckpt")
+    with pytest.raises(ValueError, match="was trained with other data"):
+        fitted(town, tmp_path / "on", resume=tmp_path / "run")
+    with pytest.raises(ValueError, match=r"seed=0 \(here 1\)"):
+        fitted(town, tmp_path / "on", resume=tmp_path / "run", seed=1)
+
+
+def test_a_run_that_begins_anew_leaves_no_parts_of_the_one_before(town, tmp_path):
+    fitted(town, tmp_path, seed=1)
+    with pytest.raises(KeyboardInterrupt):
+        fitted(town, tmp_path, stop_at=2)
+    assert [path.parent.name for path in tmp_path.glob("station*/model.ckpt")] == ["station0"]
+
+
+def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
+    data, fold = town
+    context = FitContext(tmp_path / "fold0", stations="each")
+    method, Resumable.fits, Resumable.stop_at = PerStation(Resumable), 0, 0
+    report = method.fit(data, fold, context)
+    checkpoint.save(tmp_path / "fold0" / "model.ckpt", method, extra=parts.marks(report, data, fold, context))
+    again = PerStation(Resumable)
+    found = parts.fit(again, data, fold, replace(context, resume=tmp_path / "fold0"))
+    assert Resumable.fits == 3 and found.seconds == report.seconds and again.site is not None
+
+
+def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(town, tmp_path, caplog):
+    caplog.set_level("INFO", "gsparc")
+    fitted(town, tmp_path, budget_s=30.0)
+    lines = [one.getMessage() for one in caplog.records if one.getMessage().startswith("station ")]
+    assert lines == [f"station {i + 1} of 3: {i}, about 30 s left for all" for i in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("given", "found"), [("run", "run"), ("run/fold1", "run"), ("run/fold1/refit/last.ckpt", "run")]
+)
+def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
+    (tmp_path / "run" / "fold1" / "refit").mkdir(parents=True)
+    (tmp_path / "run" / "fold1" / "refit" / "last.ckpt").touch()
+    assert parts.folder_of(tmp_path / given, parts.FOLDS) == tmp_path / found

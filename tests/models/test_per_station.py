@@ -1,0 +1,243 @@
+"""A copy of a method for each station, and one for stations that were never heard."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gsparc
+from gsparc.commands.study.run import fit_and_score, in_folders
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold, Split, SplitSettings, make_split
+from gsparc.evaluation.baseline_cache import fitting
+from gsparc.evaluation.evaluate import evaluate
+from gsparc.evaluation.scores import score
+from gsparc.models import checkpoint, loading
+from gsparc.models.per_station import PerStation, for_links, of_station
+from gsparc.models.registry import method_class
+from gsparc.prediction.timing import ClockSettings
+from gsparc.training.context import FitContext
+
+POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5], [20, 20, 5]])
+LOSS = np.array([0.0, 10.0, 20.0, 30.0])  # stations are not calibrated
+
+
+@pytest.fixture(scope="module")
+def town():
+    """Free space and a constant for each of four stations."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (120, 3))
+    far = np.linalg.norm(walk[:, None] - POSTS, axis=-1)
+    return from_arrays(
+        {"tx_position": walk, "station_position": POSTS, "rssi_db": -20 * np.log10(far) - LOSS}
+    )
+
+
+def fitted(name, data, fold, tmp_path):
+    method = for_links(method_class(name), data)
+    method.fit(data, fold, FitContext(tmp_path))
+    return method
+
+
+@pytest.fixture(scope="module")
+def fold(town):
+    return make_split(town.moving, SplitSettings(), place=town.place, station=town.station).folds[0]
+
+
+def test_every_station_has_its_own(town, fold, tmp_path):
+    method = fitted("mean", town, fold, tmp_path)
+    assert isinstance(method, PerStation)
+    found = method.answer(town.batch(fold.test)).mean[:, 0]
+    for number in range(len(POSTS)):
+        rows = fold.test[town.station[fold.test] == number]
+        alone = town.subset(np.flatnonzero(town.station == number), of_station(town.site, number))
+        assert alone.site.static_position is not None
+        assert len(found[town.station[fold.test] == number].unique()) == 1, rows
+    decibels = 10 * torch.log10(found)
+    assert decibels.max() - decibels.min() > 25
+
+
+def test_stations_are_found_by_their_places_too(town, fold, tmp_path):
+    method = fitted("idw", town, fold, tmp_path)
+    batch = town.batch(fold.test[::7])
+    assert torch.equal(method.predict(batch.tx, batch.rx).mean, method.answer(batch).mean)
+
+
+def test_checkpoints_hold_all_copies(town, fold, tmp_path):
+    method = fitted("gp", town, fold, tmp_path)
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    again, stored = loading.load(tmp_path / "m.ckpt")
+    assert stored.site.stations.name == town.site.stations.name
+    batch = town.batch(fold.test)
+    assert torch.equal(again.answer(batch).mean, method.answer(batch).mean)
+    predictor = gsparc.load(tmp_path / "m.ckpt")
+    place = town.tx[fold.test[0]] + town.site.origin
+    number = int(town.station[fold.test[0]])
+    one = predictor.at(number).rssi(tx=place)
+    assert one == pytest.approx(float(method.answer(town.batch(fold.test[:1])).mean) * town.site.target_scale)
+    with pytest.raises(ValueError, match=r"say which station: \.at\(name\)"):
+        predictor.rssi(tx=place)
+    with pytest.raises(ValueError, match="no station 'roof'; there are 0, 1"):
+        predictor.at("roof")
+
+
+def test_a_station_never_heard_is_asked_with_both_ends(town, tmp_path):
+    split = make_split(town.moving, SplitSettings("stations"), place=town.place, station=town.station)
+    found = fit_and_score(method_class("mean"), town, split, in_folders(FitContext(tmp_path)))
+    assert found.figures["rmse_db"] > 10
+    gsparc_like = type("OneEnd", (method_class("mean"),), {"both_ends": False})
+    with pytest.raises(ValueError, match="cannot predict stations that it never heard"):
+        fit_and_score(gsparc_like, town, split, in_folders(FitContext(tmp_path)))
+
+
+def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
+    fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
+    method = for_links(method_class("mean"), town)
+    method.fit(town, fold, FitContext(tmp_path, stations="together"))
+    assert len(dict(method)) == 1 and len(torch.unique(method.answer(town.batch(fold.test)).mean)) == 1
+    with pytest.raises(ValueError, match="stations='togehter': one of auto, each, together is needed"):
+        FitContext(tmp_path, stations="togehter")
+
+
+def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
+    walk = np.random.default_rng(0).uniform(0, 9, (40, 3))
+    data = from_arrays({"tx_position": walk, "rx_position": walk[::-1] + 1, "rssi_db": -walk[:, 0]})
+    assert for_links(method_class("idw"), data).both_ends
+    with pytest.raises(ValueError, match="both ends move here"):
+        for_links(method_class("array"), data)
+
+
+def test_real_city(tmp_path):
+    file = Path(__file__).parents[2] / ".." / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
+    if not file.is_file():
+        pytest.skip(f"{file.name} is not here")
+    with np.load(file) as stored:
+        data = from_arrays(
+            {
+                "tx_position": stored["mobile_position"], "tx_height": np.array(1.5),
+                "station_position": stored["station_position"], "station_height": np.array(10.0),
+                "station_name": stored["station"], "rssi_db": stored["rssi_db"],
+            }
+        )  # fmt: skip
+    split = make_split(
+        data.moving, SplitSettings("blocks", side_m=300.0), place=data.place, station=data.station
+    )
+    found = {
+        name: fit_and_score(method_class(name), data, split, in_folders(FitContext(tmp_path))).figures
+        for name in ("mean", "idw")
+    }
+    assert 9 < found["mean"]["rmse_db"] < 11 and 6 < found["idw"]["rmse_db"] < 8
+
+
+def test_a_constant_of_each_station_can_be_taken_away(town, tmp_path):
+    split = make_split(town.moving, SplitSettings("stations"), place=town.place, station=town.station)
+    fits = fit_and_score(method_class("mean"), town, split, in_folders(FitContext(tmp_path)), eval_on=None)
+    found = evaluate(
+        fits.methods, None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
+    ).facts  # fmt: skip
+    spread = np.std(10 * np.log10(town.target[:, 0]).reshape(-1, 4), axis=0)
+    assert found["test/rmse_db_after_constant"] == pytest.approx(np.sqrt(np.mean(spread**2)), rel=0.01)
+    assert found["test/rmse_db"] > 2 * found["test/rmse_db_after_constant"]
+
+
+def test_a_station_that_heard_nothing_ended_the_run():
+    """Methods that learn from what was heard alone found an empty training set there."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    levels_db = -20 * np.log10(np.linalg.norm(walk[:, None] - POSTS, axis=-1)) - 40
+    levels_db[:, 2] = np.nan
+    data = from_arrays(
+        {"tx_position": walk, "station_position": POSTS, "rssi_db": levels_db, "sensitivity_db": -80.0}
+    )
+    split = make_split(data.moving, SplitSettings(), place=data.place, station=data.station)
+    for name in ("nearest", "kriging", "gp"):
+        method = for_links(method_class(name), data)
+        method.fit(data, split.folds[0], FitContext())
+        assert method.answer(data.batch(split.folds[0].test)).mean.isfinite().all()
+
+
+def test_sectors_of_one_mast_were_answered_by_the_first():
+    """A position does not say which of two stations there is meant: the first one answered for both."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    levels_db = np.stack([-walk[:, 0], -30 - walk[:, 1]], axis=1)
+    data = from_arrays(
+        {
+            "tx_position": walk, "station_position": POSTS[[0, 0]], "rssi_db": levels_db,
+            "station_name": np.array(["sector 1", "sector 2"]),
+        }
+    )  # fmt: skip
+    split = make_split(data.moving, SplitSettings(), place=data.place, station=data.station)
+    method = for_links(method_class("idw"), data)
+    method.fit(data, split.folds[0], FitContext())
+    batch = data.batch(split.folds[0].test)
+    found = 10 * method.answer(batch).mean.log10()[:, 0]
+    assert (found[batch.station == 0] - found[batch.station == 1]).min() > 5
+    with pytest.raises(ValueError, match="sector 1 and sector 2 stand at one place"):
+        method.predict(batch.tx, batch.rx)
+
+
+def test_the_place_of_a_single_station_was_sought():
+    """A table of one station, or the one that `dataset.stations` keeps, had no place."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    for end in ("tx", "rx"):
+        levels_db = -20 * np.log10(np.linalg.norm(walk - POSTS[1], axis=1))[:, None]
+        data = from_arrays({f"{end}_position": walk, "station_position": POSTS[1:2], "rssi_db": levels_db})
+        np.testing.assert_allclose(data.site.static_position + data.site.origin, POSTS[1])
+        split = make_split(data.moving, SplitSettings(), place=data.place, station=data.station)
+        method = for_links(method_class("distance_law"), data)
+        notes = method.fit(data, split.folds[0], FitContext()).notes
+        assert len(notes) == 1 and "exponent 2" in notes[0]
+        assert data.batch(split.folds[0].test).rx.batched == (end == "rx")
+
+
+def test_a_baseline_that_cannot_ended_the_run_of_a_station_with_few_rows():
+    """`complex_gp` knows one end that stands still: it is left out where a station taught nothing."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    csi = np.exp(-2j * np.pi * np.linalg.norm(walk[:, None] - POSTS[:2], axis=-1))
+    mask = np.ones(csi.shape, bool)
+    mask[3:, 1] = False
+    data = from_arrays(
+        {"tx_position": walk, "station_position": POSTS[:2], "csi": csi, "mask": mask, "frequency_hz": 3e8}
+    )
+    folds = [
+        Fold(np.setdiff1d(np.arange(len(data)), rows), np.zeros(0, int), np.array(rows))
+        for rows in ([0, 4, 6], [1, 4, 6])
+    ]
+    kept = [fitting(data, Split("random", (fold,), "")) for fold in folds]
+    assert ["complex_gp" in names for names in kept] == [True, False]
+
+
+def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeypatch):
+    """A file of 50,000 rows at 12 stations read 12 large matrices for every 64 rows: half an hour."""
+    method = fitted("gp", town, fold, tmp_path)
+    whole = score([method], town, Split("random", (fold,), ""))
+    asked = []
+    monkeypatch.setattr("gsparc.evaluation.scores.CHUNK", 6)
+    answer = method.answer
+    monkeypatch.setattr(method, "answer", lambda b: asked.append(len(b.station.unique())) or answer(b))
+    parts = score([method], town, Split("random", (fold,), ""))
+    assert sum(asked) < len(asked) + len(POSTS)
+    np.testing.assert_array_equal(parts.row, whole.row)
+    for name in whole.samples:
+        np.testing.assert_allclose(parts.samples[name], whole.samples[name], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(parts.variance, whole.variance, rtol=1e-4)
+
+
+def test_seconds_of_stations_were_said_to_be_unused(town):
+    assert for_links(method_class("gsparc"), town).takes_budget
+    assert not for_links(method_class("idw"), town).takes_budget
+
+
+def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
+    """A search keeps what it finds in `run_dir`; without one that of station 0 became ./station0."""
+    folders = []
+
+    class Writes(method_class("mean")):
+        def fit(self, data, fold, context):
+            folders.append(context.run_dir)
+            return super().fit(data, fold, context)
+
+    for context in (FitContext(), FitContext(tmp_path)):
+        for_links(Writes, town).fit(town, fold, context)
+    assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders

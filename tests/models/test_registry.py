@@ -1,0 +1,78 @@
+"""Methods by name, and what a file may ask to build."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gsparc.data import instantiate
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.method import Method
+from gsparc.models.registry import METHODS, build, method_class
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_name_is_a_method(name):
+    assert issubclass(method_class(name), Method)
+
+
+def test_every_model_of_the_configuration_has_a_name():
+    """`model=directional_gp` could be trained, but was no baseline, nor read from a bare checkpoint."""
+    files = (Path(__file__).parents[2] / "conf" / "model").glob("*.yaml")
+    targets = {file.stem: yaml.safe_load(file.read_text())["_target_"] for file in files}
+    assert targets == METHODS
+
+
+def test_a_typo_gets_the_nearest_name():
+    with pytest.raises(ValueError, match="did you mean 'nearest'"):
+        method_class("neareast")
+    with pytest.raises(ValueError, match=r"there are .*gp, gsparc, .*idw"):
+        method_class("xxxxxxxx")
+
+
+def test_a_config_becomes_a_method():
+    method = build({"_target_": "gsparc.models.baselines.gp.GaussianProcess", "components": 7})
+    assert isinstance(method, GaussianProcess) and method.limit == 7
+    with pytest.raises(ValueError, match=r"not a gsparc\.methods\.method\.Method"):
+        build({"_target_": "pathlib.Path"})
+    with pytest.raises(ValueError, match="_target_"):
+        build({"components": 7})
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "gsparc.evaluation.summary.os.system",
+        "gsparc.evaluation.summary.write_summary",
+        "gsparc.nowhere.X",
+        3,
+        "builtins.eval",
+    ],
+)
+def test_text_from_a_file_builds_our_classes_only(target, tmp_path):
+    hostile = {
+        "_target_": "gsparc.models.baselines.gp.GaussianProcess",
+        "components": {"_target_": target, "_args_": ["x"]},
+    }
+    for config in (hostile, {"_target_": target}, {**hostile, "components": [hostile["components"]]}):
+        with pytest.raises(ValueError, match="refused"):
+            build(config, trusted=False)
+    assert build({"_target_": "gsparc.models.baselines.gp.GaussianProcess"}, trusted=False).limit > 0
+
+
+def test_entry_points_of_plugins_were_read_for_every_class_of_a_checkpoint(monkeypatch):
+    """65 times for a model of four stations: most of the seconds of `gsparc.load`."""
+    monkeypatch.setattr(instantiate, "plugins", lambda group: pytest.fail("entry points are read"))
+    instantiate.refuse_foreign("gsparc.models.baselines.gp.GaussianProcess")
+    monkeypatch.setattr(instantiate, "plugins", lambda group: {})
+    for path in (
+        "gsparc.data.instantiate.find",
+        "os.system",
+        "gsparc.models.baselines.gp.torch.nn.Linear",
+        None,
+    ):
+        with pytest.raises(ValueError, match="not a class of gsparc"):
+            instantiate.refuse_foreign(path)

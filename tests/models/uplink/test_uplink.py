@@ -1,0 +1,210 @@
+"""Sources estimated in an uplink, and the methods that read one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cities import city, deaf, fold, folder
+
+from gsparc.data.campaigns.argos import load_argos
+from gsparc.models import checkpoint, loading
+from gsparc.models.baselines.ridge import Ridge
+from gsparc.models.peers.fire import Fire
+from gsparc.models.uplink.error_model import estimate_noise
+from gsparc.models.uplink.method import UplinkField
+from gsparc.models.uplink.posterior import Sources
+from gsparc.models.uplink.search import SearchSettings, SourceSearch
+from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
+from gsparc.training.context import FitContext
+
+
+def _aperture() -> Aperture:
+    side = torch.arange(8.0) - 3.5
+    return Aperture(torch.cartesian_prod(side, side) / 2, torch.arange(26.0) - 12.5)
+
+
+def _three() -> Sources:
+    direction = torch.tensor([[[0.31, -0.2], [-0.52, 0.11], [0.05, 0.63]]])
+    delay, gain = torch.tensor([[0.013, 0.091, -0.04]]), torch.tensor([[1.0, 0.5j, -0.3 + 0.1j]])
+    none = torch.zeros(1, 3, 3), torch.zeros(1, 9, 9), torch.zeros(1, 3, 9, dtype=torch.complex64)
+    return Sources(direction, delay, gain, *none)
+
+
+def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
+    aperture, truth = _aperture(), _three()
+    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=6, leakage=1e-6))
+    heard = truth.response(aperture)
+    found, left = search(heard, torch.tensor([1e-6]))
+    assert left.abs().square().mean() < 1e-5 * heard.abs().square().mean()
+    for which in range(3):
+        near = (found.delay[0] - truth.delay[0, which]).abs().argmin()
+        assert (found.direction[0, near] - truth.direction[0, which]).abs().max() < 1e-2
+        assert (found.gain[0, near] - truth.gain[0, which]).abs() < 1e-2
+    other = replace(aperture, tones=aperture.tones + 27)
+    miss = (found.response(other) - truth.response(other)).abs().square().mean()
+    assert miss < 1e-3 * truth.response(other).abs().square().mean()
+
+
+def test_noise_is_read_off_empty_delays() -> None:
+    aperture = _aperture()
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(1, 64, 26, dtype=torch.complex64, generator=generator) * 0.1
+    guess = estimate_noise(_three().response(aperture) + noise, aperture, (-0.12, 0.3))
+    assert 0.005 < float(guess) < 0.02
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    data = city("all")
+    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
+    method.fit(data, fold(), FitContext())
+    return method, data
+
+
+def _share(method, data, rows) -> float:
+    batch = data.batch(rows)
+    miss = method.answer(batch).mean - batch.target
+    return float((miss.abs().square().sum((1, 2)) / batch.target.abs().square().sum((1, 2))).median())
+
+
+def test_beats_ridge_by_more_than_three_decibels(fitted) -> None:
+    method, data = fitted
+    ridge = Ridge()
+    ridge.fit(data, fold(), FitContext())
+    assert _share(method, data, fold().test) < 0.5 * _share(ridge, data, fold().test)
+
+
+def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:
+    """Whatever turns the uplink turns the prediction: offsets are the snapshot's, not the model's."""
+    method, data = fitted
+    uplink = data.batch(fold().test[:4]).uplink
+    noise = torch.full((4,), float(data.noise_variance[0]))
+    plain = method.from_uplink(uplink, noise).mean
+    up, down = method.search.aperture.tones, method._downlink.tones
+    turned = method.from_uplink(uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up), noise).mean
+    expected = plain * torch.polar(torch.ones(26), 0.4 - 0.15 * down)
+    close = (turned - expected).abs().square().sum() / expected.abs().square().sum()
+    assert close < 1e-2
+
+
+def test_confidence_is_a_share_and_is_larger_where_errors_are_smaller(fitted) -> None:
+    method, data = fitted
+    batch = data.batch(np.concatenate([fold().val, fold().test]))
+    found = method.answer(batch)
+    assert ((found.confidence > 0) & (found.confidence < 1)).all()
+    error = (found.mean - batch.target).abs().square().sum((1, 2)) / batch.target.abs().square().sum((1, 2))
+    sure = found.confidence > found.confidence.median()
+    assert error[sure].median() < error[~sure].median()
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Ridge(), lambda: Ridge("all"), lambda: Fire(hidden=16, code=4, steps=20, batch=16)]
+)
+def test_peers_answer_and_keep(make, tmp_path) -> None:
+    data = city()
+    method = make()
+    method.fit(data, fold(), FitContext(tmp_path))
+    batch = data.batch(fold().test)
+    before = method.answer(batch).mean
+    assert before.shape == batch.target.shape
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    again, _ = loading.load(tmp_path / "m.ckpt")
+    assert torch.allclose(again.answer(batch).mean, before)
+
+
+@pytest.mark.parametrize("inputs", ["own", pytest.param("all", marks=pytest.mark.slow)])
+def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
+    """A Gram matrix of zeros ended in the library's sequences about singular matrices."""
+    data = city("all")
+    uplink = data.uplink.copy()
+    uplink[:, 0] = 0
+    method = Ridge(inputs)
+    method.fit(replace(data, uplink=uplink), fold(), FitContext())
+    predicted = method.from_uplink(torch.from_numpy(uplink[fold().test])).mean
+    assert torch.isfinite(torch.view_as_real(predicted)).all() and predicted[:, 1:].abs().min() > 0
+    assert inputs == "all" or (predicted[:, 0] == 0).all()
+
+
+def test_saved_and_restored(fitted, tmp_path) -> None:
+    method, data = fitted
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    again, _ = loading.load(tmp_path / "m.ckpt")
+    batch = data.batch(fold().test[:3])
+    assert torch.equal(again.answer(batch).mean, method.answer(batch).mean)
+
+
+def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
+    method, data = fitted
+    with pytest.raises(ValueError, match="has none"):
+        Ridge().fit(deaf(data), fold(), FitContext())
+    batch = data.batch(fold().test[:2])
+    with pytest.raises(ValueError, match="not positions"):
+        method.predict(batch.tx, batch.rx)
+    with pytest.raises(ValueError, match="fit or restore"):
+        UplinkField().answer(batch)
+
+
+def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None:
+    """The release's own layout: a line has one direction cosine, and noise is read off empty delays."""
+    for name in ("csidata.npy", "base-station.yml"):
+        (tmp_path / name).write_bytes((folder() / name).read_bytes())
+    text = (tmp_path / "base-station.yml").read_text()
+    kept = [line for line in text.splitlines() if not line.startswith("noise_power")]
+    (tmp_path / "base-station.yml").write_text("\n".join(kept))
+    data = load_argos(tmp_path, lambda uplink, rows: np.abs(uplink[:, 0, :3]).astype(float))
+    assert data.noise_variance is None and data.uplink.shape[1] == 8
+    method = UplinkField(SearchSettings(rounds=3, picks=4, final=2), teachers=60)
+    method.fit(data, fold(), FitContext())
+    assert method.search.shape[1] == 1
+    assert _share(method, data, fold().test) < 0.3
+
+
+def test_columns_are_the_slopes_and_their_inner_products() -> None:
+    """One Gram matrix holds atoms and slopes: it equals that of finite differences."""
+    aperture, three = _aperture(), _three()
+
+    def atoms(moved: torch.Tensor) -> torch.Tensor:
+        direction, delay = three.direction.double().clone(), three.delay.double().clone()
+        direction, delay = direction + moved[:2], delay + moved[2]
+        exact = Aperture(aperture.places.double(), aperture.tones.double())
+        return (steering(direction, exact)[..., None] * delays(delay, exact)[:, :, None]).flatten(2)[0]
+
+    step = 1e-6
+    slopes = [(atoms(step * row) - atoms(-step * row)) / (2 * step) for row in torch.eye(3).double()]
+    flat = torch.cat([atoms(torch.zeros(3).double()), *slopes])
+    columns = Columns.of(three.direction, three.delay, aperture)
+    assert torch.allclose(columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0)
+    snapshot = three.response(aperture)
+    wanted = flat.conj() @ snapshot.flatten().to(flat.dtype)
+    assert torch.allclose(columns.inner(snapshot)[0], wanted.to(torch.complex64), rtol=1e-3, atol=2.0)
+
+
+def test_posterior_tells_the_error_of_the_other_band() -> None:
+    """Posterior variance equals the mean squared error over noise, in the other band and on one antenna."""
+    aperture, truth = _aperture(), _three()
+    count, noise = 200, 0.05
+    generator = torch.Generator().manual_seed(0)
+    heard = truth.response(aperture).expand(count, -1, -1)
+    heard = heard + noise**0.5 * torch.randn(heard.shape, dtype=torch.complex64, generator=generator)
+    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
+    found, _ = search(heard, torch.full((count,), noise))
+    other = replace(aperture, tones=aperture.tones + 27)
+    for where in (other, Aperture(other.places[:1], other.tones[:5])):
+        miss = (found.response(where) - truth.response(where)).abs().square().mean((1, 2))
+        assert 0.6 < float(miss.median() / found.error_variance(where).median()) < 1.6
+
+
+def test_expected_errors_hold_on_a_narrow_grid_of_one_antenna(fitted) -> None:
+    """Pieces of the downlink are in fades that the whole never is in: expected errors follow."""
+    method, data = fitted
+    rows = np.concatenate([fold().val, fold().test])
+    batch = data.batch(rows)
+    few = torch.from_numpy(data.site.subcarriers_hz[11:15])
+    found = method.from_uplink_at(batch.uplink, few, batch.noise_variance, slice(0, 1))
+    error = (found.mean - batch.target[:, :1, 11:15]).abs().square().mean((1, 2))
+    sure = found.confidence > found.confidence.median()
+    share = error / batch.target[:, :1, 11:15].abs().square().mean((1, 2))
+    assert share[sure].median() < 0.5 * share[~sure].median()

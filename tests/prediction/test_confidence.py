@@ -1,0 +1,67 @@
+"""A confidence kept with a model, and what `gsparc.load` answers with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import gsparc
+from gsparc.models import checkpoint, loading
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.prediction.confidence import Trusted, as_confidence, keep
+from gsparc.prediction.confidence_scores import gather, known_positions, position_kernel
+from gsparc.prediction.risk_threshold import Promise
+from gsparc.training.context import FitContext
+
+
+@pytest.fixture
+def site(campaign, folds, tmp_path):
+    data, fold = campaign("spectrum", 60), folds(60).folds[0]
+    method = GaussianProcess()
+    method.fit(data, fold, FitContext(tmp_path))
+    file = tmp_path / "gp.ckpt"
+    checkpoint.save(file, method)
+    return data, fold, file
+
+
+def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
+    data, fold, file = site
+    method, _ = loading.load(file)
+    evidence = gather(method, data, fold, fold.test)
+    keep(file, Trusted("distance", 0.2, Promise(), known_positions(data, fold), position_kernel(data, fold)))
+    world = data.tx[fold.test] + data.site.origin
+    for kind, score in evidence.scores.items():
+        answered = gsparc.load(file, confidence=kind).confidence(tx=world)
+        assert answered.dtype == np.float32 and ((answered >= 0) & (answered <= 1)).all()
+        assert np.allclose(answered, as_confidence(kind, score), atol=1e-3)
+    plain = gsparc.load(file)
+    assert np.allclose(plain.confidence(tx=world), as_confidence("distance", evidence.scores["distance"]))
+    assert np.array_equal(plain.accepts(tx=world), plain.confidence(tx=world) >= 0.2)
+    assert isinstance(plain.accepts(tx=world[0]), bool)
+
+
+def test_what_was_never_stored_is_said(site) -> None:
+    data, fold, file = site
+    world = data.tx[fold.test[:2]] + data.site.origin
+    with pytest.raises(ValueError, match="no threshold is stored"):
+        gsparc.load(file).accepts(tx=world)
+    with pytest.raises(ValueError, match=r"gsparc calibrate ckpt=FILE stores it"):
+        gsparc.load(file, confidence="distance")
+    with pytest.raises(ValueError, match="expected one of learned"):
+        gsparc.load(file, confidence="hope")
+    keep(file, Trusted("learned", 0.5, Promise(), known_positions(data, fold), position_kernel(data, fold)))
+    with pytest.raises(ValueError, match="threshold is one of confidence=learned"):
+        gsparc.load(file, confidence="distance").accepts(tx=world)
+
+
+@pytest.mark.parametrize("kind", ["gp_variance", "distance"])
+def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None:
+    """Variances above 1 were cut off: a threshold there accepted a place 900 km away."""
+    data, fold, file = site
+    known, kernel = known_positions(data, fold), replace(position_kernel(data, fold), noise=0.5)
+    laxest = as_confidence(kind, np.array(-1.49 if kind == "gp_variance" else -100.0))
+    keep(file, Trusted(kind, float(laxest), Promise(), known, kernel))
+    near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
+    assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()

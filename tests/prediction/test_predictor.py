@@ -1,0 +1,216 @@
+"""gsparc.load: world coordinates in, the same kind of array out."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import gsparc
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold
+from gsparc.models import checkpoint
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.baselines.mean import Mean
+from gsparc.models.per_station import for_links
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
+
+
+def loaded(data, fold, path, name="gp"):
+    method = method_class(name)()
+    method.fit(data, fold, FitContext(path))
+    checkpoint.save(path / f"{name}.ckpt", method)
+    return gsparc.load(path / f"{name}.ckpt")
+
+
+@pytest.fixture
+def spectra(campaign, folds, tmp_path):
+    data = campaign("spectrum", 40)
+    return data, loaded(data, folds(40).folds[0], tmp_path)
+
+
+def test_world_positions_many_and_one(spectra):
+    data, predictor = spectra
+    world = data.tx[:3] + data.site.origin
+    batch = data.batch(np.arange(3))
+    expected = predictor.method.predict(batch.tx, batch.rx)
+    many = predictor.spectrum(tx=world)
+    assert isinstance(many, np.ndarray) and many.shape == (3, 12, 24) and many.dtype == np.float32
+    assert np.allclose(many, expected.mean.numpy(), atol=1e-5)
+    one = predictor.spectrum(tx=torch.tensor(world[0]))
+    assert isinstance(one, torch.Tensor) and one.shape == (12, 24)
+    assert np.allclose(one.numpy(), many[0], atol=1e-6)
+    assert isinstance(predictor.spectrum(tx=world[0].tolist()), np.ndarray)
+    sure = predictor.confidence(tx=world)
+    assert sure.shape == (3,) and np.allclose(sure, expected.confidence.numpy(), atol=1e-4)
+    assert isinstance(predictor.confidence(tx=world[0]), float)
+
+
+def test_static_end_is_known_and_not_moved(spectra):
+    data, predictor = spectra
+    world, still = data.tx[:2] + data.site.origin, data.rx_position[0] + data.site.origin
+    with_pose = gsparc.Pose(torch.tensor(still), torch.eye(3, dtype=torch.float64))
+    for rx in (still, np.tile(still, (2, 1)), with_pose):
+        assert np.array_equal(np.asarray(predictor.spectrum(tx=world, rx=rx)), predictor.spectrum(tx=world))
+    with pytest.raises(ValueError, match="rx= differs from where it stood"):
+        predictor.spectrum(tx=world, rx=still + 1)
+
+
+def test_far_from_the_origin(campaign, folds, tmp_path):
+    near = campaign("spectrum", 40)
+    here = loaded(near, folds(40).folds[0], tmp_path)
+    shift = np.array([1e5, -2e5, 3e4])
+    predictor = gsparc.Predictor(
+        here.method, type(near.site)(**{**vars(near.site), "origin": near.site.origin + shift})
+    )
+    world = near.tx[:4] + near.site.origin
+    assert np.allclose(predictor.spectrum(tx=world + shift), here.spectrum(tx=world), atol=1e-5)
+
+
+def test_channels_in_physical_units_with_a_moving_receiver(campaign, folds, tmp_path):
+    data = campaign("csi", 40, "tx")
+    predictor = loaded(data, folds(40).folds[0], tmp_path, "nearest")
+    row = folds(40).folds[0].train[0]
+    found = predictor.csi(rx=data.rx_position[row] + data.site.origin)
+    assert found.shape == (4, 3) and found.dtype == np.complex64
+    assert np.allclose(found, data.target[row] * 2, atol=1e-5)  # target_scale
+    pose = gsparc.Pose(torch.tensor(data.rx_position[[row]] + data.site.origin), torch.eye(3).double()[None])
+    assert torch.allclose(predictor.csi(rx=pose), torch.from_numpy(found))
+
+
+def test_wrong_questions_get_clear_answers(spectra, campaign, folds, tmp_path):
+    data, predictor = spectra
+    here = data.site.origin
+    with pytest.raises(ValueError, match=r"predicts spectrum \(dataset toy\), not csi: call .spectrum"):
+        predictor.csi(tx=here)
+    with pytest.raises(ValueError, match="tx= is needed"):
+        predictor.spectrum()
+    with pytest.raises(ValueError, match="NaN or Inf in row 1"):
+        predictor.spectrum(tx=[here, here * np.nan])
+    for wrong in (here[:2], np.zeros((2, 2, 3)), np.zeros((0, 3))):
+        with pytest.raises(ValueError, match="shape"):
+            predictor.spectrum(tx=wrong)
+    with pytest.raises(ValueError, match="numbers"):
+        predictor.spectrum(tx="here")
+    with pytest.raises(ValueError, match="holds 2 positions, the other end 3"):
+        predictor.spectrum(tx=np.tile(here, (2, 1)), rx=np.tile(here, (3, 1)))
+    with pytest.raises(ValueError, match="mean has no confidence"):
+        loaded(data, folds(40).folds[0], tmp_path, Mean.name).confidence(tx=here)
+
+
+def test_importing_costs_nothing():
+    code = "import sys, gsparc; assert 'torch' not in sys.modules; gsparc.load; assert 'torch' in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert "load" in dir(gsparc)
+    with pytest.raises(AttributeError, match="lod"):
+        gsparc.lod  # noqa: B018
+
+
+def test_load_restores_the_class(spectra):
+    assert isinstance(spectra[1].method, GaussianProcess)
+
+
+def test_other_frequencies_than_the_one_measured_are_refused(campaign, folds, tmp_path):
+    """One tone was repeated at whatever frequency was asked for, with a phase that belongs to another."""
+    data = campaign("csi", 30, "tx")
+    site = dataclasses.replace(data.site, subcarriers_hz=np.array([2.4e9]))
+    data = dataclasses.replace(data, site=site, target=data.target[:, :, :1])
+    predictor = loaded(data, folds(30).folds[0], tmp_path)
+    place = data.rx_position[0] + data.site.origin
+    assert np.array_equal(predictor.csi(rx=place, frequency_hz=2.4e9)[0], predictor.csi(rx=place))
+    with pytest.raises(ValueError, match=r"measured at 2400\.000 MHz alone"):
+        predictor.csi(rx=place, frequency_hz=[2.4e9, 2.41e9])
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [([1j, 0, 0], "must be real numbers"), ([1e300, 0, 0], "expected metres, none beyond 1e")],
+)
+def test_positions_that_are_none_are_refused(spectra, place, said):
+    """Complex numbers lost their imaginary part, and what overflows float32 was answered with NaN."""
+    with pytest.raises(ValueError, match=said):
+        spectra[1].spectrum(tx=place)
+
+
+@pytest.fixture
+def abroad(tmp_path):
+    """Powers of one transmitter at a known place, in degrees, 1.5 m above ground."""
+    rng = np.random.default_rng(0)
+    data = from_arrays(
+        {
+            "latitude": 47 + rng.uniform(0, 0.01, 40),
+            "longitude": 11 + rng.uniform(0, 0.01, 40),
+            "rx_height": np.array(1.5),
+            "station_latitude": np.array([47.001, 47.001]),
+            "station_longitude": np.array([11.0, 11.0]),
+            "station_height": np.array(9.0),
+            "carrier_hz": np.array([9e8, 1.8e9]),
+            "rssi_db": rng.normal(0, 1, (40, 2)) - [50, 80],
+        }
+    )
+    method = for_links(GaussianProcess, data)
+    rows = np.arange(len(data))
+    method.fit(data, Fold(rows, rows[:0], rows[:4]), FitContext(tmp_path))
+    checkpoint.save(tmp_path / "gp.ckpt", method)
+    return gsparc.load(tmp_path / "gp.ckpt")
+
+
+def test_degrees_to_metres_and_back(abroad):
+    place = abroad.metres(47.004, 11.002)
+    assert place.shape == (3,) and place[2] == 1.5  # the height at which it was measured
+    many = abroad.metres([47.004, 47.005], [11.002, 11.003], height=[1.0, 2.0])
+    assert many.shape == (2, 3) and np.array_equal(many[0, :2], place[:2])
+    latitude, longitude, height = abroad.degrees(many)
+    assert np.allclose(latitude, [47.004, 47.005], atol=1e-10) and np.allclose(longitude, [11.002, 11.003])
+    assert height.tolist() == [1, 2] and abroad.degrees(place)[2] == 1.5
+    assert isinstance(abroad.at(0).rssi(rx=place)[0], np.float32)
+
+
+def test_degrees_that_mean_nothing_are_refused(abroad, spectra):
+    with pytest.raises(ValueError, match="latitude 95 is outside"):
+        abroad.metres(95, 11)
+    with pytest.raises(ValueError, match=r"height= must be one number or 2 \[m\]"):
+        abroad.metres([47, 47], [11, 11], [1, 2, 3])
+    with pytest.raises(ValueError, match="toy was measured in metres about an unknown origin"):
+        spectra[1].metres(47, 11)
+    with pytest.raises(ValueError, match="unknown origin"):
+        spectra[1].degrees(np.zeros(3))
+    several = dataclasses.replace(abroad.site, moving_box=abroad.site.moving_box - np.eye(2, 3, 2))
+    with pytest.raises(ValueError, match="height= is needed"):
+        gsparc.Predictor(abroad.method, several).metres(47, 11)
+
+
+def test_utm_places_in_float32_were_half_a_metre_off(abroad):
+    """The origin is taken away in float64, but steps of 5,000 km in float32 are 0.5 m: phases were lost."""
+    utm = np.array([691_500.0, 5_334_500, 0])
+    site = dataclasses.replace(abroad.site, origin=abroad.site.origin + utm)
+    far, place = gsparc.Predictor(abroad.method, site).at(0), abroad.metres(47.004, 11.002)
+    there = place + utm
+    assert np.allclose(far.rssi(rx=there), abroad.at(0).rssi(rx=place), rtol=1e-5)
+    for rough in (torch.tensor(there, dtype=torch.float32), there.astype(np.float32)):
+        with pytest.raises(
+            ValueError, match=r"rx= is float32, which moves in steps of 0.5 m there; give float64"
+        ):
+            far.rssi(rx=rough)
+    abroad.at(0).rssi(rx=place.astype(np.float32))
+
+
+def test_two_stations_at_one_place_have_models_of_their_own(abroad):
+    """Both carriers of a mast were answered by the model of the first."""
+    place = abroad.metres(47.004, 11.002)
+    low, high = (float(abroad.at(number).rssi(rx=place)[0]) for number in (0, 1))
+    assert 25 < 10 * np.log10(low / high) < 35
+
+
+def test_all_at_once_is_what_is_asked_one_by_one(abroad):
+    one, places = abroad.at(1), abroad.metres([47.004, 47.008], [11.002, 11.009])
+    said = one.predict(rx=places)
+    assert np.array_equal(said.mean.numpy(), one.rssi(rx=places))
+    assert np.array_equal(said.confidence.numpy(), one.confidence(rx=places))
+    spread = 10 / np.log(10) * said.variance.sqrt().numpy() / said.mean[:, 0].double().numpy()
+    assert (np.abs(spread - 1) < 0.5).all()  # a decibel, as the powers were drawn
