@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from gsparc.data.load import split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint, initialise, loading
+from gsparc.models import checkpoint, fields, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
 from gsparc.models.mixture import solutions
@@ -182,7 +182,7 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
-    monkeypatch.setattr(initialise, "LEAST_GAIN", -math.inf)
+    monkeypatch.setattr(fields, "LEAST_GAIN", -math.inf)
     fitted = fit("channels", budget_s=8.0)  # less leaves no time to complete them on a busy machine
     field = fitted.method.field
     assert isinstance(field, StackedField) and sum(field.weights) == pytest.approx(1)

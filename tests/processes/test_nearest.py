@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from releases import real
-from tests.methods.test_power_settings import error_db, fit, town
 
 from gsparc.data.own import interpret
 from gsparc.data.raw import read_raw
@@ -26,6 +25,7 @@ from gsparc.processes.powers import PowerProcess, Rows, conditioned
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
+from tests.models.powers.test_settings import error_db, fit, town
 
 KERNEL = Kernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 

@@ -9,8 +9,8 @@ from campaigns import channels
 
 from gsparc.data.load import load
 from gsparc.field.initial import InitSettings
+from gsparc.models.fields import sources
 from gsparc.models.image_sources.source_field import SourceField
-from gsparc.models.initialise import sources
 from gsparc.physics.mirror_planes import reflect
 from gsparc.training.context import FitContext
 
