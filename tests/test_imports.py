@@ -10,6 +10,7 @@ import subprocess
 import sys
 import sysconfig
 from collections import Counter, defaultdict
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -170,6 +171,7 @@ def test_only_the_viewers_server_imports_viser():
     assert not above, "imported where it is needed, in a function: the command does without viser"
 
 
+@cache
 def _tree(file: Path) -> ast.Module:
     return ast.parse(file.read_text(encoding="utf-8"))
 
@@ -180,28 +182,29 @@ def _top(tree: ast.Module) -> ast.Module:
     return ast.Module(kept, [])
 
 
-@pytest.mark.parametrize(("room", "file"), FILES, ids=[f"{r}/{f.name}" for r, f in FILES])
-def test_imports_have_full_names(room, file):
-    names = set(imported(ast.parse(file.read_text(encoding="utf-8"))))
-    bare = {name for name in names if name.split(".")[0] in ("ops", "callbacks", "conf", "tests")}
-    assert not bare, f"{bare}: import gsparc.NAME"
-    if room == "ops":
-        assert not {name.split(".")[0] for name in names} & {"lightning", "hydra", "omegaconf"}
+def test_imports_have_full_names():
+    for room, file in FILES:
+        names = set(imported(_tree(file)))
+        bare = {name for name in names if name.split(".")[0] in ("ops", "callbacks", "conf", "tests")}
+        assert not bare, f"{file}: {bare}: import gsparc.NAME"
+        if room == "ops":
+            assert not {name.split(".")[0] for name in names} & {"lightning", "hydra", "omegaconf"}, file
 
 
-@pytest.mark.parametrize("file", [file for _, file in FILES] + [ROOT / "train.py"], ids=lambda p: p.name)
-def test_nothing_prints_and_nothing_happens_at_import(file):
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
-    assert not [c.lineno for c in calls if c.func.id == "print"], "print: use logging or rich"
-    for node in tree.body:  # os.environ, torch.set_num_threads, ... belong into functions
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
-            called = ast.unparse(node.value.func)
-            # Declaring an operator's derivative is part of declaring the operator.
-            declares = ".register_" in called
-            # The one exception: how torch's threads wait is settled when torch is first imported.
-            waits = file == ROOT / "gsparc" / "__init__.py" and called == "os.environ.setdefault"
-            assert declares or waits, f"{file.name}:{node.lineno} calls {called} at import"
+def test_nothing_prints_and_nothing_happens_at_import():
+    for file in (*(file for _, file in FILES), ROOT / "train.py"):
+        tree = _tree(file)
+        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
+        printed = [c.lineno for c in calls if c.func.id == "print"]
+        assert not printed, f"{file}:{printed}: print: use logging or rich"
+        for node in tree.body:  # os.environ, torch.set_num_threads, ... belong into functions
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+                called = ast.unparse(node.value.func)
+                # Declaring an operator's derivative is part of declaring the operator.
+                declares = ".register_" in called
+                # The one exception: how torch's threads wait is settled when torch is first imported.
+                waits = file == ROOT / "gsparc" / "__init__.py" and called == "os.environ.setdefault"
+                assert declares or waits, f"{file}:{node.lineno} calls {called} at import"
 
 
 @pytest.mark.parametrize(("said", "found"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
