@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gsparc.ops import Pose as Pose
     from gsparc.ops import SphereGrid as SphereGrid
+    from gsparc.prediction.fit import fit as fit
     from gsparc.prediction.load import load as load
     from gsparc.prediction.predictor import Predictor as Predictor
 
@@ -16,13 +17,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 # Looked up on first use: `import gsparc` costs nothing.
 _PUBLIC = {
+    "fit": "gsparc.prediction.fit",
     "load": "gsparc.prediction.load",
     "Predictor": "gsparc.prediction.predictor",
     "Pose": "gsparc.ops",
     "SphereGrid": "gsparc.ops",
     "load_ipython_extension": "gsparc.commands.notebook",  # what `%load_ext gsparc` asks for
 }
-__all__ = ["Pose", "Predictor", "SphereGrid", "load"]
+__all__ = ["Pose", "Predictor", "SphereGrid", "fit", "load"]
 
 
 def __getattr__(name: str) -> Any:

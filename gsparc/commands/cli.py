@@ -82,9 +82,13 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
 
 def _began_as_interrupt(error: BaseException | None) -> bool:
     """A clean-up that meets what Ctrl-C left half done raises an error of its own over the interrupt."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+    seen: list[BaseException] = []
+    while error is not None and error not in seen:  # an error raised again may be its own context
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        seen.append(error)
         error = error.__cause__ or error.__context__
-    return error is not None
+    return False
 
 
 def _message_of(error: Exception) -> str:

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from gsparc.__main__ import READER_LEFT, main
+from gsparc.commands.cli import _began_as_interrupt
 from gsparc.commands.listing import COMMANDS
 
 
@@ -109,3 +110,12 @@ def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch, capsys
     monkeypatch.setattr("gsparc.commands.cli.offer", interrupted)
     status, _, err = gsparc(monkeypatch, capsys, "train", "dataset=rfid", "model=gsparc")
     assert (status, err) == (130, "error: interrupted\n")
+
+
+def test_an_error_that_is_its_own_context_was_followed_without_end():
+    """`raise error.__cause__` within its handler makes such a circle; a command then hung."""
+    first, second = ValueError("batch_size"), RuntimeError("of a library")
+    first.__context__, second.__cause__ = second, first
+    assert not _began_as_interrupt(second)
+    second.__cause__ = KeyboardInterrupt()
+    assert _began_as_interrupt(first)

@@ -1,0 +1,96 @@
+"""`gsparc.fit(...)`: a model of measurements in arrays, as `gsparc train` makes it of a file."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.errors import DataError
+from gsparc.data.own import interpret
+from gsparc.data.raw import Raw
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, SplitSettings
+from gsparc.models import checkpoint
+from gsparc.models.per_station import for_links
+from gsparc.models.registry import method_class
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
+
+log = logging.getLogger(__name__)
+
+VALIDATED = SplitSettings().val_fraction
+
+
+def fit(
+    rx: Any = None,
+    tx: Any = None,
+    *,
+    rssi: Any = None,
+    csi: Any = None,
+    spectrum: Any = None,
+    model: str = "gsparc",
+    budget_s: float | None = None,
+    seed: int = 0,
+    save: str | Path | None = None,
+    settings: dict[str, Any] | None = None,
+    **arrays: Any,
+) -> Predictor:
+    """A model of all rows, ready to be asked; checks and messages are those of a file of one's own.
+
+    >>> predictor = gsparc.fit(rx=places, tx=[12.0, 30.0, 2.6], rssi=powers_dbm)
+    >>> predictor.rssi(rx=[[3.0, 4.0, 1.5]])
+
+    Args:
+        rx, tx: (n, 3) places of the receiver and of the transmitter [m], (3,) of the one that stands still.
+        rssi: (n,) received powers [dBm].
+        csi: (n,), (n, subcarriers) or (n, antennas, subcarriers) complex channels.
+        spectrum: (n, elevations, azimuths) directional spectra.
+        model: a name of `gsparc --help model`.
+        budget_s: seconds of training; None: the model's own.
+        seed: of whatever is random.
+        save: a checkpoint to write, for `gsparc.load` and all commands.
+        settings: of the model, by their names in `conf/model/NAME.yaml`.
+        **arrays: anything else of the schema of `docs/own-data.md`: `carrier_hz`, `frequency_hz`,
+            `array_position`, `station_position`, ...
+
+    Raises:
+        DataError: arrays that `gsparc check` would refuse, all problems with array and row.
+        ValueError: no such model, or one that cannot learn these measurements.
+    """
+    given = {
+        "rx_position": rx,
+        "tx_position": tx,
+        "rssi_db": rssi,
+        "csi": csi,
+        "spectrum": spectrum,
+        **arrays,
+    }
+    raw = Raw({name: np.asarray(value) for name, value in given.items() if value is not None}, {})
+    try:
+        reading = interpret(raw, "gsparc.fit")
+    except DataError as refused:
+        raise DataError("; ".join(dict.fromkeys(refused.problems))) from None
+    data = reading.data
+    for note in reading.notes:
+        log.warning("%s", note)
+    method = for_links(partial(method_class(model), **(settings or {})), data)
+    fold = _learned_from(data, VALIDATED if method.takes_budget else 0.0, seed)
+    report = method.fit(data, fold, FitContext(seed=seed, budget_s=budget_s))
+    for note in report.notes:
+        log.info("%s", note)
+    if save is not None:
+        checkpoint.save(save, method, extra={"train_s": report.seconds})
+    return Predictor(method, data.site)
+
+
+def _learned_from(data: Measurements, share: float, seed: int) -> Fold:
+    """All rows; those at a share of the places validate. Nothing is left to test on."""
+    rows = np.arange(len(data))
+    places, which = np.unique(rows if data.place is None else data.place, return_inverse=True)
+    drawn = np.random.default_rng(seed).permutation(len(places))[: round(share * len(places))]
+    held = np.isin(which.reshape(-1), drawn)
+    return Fold(rows[~held], rows[held], rows[:0])
