@@ -39,7 +39,8 @@ def test_it_is_the_model_that_the_command_trains(tmp_path):
     settings = [one for one in brief(tmp_path / "own.npz") if not one.startswith("model.")]
     _, objects = train(compose(*settings, "model=gp"), tmp_path / "run")
     fold = objects.split.folds[0]
-    found = gsparc.fit(rx=PLACES[fold.train], tx=END, rssi=POWERS[fold.train], model="gp")
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    found = gsparc.fit(rx=PLACES[known], tx=END, rssi=POWERS[known], model="gp")
     asked = PLACES[fold.test]
     other = gsparc.load(objects.checkpoints[0])
     assert np.allclose(10 * np.log10(found.rssi(rx=asked) / other.rssi(rx=asked)), 0, atol=0.01)
