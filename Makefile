@@ -6,7 +6,7 @@ RUN := $(VENV)/bin/python
 # Torch's threads would otherwise spin for one another beside a busy process.
 export OMP_WAIT_POLICY ?= passive
 # A process per core, each with one thread; whoever is done takes tests from the others.
-PYTEST = OMP_NUM_THREADS=1 $(RUN) -m pytest -n auto --dist worksteal --durations=10
+PYTEST = OMP_NUM_THREADS=1 $(RUN) -m pytest -n auto --dist worksteal --instafail --durations=10
 SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 # An editable installation knows its modules by a list: one that came or went needs another.
 MODULES := $(VENV)/.modules-$(shell find gsparc ops callbacks conf -name '*.py' | LC_ALL=C sort | cksum | cut -d' ' -f1)
@@ -17,7 +17,7 @@ DIST ?= dist
 # Its own objects, made anew: those of another compiler would be taken as they are.
 WHEEL ?= -Cbuild-dir=build/wheel/objects
 GRID ?=
-.PHONY: browser grid pages results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
+.PHONY: browser grid rare results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -75,10 +75,10 @@ results: setup ## README's results table, measured anew (RFID=folder of the rele
 	$(RUN) -m gsparc report outputs/results readme=README.md
 
 test-slow: setup sionna browser $(VENV)/.docs ## slow tests: whole training runs, kills, sanitizers, ray tracing
-	$(PYTEST) -m "slow and not pages"
+	$(PYTEST) -m "slow and not rare"
 
-pages: setup ## every command of every page on small data (a part of them is among the slow tests)
-	$(PYTEST) -m slow tests/commands/test_pages.py
+rare: setup sionna browser $(VENV)/.docs ## what takes minutes each: tutorials, furnished rooms, all commands of all pages
+	$(PYTEST) -m rare
 
 hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md
 	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md

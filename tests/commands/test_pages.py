@@ -45,7 +45,7 @@ def _parts() -> list:
     for line in RUN:
         seen[line[0]] = seen.get(line[0], 0) + 1
         often = line[0] == "study" or seen[line[0]] <= OFTEN
-        found.append(pytest.param(line, id=" ".join(line), marks=() if often else pytest.mark.pages))
+        found.append(pytest.param(line, id=" ".join(line), marks=() if often else pytest.mark.rare))
     return found
 
 

@@ -183,7 +183,7 @@ ptxas info    : Used 99 registers"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arch", ["75", "90"])
+@pytest.mark.parametrize("arch", [pytest.param("75", marks=pytest.mark.rare), "90"])
 def test_compiles(arch, tmp_path, monkeypatch):
     """The whole library for an old and a new GPU, without one; every kernel fits there as it was meant to."""
     if cuda_library.compiler() is None:

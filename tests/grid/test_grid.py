@@ -37,7 +37,10 @@ def test_every_kind_of_thirty_rows(number, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("world", SOME, ids=[world.name for world in SOME])
+@pytest.mark.parametrize(
+    "world",
+    [pytest.param(one, id=one.name, marks=pytest.mark.rare if i > 4 else ()) for i, one in enumerate(SOME)],
+)
 def test_every_kind_of_three_hundred_rows(world, tmp_path):
     assert_served(world, tmp_path, 15.0)
 

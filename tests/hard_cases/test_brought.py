@@ -76,6 +76,7 @@ def test_four_antennas_hear_a_transmitter_that_moves(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.rare
 def test_a_band_of_hardly_any_noise_is_learned(tmp_path):
     """`cholesky: not positive-definite` ended this."""
     data = brought("ofdm", tmp_path)

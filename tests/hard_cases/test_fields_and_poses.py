@@ -25,9 +25,10 @@ FACTOR = 16
 
 
 def effort(fast: int, many: int):
-    """Run with `fast` examples in `make test`, with `many` in `make test-slow`; the same ones every time."""
-    thorough = pytest.param(many, marks=pytest.mark.slow, id="many")
-    return pytest.mark.parametrize("examples", [pytest.param(fast, id="few"), thorough])
+    """`fast` examples in `make test`, a third of `many` in `make test-slow`, all in `make rare`."""
+    some = pytest.param(many // 3, marks=pytest.mark.slow, id="some")
+    thorough = pytest.param(many, marks=(pytest.mark.slow, pytest.mark.rare), id="many")
+    return pytest.mark.parametrize("examples", [pytest.param(fast, id="few"), some, thorough])
 
 
 def holds(examples: int, *, property, **drawn) -> None:

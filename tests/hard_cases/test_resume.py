@@ -158,7 +158,7 @@ def test_a_checkpoint_of_parameters_and_moments_alone_breaks(whole, killed, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("saves", [1, 3, 8])
+@pytest.mark.parametrize("saves", [3, *(pytest.param(n, marks=pytest.mark.rare) for n in (1, 8))])
 def test_killed_in_the_first_stage(whole, tmp_path, saves):
     folder, file = whole
     cut = tmp_path / "cut"
@@ -168,7 +168,7 @@ def test_killed_in_the_first_stage(whole, tmp_path, saves):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("saves", [1, 4, 7])
+@pytest.mark.parametrize("saves", [4, *(pytest.param(n, marks=pytest.mark.rare) for n in (1, 7))])
 def test_killed_in_the_refit(whole, tmp_path, saves):
     folder, file = whole
     cut = tmp_path / "cut"

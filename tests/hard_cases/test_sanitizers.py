@@ -88,7 +88,7 @@ def module() -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize("isa", [pytest.param("baseline", marks=pytest.mark.rare), "avx2", "avx512"])
 def test_nothing_is_found(module, isa):
     files = [f"tests/hard_cases/test_{case}.py" for case in CASES]
     files += ["tests/ops/test_kernels.py", "tests/ops/test_face.py", "tests/ops/test_channels.py"]

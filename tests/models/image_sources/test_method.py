@@ -240,6 +240,7 @@ def test_visibility_behind_a_pillar_is_learned(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.rare
 def test_a_furnished_room(tmp_path):
     told, data, fold = furnished(450)
     method = ImageSourceGP(searches=1, budget_s=400)  # of which a quiet machine needs a fraction
