@@ -1,475 +1,66 @@
-"""`model=gsparc`: one Gaussian field whatever is measured; terms and initialiser follow from the site.
-
-Where Gaussians are rendered it is trained by rendering (`LearnedField`). Where weights follow from the rows
-in closed form (`ConditionalField`), initialisers find the Gaussians, held-out rows weigh what they found, and
-steps of gradient refine it as long as validation gains.
-"""
+"""`model=gsparc`: which prior, which renderer and which search a site calls for."""
 
 from __future__ import annotations
 
-import copy
-import logging
-from dataclasses import replace
-from typing import Any, Literal
+from gsparc.data.schema import Measurements
+from gsparc.field.initial import InitSettings
+from gsparc.models.planned_field import PlannedField
+from gsparc.models.terms import EffectSettings, Plan, called_for
 
-import numpy as np
-import torch
-from torch import Tensor
-
-from gsparc.data.inner_folds import cut_inside
-from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.data.site_objects import SiteObjects
-from gsparc.data.splits import Fold
-from gsparc.data.walls import read_walls
-from gsparc.models import stations
-from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.fields import INITIALISERS
-from gsparc.models.haste import factor_s
-from gsparc.models.image_sources.run_factors import RunFactors
-from gsparc.models.method import HasPaths, Method, Prediction
-from gsparc.models.mixture import process_average, solutions
-from gsparc.models.mixture import weights as solution_weights
-from gsparc.models.mixture.process_average import Summed, averaged, mean_alone
-from gsparc.models.mixture.weights import comparable
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import contributions, knobs, reduced
-from gsparc.models.splat.auto_settings import resolve
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO
-from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
-from gsparc.models.stored_field import restored, stored
-from gsparc.models.terms import EffectSettings, Plan, plan
-from gsparc.ops import Pose
-from gsparc.processes.nearest import Nearest
-from gsparc.processes.posterior import approximated
-from gsparc.processes.powers import PowerProcess
-from gsparc.training.conditional import CompletedField, ConditionalField, StackedField, learns
-from gsparc.training.context import FitContext, FitReport
-from gsparc.training.fit import run_stage, total_steps
-from gsparc.training.keep_best import SHORT, KeepBest
-from gsparc.training.module import GaussianModule
-from gsparc.training.pace import Pace
-from gsparc.training.time_budget import TimeBudget, less_repeatable
-
-log = logging.getLogger(__name__)
-
-DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
-STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
-BEFORE, AFTER = 3.0, 3.0  # validations that steps take at least, and that may follow when seconds end them
-LEAST_STEPS_S = 0.5  # less is not worth to set up
-RAYS_FACTORS = 1_500.0  # the same of measured rays, fitted and given all rows
-LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fit makes, and rows of one
-VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
+PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
 
 
-class Gsparc(LearnedField):
-    """A Gaussian field.
+class Gsparc(PlannedField):
+    """A Gaussian field of the terms that a site calls for; see `plan`."""
+
+    def planned(self, data: Measurements) -> Plan:
+        """See `PlannedField.planned`."""
+        return plan(self.switches, self.init, data, self.settings.emission.hidden, self.settings.field.count)
+
+
+def plan(
+    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int = 1
+) -> Plan:
+    """The terms for these measurements: the first row of the table that they call for.
 
     Args:
-        effects: switches of terms.
-        **field: see `LearnedField`.
+        switches: as configured.
+        init: as configured.
+        data: measurements; targets are not looked at.
+        hidden: units of the emission's networks: a network is trained by rendering.
+        count: of Gaussians to start from; 0 is the residual alone.
+
+    Raises:
+        ValueError: a term that is asked for means nothing here.
     """
-
-    both_ends = True
-
-    def __init__(self, effects: EffectSettings | None = None, **field: Any) -> None:
-        super().__init__(**field)
-        self.switches = effects or EffectSettings()
-        self.field: ConditionalField | None = None
-        self.plan: Plan | None = None
-        self.explained: float | None = None
-        self.started = ""  # initialisers of what was fitted
-        self._average: tuple[Method, float] | None = None  # a process and its weight in the mean
-        self._average_mean: Method | None = None  # that process without its variance, made when first asked
-        self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
-
-    @property
-    def label(self) -> str:
-        """The name, and how many nearest rows tell of a place where not all do."""
-        process = getattr(self.field, "process", None)
-        return approximated(self.name, getattr(process, "posterior", None))
-
-    @property
-    def takes_budget(self) -> bool:  # type: ignore[override]
-        """Always: steps or searches."""
-        return True
-
-    @property
-    def effects(self) -> str:  # type: ignore[override]
-        """The terms that are computed, for `summary.json`."""
-        if self.field is not None:
-            return "+".join(self.field.terms) or "residual"
-        if self._alone:
-            return "residual"
-        base = "array" if self.settings.response.array else "image"
-        return base + ("+residual" if self._average is not None else "")
-
-    # -- learning ----------------------------------------------------------------------------------
-
-    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Choose the terms, initialise, weigh, take the steps that pay."""
-        self.site, self.field, self._average, self._average_mean = data.site, None, None, None
-        self.runs = RunFactors.none()
-        count = self.settings.field.count
-        self.plan = plan(self.switches, self.init, data, self.settings.emission.hidden, count)
-        for reason in self.plan.reasons:
-            log.info("%s", reason)
-        if self.init.name == "scene":
-            read_walls(self.init.file)  # its errors come before anything is computed
-        if self.plan.rasterized:
-            return self._fit_rasterized(data, fold, context)
-        return self._fit_conditional(self.plan, data, fold, context)
-
-    def _fit_rasterized(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        assert self.plan is not None
-        response = replace(self.settings.response, array=self.plan.array)
-        self.settings = replace(self.settings, response=response)
-        if not self.settings.field.count:
-            self.most_steps = 0
-        choices, _ = resolve(self.settings, self.init.name, data.site)
-        steps = total_steps(context) if self.most_steps is None else self.most_steps
-        log.info(
-            "training %s by rendering: %d Gaussians, terms %s, init=%s, at most %d steps; callbacks %s",
-            GaussianModule.__name__, self.settings.field.count, self.effects, choices.init, steps,
-            ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
-        )  # fmt: skip
-        report = super().fit(data, fold, context)
-        self.started = self.choices.init if self.choices is not None else ""
-        spent = dict(self.spent)
-        if self._average is not None:
-            method = self._average[0]
-            known = np.sort(np.concatenate([fold.train, fold.val]))
-            more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
-            report = replace(report, seconds=report.seconds + more.seconds)
-            spent["averaged process"] = more.seconds
-        log.info("%d Gaussians, %d gradient steps kept", self.size(), self.steps)
-        _log_cost(spent, report.seconds)
-        return report
-
-    @property
-    def _alone(self) -> bool:
-        """Whether the averaged process has all the weight."""
-        return self._average is not None and self._average[1] >= 1
-
-    def _pays(self) -> bool:
-        """Whether the rendered field is worth another stage."""
-        return not self._alone
-
-    def _weigh_process(self, data: Measurements, fold: Fold) -> None:
-        self._reserve_s = 0.0
-        if self.plan is not None and self.plan.plain:
-            watch = TimeBudget()
-            self._average, explained = process_average.weigh(self, data, fold, self._left_out, self._apart)
-            self.explained = self.explained if explained is None else explained
-            self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
-
-    def _fit_conditional(
-        self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
-    ) -> FitReport:
-        if context.budget_s is None:
-            context = replace(context, budget_s=DEFAULT_BUDGET_S)
-        budget = context.time_budget()
-        log.info(
-            "training a Gaussian field with closed-form weights: init=%s, then at most %d gradient steps, "
-            "within %.3g s; callbacks: %s", " and ".join(chosen.parts), self._most_steps(context),
-            context.budget_s, KeepBest.__name__,
-        )  # fmt: skip
-        known = np.sort(np.concatenate([fold.train, fold.val]))
-        count = 1 if data.site.stations is None else len(data.site.stations)
-        alone = LEAST_FACTORS * count * factor_s(min(len(known) // count, MOST_FACTORED))
-        least = alone if len(chosen.parts) == 1 else alone * (1 + solutions.GROUPS)
-        if "rays" in chosen.parts:
-            least += RAYS_FACTORS * factor_s(min(len(known), MOST_FACTORED))
-        if least > budget.seconds:
-            log.warning(
-                "%g s are too few: the least fit of these rows takes about %.0f s", budget.seconds, least
-            )
-        several = len(chosen.parts) > 1
-        held = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
-        init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
-        until_s = budget.seconds * (1 - STEPS_SHARE)
-        share = solutions.CLOSED_SHARE * max(budget.seconds - budget.spent, solutions.LEAST_S)
-        data = self._aligned(data, known, replace(context, budget_s=share))
-        found, reports = solutions.find(
-            chosen.parts, init, self.switches, data, fold, context, budget, until_s, held
+    terms, site = called_for(switches, init, data, hidden, count), data.site
+    plain = switches.residual is not False  # a plain process may stand in, or beside
+    several = site.stations is not None and len(site.stations) > 1
+    searched = ("sources", "rays") if data.directions is not None else ("sources",)
+    placed = count > 0 or not plain
+    beside = ("process",) if plain and len(data) <= PROCESS_ROWS else ()
+    waves = ("diffuse",) if plain and init.snapshot == "none" else ()  # offsets are known to sources alone
+    residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
+    table: tuple[tuple[bool, tuple[str, ...]], ...] = (
+        (terms.power and init.name == "scene", ("scene",)),  # known walls and a process
+        (terms.power and several, ("joint_powers",)),  # a law of the site and a process of each station
+        (terms.power, ("powers",)),  # a process of decibels about a distance law
+        (terms.moving_array and placed, ("bearings", *beside)),  # triangulated sources, processes of powers
+        (terms.phase and placed and init.name == "auto", (*searched, *waves)),  # image sources beside waves
+        (terms.phase and placed, (str(init.name), *waves)),
+        (residual_alone, ("diffuse",)),  # leakage, a direct wave and a diffuse field
+    )
+    parts = next((parts for called, parts in table if called), ())
+    reasons = [*terms.reasons]
+    if not parts and switches.visibility is False:
+        raise ValueError(
+            "model.effects.visibility=false is not possible: rasterized Gaussians always occlude each other"
         )
-        kept = solutions.weighed(found, data, fold, held)
-        self.field, self.started = solutions.joined(kept), "+".join(kept)
-        self.field.site = data.site
-        self.init_s = budget.counted.wall
-        log.info(
-            "%s of %d Gaussians from init=%s, terms %s", type(self.field).__name__, self.field.count,
-            self.started, ", ".join(self.field.terms) or "none",
-        )  # fmt: skip
-        self.steps, moved = self._take_steps(data, fold, context, budget, several)
-        stepped = budget.counted.wall
-        if moved or several:  # else it is of these rows already
-            self.field.condition(data, known)
-        seconds = budget.counted.wall
-        stages = {name: report.seconds for name, report in reports.items()}
-        stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
-        stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
-        _log_cost(stages, seconds)
-        notes = [note for name in self.started.split("+") for note in reports[name].notes]
-        limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return FitReport(seconds, tuple(notes), limited)
-
-    def _aligned(self, data: Measurements, known: np.ndarray, context: FitContext) -> Measurements:
-        """Channels of several runs in the phase and level of one, by the waves that explain rows (n,)."""
-        if not RunFactors.several(data, known):
-            return data
-        field, _ = INITIALISERS["diffuse"](data, known, self.init, True, context)
-        assert isinstance(field.runs, RunFactors)
-        self.runs = field.runs
-        log.info(
-            "channels of %d runs: the factor of each was estimated with the waves' field", len(self.runs)
+    if parts[:1] == ("bearings",) and switches.visibility is True:
+        raise ValueError(
+            "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"
         )
-        return self.runs.aligned(data)
-
-    def _take_steps(
-        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, apart: bool
-    ) -> tuple[int, bool]:
-        """Gradient steps under Lightning, as many as validation gains by.
-
-        Args:
-            apart: whether the field was conditioned on training rows alone.
-
-        Returns:
-            Their number, and whether the field is conditioned on other rows than before, or has moved.
-        """
-        field = self.field
-        assert field is not None
-        if not len(fold.val):
-            log.info("gradient steps: none, there are no validation rows to say whether they pay")
-            return 0, False
-        began = budget.spent
-        if field.count:
-            if not apart:
-                field.condition(data, fold.train)
-            batch = data.batch(fold.val)
-            target, found = comparable(batch.target, data.site), field(batch.tx, batch.rx)
-            assert found.explained is not None
-            own = comparable(found.explained, data.site)
-            self.explained = solution_weights.explained(own, target, data.site.kind != "csi")
-        if isinstance(getattr(getattr(field, "process", None), "posterior", None), Nearest):
-            log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
-            return 0, field.count > 0
-        if not learns(field):
-            log.info("gradient steps: none, nothing to move")
-            return 0, field.count > 0
-        each = factor_s(min(len(fold.train), MOST_FACTORED))  # about what a validation takes
-        if (BEFORE + AFTER) * each + LEAST_STEPS_S > budget.seconds - budget.spent:
-            log.info("gradient steps: none, no seconds are left")
-            return 0, field.count > 0
-        if not field.count:
-            field.condition(data, fold.train)  # as a validation does
-        left = budget.seconds - budget.spent - AFTER * (budget.spent - began)
-        if left < BEFORE * (budget.spent - began) or left < LEAST_STEPS_S:
-            log.info("gradient steps: none, no seconds are left")
-            return 0, True
-        inner = context.within("steps", resume=None)
-        steps = self._most_steps(context)
-        module = GaussianModule(field, self.loss, self.rates, steps, inner.run_dir, Pace(steps, left))
-        files = GsparcCheckpointIO(self, context.config_yaml, {"stage": "steps"})
-        try:
-            ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
-        except KeyboardInterrupt:  # these steps are taken anew; what searches found is kept
-            searched = context.run_dir / "last.ckpt"
-            said = f"go on with ckpt_path={searched}" if searched.exists() else "there is no checkpoint yet"
-            raise KeyboardInterrupt(f"training was interrupted; {said}") from None
-        return ran.steps, True
-
-    def _most_steps(self, context: FitContext) -> int:
-        return total_steps(context) if self.most_steps is None else self.most_steps
-
-    def best_stations(
-        self, data: Measurements, fold: Fold, context: FitContext
-    ) -> tuple[Literal["each", "together"], str]:
-        """See `Method.best_stations`."""
-        if not self.shares(data.site) or self.init.name == "scene":
-            return "each", ""
-        return stations.best(data, fold, context)
-
-    def usual_s(self, site: Site) -> float | None:
-        """See `Method.usual_s`; steps, not seconds, are counted where Gaussians are rendered."""
-        return None if site.kind == "spectrum" else DEFAULT_BUDGET_S
-
-    # -- answering ---------------------------------------------------------------------------------
-
-    def objects(self) -> SiteObjects:
-        """Those of the field with closed-form weights."""
-        return SiteObjects.of() if self.field is None else self.field.objects()
-
-    def shares(self, site: Site) -> bool:
-        """Received powers, and channels of a known carrier."""
-        waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
-        return waves or site.kind == "rssi"
-
-    @torch.no_grad()
-    def answer(self, batch: Batch) -> Prediction:
-        """See `Method.answer`."""
-        if self.field is None or not self.field.reads_rows:
-            found = super().answer(batch)
-        else:
-            of_field = self.field.answer(replace(batch, run=None))
-            found = Prediction(of_field.mean, (1 - of_field.unknown).clamp(0, 1), of_field.variance)
-        return self.runs.restored(found, batch.run)
-
-    @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`."""
-        if self.field is not None:
-            parts = [
-                self.field(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
-                for i in range(0, len(tx), QUERY_CHUNK)
-            ]
-            mean, variance, unknown = (
-                torch.cat([getattr(part, name) for part in parts]) for name in ("mean", "variance", "unknown")
-            )
-            return Prediction(mean, (1 - unknown).clamp(0, 1), variance)
-        if self._average is not None and not self.size():
-            return self._average[0].predict(tx, rx)
-        own = super().predict(tx, rx)
-        if self._average is None:
-            return own
-        if self._average_mean is None:
-            self._average_mean = mean_alone(self._average[0])
-        mean = self._average_mean.predict(tx, rx).mean
-        return replace(own, mean=own.mean.lerp_(mean, self._average[1]))
-
-    def process(self) -> PowerProcess | None:
-        """See `HasProcess`."""
-        found = getattr(self.field, "process", None)
-        return None if found is None else found.exact()
-
-    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
-        if self.field is None or not self.field.forgets:
-            return None
-        found = copy.copy(self)
-        found.field = copy.deepcopy(self.field)
-        found.field.condition(data, rows)
-        return found
-
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """See `Differentiable`; of rasterized Gaussians, without an averaged process."""
-        if self.field is not None:
-            raise ValueError(f"{self.name}: its mean has no gradients by position")
-        return super().mean_at(tx, rx)
-
-    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
-        """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.
-
-        What other solutions and the residual add to channels is in no path.
-        """
-        field: Any = self.field
-        members: list[tuple[float, Any]] = [(1.0, field)]
-        if isinstance(field, StackedField):
-            members = list(zip(field.weights, field.members, strict=True))
-        parts: list[tuple[float, Any]] = [
-            (w, one.field if isinstance(one, CompletedField) else one) for w, one in members
-        ]
-        made = [(w, one.method) for w, one in parts if isinstance(getattr(one, "method", None), HasPaths)]
-        if not made:
-            raise ValueError("its channels are not made of paths")
-        found = [(weight, method.paths(tx, rx)) for weight, method in made]
-        gain = torch.cat([weight * one[0] for weight, one in found], dim=2)
-        delay = torch.cat([one[1] for _, one in found], dim=2)
-        return gain, delay, torch.cat([one[2] for _, one in found], dim=1), found[0][1][3]
-
-    def trainer_options(self) -> bool:
-        """See `TrainsByGradient`."""
-        return True
-
-    def _method(self) -> Method | None:
-        """The method inside the heaviest member, where there is one."""
-        field = self.field
-        if isinstance(field, StackedField):
-            field = field.heaviest
-        if isinstance(field, CompletedField):
-            field = field.field
-        return getattr(field, "method", None)
-
-    # -- reductions --------------------------------------------------------------------------------
-
-    def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
-        if self.field is None:
-            return super().knobs()
-        method = self._method()
-        return () if method is None or isinstance(self.field, StackedField) else knobs(method)
-
-    def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
-        """See `Reducible`."""
-        if self.field is None:
-            return super().contributions(data, rows)
-        method = self._method()
-        return {} if method is None else contributions(method, data, rows)
-
-    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`."""
-        method = self._method()
-        if self.field is None:
-            twin = copy.copy(self)
-            twin._average = None
-            found = LearnedField.reduced(twin, settings, measured)
-            return found if self._average is None else averaged(found, *self._average)
-        if method is None or isinstance(self.field, StackedField):
-            return self
-        found = reduced(method, settings, measured)
-        return Summed(found, self.field) if isinstance(self.field, CompletedField) else found
-
-    # -- storing -----------------------------------------------------------------------------------
-
-    def state(self) -> dict[str, Any]:
-        """Field, averaged process, and what was found out."""
-        beside = None
-        if self._average is not None:
-            method, weight = self._average
-            beside = {"state": method.state(), "weight": weight}
-        return {
-            "inner": super().state() if self.field is None else None,
-            "field": None if self.field is None else stored(self.field),
-            "beside": beside,
-            "facts": {"explained": self.explained, "steps": self.steps},
-            "init": self.started,
-            "array": self.settings.response.array,
-            "runs": self.runs.state(),
-        }
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`."""
-        self.site, self.field, self._average, self._average_mean = site, None, None, None
-        response = replace(self.settings.response, array=bool(state["array"]))
-        self.settings = replace(self.settings, response=response)
-        if state["field"] is not None:
-            self.field = restored(site, state["field"])
-        else:
-            super().restore(site, state["inner"])
-        if state["beside"] is not None:
-            method = GaussianProcess()
-            method.restore(site, state["beside"]["state"])
-            self._average = method, float(state["beside"]["weight"])
-        self.explained, self.steps = state["facts"]["explained"], int(state["facts"]["steps"])
-        self.started, self.runs = str(state["init"]), RunFactors.read(state["runs"])
-
-    def size(self) -> int:
-        """Number of Gaussians."""
-        if self._alone:
-            return 0
-        return super().size() if self.field is None else self.field.count
-
-    def facts(self) -> dict[str, float | int | str | None]:
-        """See `Method.facts`."""
-        return {
-            **super().facts(),
-            "model/init": self.started,
-            "model/steps": self.steps,
-            "model/variance_explained": self.explained,
-            "time/init_s": self.init_s,
-        }
-
-
-def _log_cost(stages: dict[str, float], seconds: float) -> None:
-    """The log's last line of a fit: seconds of each stage, and of all."""
-    said = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
-    log.info("cost: %s; %.1f s in all", said, seconds)
+    if parts == ("diffuse",) and not (terms.phase and placed):
+        why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
+        reasons.append(f"the residual is all there is: {why}")
+    return Plan(not parts, terms.array and not parts, parts, plain and not parts, tuple(reasons))

@@ -1,4 +1,4 @@
-"""Which terms of the field a site calls for, and where its Gaussians come from; every choice is said."""
+"""Terms of a field: their switches, which of them mean something at a site, and what a plan of them is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from gsparc.field.initial import InitSettings
 
 Switch = bool | Literal["auto"]
 SWITCH = switch("auto")
-PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
 
 
 @dataclass(frozen=True)
@@ -57,22 +56,35 @@ class Plan:
     reasons: tuple[str, ...] = field(default=())
 
 
-def plan(
-    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int = 1
-) -> Plan:
-    """The terms for these measurements.
+@dataclass(frozen=True)
+class Terms:
+    """Which terms are on.
 
-    Args:
-        switches: as configured.
-        init: as configured.
-        data: measurements; targets are not looked at.
-        hidden: units of the emission's networks: a network is trained by rendering.
-        count: of Gaussians to start from; 0 is the residual alone.
+    Attributes:
+        array, moving_array, phase, power: see `EffectSettings`.
+        rendered: whether rendered Gaussians are asked for.
+        obstacle: why there is no carrier phase, where there can be none.
+        reasons: one line each.
+    """
+
+    array: bool
+    moving_array: bool
+    phase: bool
+    power: bool
+    rendered: bool
+    obstacle: str | None
+    reasons: tuple[str, ...]
+
+
+def called_for(
+    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int
+) -> Terms:
+    """The terms that mean something here and are not switched off; see `gsparc.plan`.
 
     Raises:
         ValueError: a term that is asked for means nothing here.
     """
-    site, plain = data.site, switches.residual is not False
+    site = data.site
     networks = f"emission.hidden={hidden}" if hidden else None
     placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
     drawn = networks or placed  # asks for Gaussians that are rendered
@@ -93,34 +105,8 @@ def plan(
             reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{said}")
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
-    if on["power"]:
-        joint = site.stations is not None and len(site.stations) > 1
-        part = "scene" if init.name == "scene" else "joint_powers" if joint else "powers"
-        return Plan(False, parts=(part,), reasons=tuple(reasons))
-    if on["moving_array"] and (count or not plain):
-        if switches.visibility is True:
-            raise ValueError(
-                "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"
-            )
-        beside = ("process",) if plain and len(data) <= PROCESS_ROWS else ()
-        return Plan(False, parts=("bearings", *beside), reasons=tuple(reasons))
-    if on["phase"] and (count or not plain):
-        searched = ("sources", "rays") if data.directions is not None else ("sources",)
-        parts = searched if init.name == "auto" else (str(init.name),)
-        beside = (
-            ("diffuse",) if plain and init.snapshot == "none" else ()
-        )  # offsets are known to sources alone
-        return Plan(False, parts=parts + beside, reasons=tuple(reasons))
     rendered = drawn is not None or switches.image is True
-    if site.kind == "csi" and plain and site.wavelength is not None and not rendered:
-        why = obstacles["phase"] or ("no Gaussians are asked for" if on["phase"] else "no phase is asked for")
-        reasons.append(f"the residual is all there is: {why}")
-        return Plan(False, parts=("diffuse",), reasons=tuple(reasons))
-    if switches.visibility is False:
-        raise ValueError(
-            "model.effects.visibility=false is not possible: rasterized Gaussians always occlude each other"
-        )
-    return Plan(True, array=on["array"], plain=plain, reasons=tuple(reasons))
+    return Terms(**on, rendered=rendered, obstacle=obstacles["phase"], reasons=tuple(reasons))
 
 
 def _refuse_scene(

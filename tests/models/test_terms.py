@@ -10,7 +10,8 @@ from known_arrays import array_site
 
 from gsparc.data.campaigns.rfid import planar_array
 from gsparc.field.initial import InitSettings
-from gsparc.models.terms import EffectSettings, plan
+from gsparc.models.gsparc import plan
+from gsparc.models.terms import EffectSettings
 from gsparc.ops import SphereGrid
 
 AUTO, ANY = EffectSettings(), InitSettings()

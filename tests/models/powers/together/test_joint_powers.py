@@ -17,7 +17,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.field.initial import InitSettings
 from gsparc.models import checkpoint, loading
-from gsparc.models.gsparc import Gsparc
+from gsparc.models.gsparc import Gsparc, plan
 from gsparc.models.per_station import for_links
 from gsparc.models.powers.together import field as together
 from gsparc.models.powers.together.field import JointPowerField, initialise, most_each, restored
@@ -28,7 +28,7 @@ from gsparc.models.powers.together.prior import Prior, grid
 from gsparc.models.powers.together.rows import heard_rows, places_of, thinned
 from gsparc.models.powers.together.unheard import for_unheard
 from gsparc.models.registry import method_class
-from gsparc.models.terms import EffectSettings, plan
+from gsparc.models.terms import EffectSettings
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 
