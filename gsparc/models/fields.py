@@ -25,13 +25,14 @@ from gsparc.models.image_sources.known.mirrors import counted
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.source_field import RayField, SourceField
 from gsparc.models.mixture import process_field
+from gsparc.models.mixture.mixture import Mixture, residuals
 from gsparc.models.moving_array import bearing_field
 from gsparc.models.moving_array.bearing_field import BearingField
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.powers import field as power_field
 from gsparc.models.powers.together import field as joint_field
-from gsparc.training.conditional import CompletedField, ConditionalField, residuals
+from gsparc.training.conditional import ConditionalField
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 
@@ -154,7 +155,7 @@ def _completed(
         budget.limited = True
         note = "no time for a process on what the sources leave"
         return field, replace(report, notes=(*report.notes, note), limited_by=budget.clock)
-    remainder = residuals(field, data)
+    remainder = residuals(left, data)
     settings = ChannelSettings(direct=False, constant=False)
     residual, _ = waves.initialise(remainder, left.rows, settings, budget)
     missed = torch.from_numpy(data.target[left.rows]).flatten() - left.mean.flatten()
@@ -166,7 +167,7 @@ def _completed(
     limited = less_repeatable(report.limited_by, budget.limited_by)
     seconds = report.seconds + budget.counted.wall - began
     report = FitReport(seconds, (*report.notes, note), limited)
-    return (CompletedField(field, residual, weight) if gain >= LEAST_GAIN else field), report
+    return (Mixture([field], residual=residual, share=weight) if gain >= LEAST_GAIN else field), report
 
 
 # `(data, rows, init, clutter, context) -> (field, report)` by name.
@@ -191,3 +192,24 @@ RESTORED: dict[str, Callable[[Site, dict[str, Any]], ConditionalField]] = {
     "bearings": bearing_field.restored,
     "process": process_field.restored,
 }
+
+
+def stored(field: ConditionalField) -> dict[str, Any]:
+    """What `restored` reads."""
+    if not isinstance(field, Mixture):
+        return {"kind": field.kind, **field.state()}
+    residual = None if field.residual is None else stored(field.residual)
+    members = [stored(member) for member in field.members]  # type: ignore[arg-type]
+    return {"members": members, "residual": residual, **field.state()}
+
+
+def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
+    """The field whose `stored` state this was."""
+    if "members" in state:
+        members = [restored(site, member) for member in state["members"]]
+        residual = None if state["residual"] is None else restored(site, state["residual"])
+        found: ConditionalField = Mixture(members, state["weights"], residual, state["share"])
+    else:
+        found = RESTORED[str(state["kind"])](site, state)
+    found.site = site
+    return found

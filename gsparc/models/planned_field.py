@@ -24,12 +24,13 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.models import stations
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.fields import INITIALISERS
+from gsparc.models.fields import INITIALISERS, restored, stored
 from gsparc.models.haste import factor_s
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.mixture import process_average, solutions
 from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.process_average import Summed, averaged, mean_alone
 from gsparc.models.mixture.weights import comparable
 from gsparc.models.pareto import Settings
@@ -37,13 +38,12 @@ from gsparc.models.reduced import contributions, knobs, reduced
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
-from gsparc.models.stored_field import restored, stored
 from gsparc.models.terms import EffectSettings, Plan
 from gsparc.ops import Pose
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import approximated
 from gsparc.processes.powers import PowerProcess
-from gsparc.training.conditional import CompletedField, ConditionalField, StackedField, learns
+from gsparc.training.conditional import ConditionalField, learns
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.keep_best import SHORT, KeepBest
@@ -365,13 +365,9 @@ class PlannedField(LearnedField):
 
         What other solutions and the residual add to channels is in no path.
         """
-        field: Any = self.field
-        members: list[tuple[float, Any]] = [(1.0, field)]
-        if isinstance(field, StackedField):
-            members = list(zip(field.weights, field.members, strict=True))
-        parts: list[tuple[float, Any]] = [
-            (w, one.field if isinstance(one, CompletedField) else one) for w, one in members
-        ]
+        parts: list[tuple[float, Any]] = [(1.0, self.field)]
+        if isinstance(self.field, Mixture):
+            parts = list(self.field.parts())
         made = [(w, one.method) for w, one in parts if isinstance(getattr(one, "method", None), HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
@@ -384,13 +380,16 @@ class PlannedField(LearnedField):
         """See `TrainsByGradient`."""
         return True
 
+    @property
+    def _several(self) -> bool:
+        """Whether several solutions are averaged."""
+        return isinstance(self.field, Mixture) and len(self.field.members) > 1
+
     def _method(self) -> Method | None:
         """The method inside the heaviest member, where there is one."""
         field = self.field
-        if isinstance(field, StackedField):
-            field = field.heaviest
-        if isinstance(field, CompletedField):
-            field = field.field
+        if isinstance(field, Mixture):
+            _, field = max(field.parts(), key=lambda part: part[0])
         return getattr(field, "method", None)
 
     # -- reductions --------------------------------------------------------------------------------
@@ -400,7 +399,7 @@ class PlannedField(LearnedField):
         if self.field is None:
             return super().knobs()
         method = self._method()
-        return () if method is None or isinstance(self.field, StackedField) else knobs(method)
+        return () if method is None or self._several else knobs(method)
 
     def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
         """See `Reducible`."""
@@ -417,10 +416,10 @@ class PlannedField(LearnedField):
             twin._average = None
             found = LearnedField.reduced(twin, settings, measured)
             return found if self._average is None else averaged(found, *self._average)
-        if method is None or isinstance(self.field, StackedField):
+        if method is None or self._several:
             return self
         found = reduced(method, settings, measured)
-        return Summed(found, self.field) if isinstance(self.field, CompletedField) else found
+        return Summed(found, self.field) if isinstance(self.field, Mixture) else found
 
     # -- storing -----------------------------------------------------------------------------------
 

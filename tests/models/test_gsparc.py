@@ -26,10 +26,10 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
 from gsparc.models.mixture import solutions
 from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation, for_links
 from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose
-from gsparc.training.conditional import CompletedField, StackedField
 from gsparc.training.context import FitReport
 
 SMALL = (
@@ -185,14 +185,14 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     monkeypatch.setattr(fields, "LEAST_GAIN", -math.inf)
     fitted = fit("channels", budget_s=8.0)  # less leaves no time to complete them on a busy machine
     field = fitted.method.field
-    assert isinstance(field, StackedField) and sum(field.weights) == pytest.approx(1)
-    assert [type(member) is CompletedField for member in field.members] == [False, True, True]
+    assert isinstance(field, Mixture) and sum(field.weights) == pytest.approx(1)
+    assert [isinstance(member, Mixture) for member in field.members] == [False, True, True]
     assert fitted.method.facts()["model/init"] == "diffuse+few sources+sources" and field.count
     assert {"phase", "residual"} <= set(fitted.method.effects.split("+"))
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")
     same(fitted.method, again, asked(fitted))
-    assert isinstance(again.field, StackedField) and again.field.weights == field.weights
+    assert isinstance(again.field, Mixture) and again.field.weights == field.weights
     rows = np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
     again.field.condition(fitted.data, rows)  # the same rows, the same weights
     batch = asked(fitted)
@@ -231,7 +231,7 @@ def test_without_the_residual_gaussians_are_alone(name):
     batch = asked(fitted)
     found = method.field(batch.tx, batch.rx)
     torch.testing.assert_close(found.mean, found.explained)
-    assert not isinstance(method.field, (StackedField, CompletedField))
+    assert not isinstance(method.field, Mixture)
 
 
 @pytest.mark.parametrize(

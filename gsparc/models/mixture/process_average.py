@@ -16,11 +16,11 @@ from gsparc.models.coarse_grid import Filled
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import View
 from gsparc.ops import Pose
-from gsparc.training.conditional import CompletedField
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -130,14 +130,16 @@ def averaged(own: Method, process: Method, weight: float) -> Method:
 class Summed(View):
     """A reduced field with the residual of the whole one."""
 
-    def __init__(self, inner: Method, whole: CompletedField) -> None:
+    def __init__(self, inner: Method, whole: Mixture) -> None:
         super().__init__(inner)
-        self.residual, self.weight = whole.residual, whole.weight
+        self.whole = whole
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
         found = self.inner.predict(tx, rx)
-        return replace(found, mean=found.mean + self.weight * self.residual(tx, rx).mean)
+        if self.whole.residual is None:
+            return found
+        return replace(found, mean=found.mean + self.whole.share * self.whole.residual(tx, rx).mean)
 
 
 def _flat(values: Tensor) -> np.ndarray:

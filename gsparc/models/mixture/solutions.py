@@ -18,10 +18,11 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.fields import INITIALISERS
 from gsparc.models.haste import factor_s
 from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.weights import LEAST_HELD, comparable
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
-from gsparc.training.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField
+from gsparc.training.conditional import ConditionalField, LeftOutRows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -84,8 +85,8 @@ def find(
             clutter = effects.visibility is not False
             with late_when(budget.over):
                 field, report = INITIALISERS[part](data, rows, settings, clutter, within)
-            if effects.residual is False and isinstance(field, CompletedField):
-                field = field.field
+            if effects.residual is False and isinstance(field, Mixture):
+                field = next(one for _, one in field.parts())
             found[name] = field
             if part not in OPEN_ENDED:
                 field.held = _held(field, data, rows, groups, until_s, budget, report.seconds)
@@ -146,7 +147,7 @@ def weighed(
 def joined(kept: dict[str, tuple[ConditionalField, float]]) -> ConditionalField:
     """The weighed mean, or the only one."""
     fields, weights = zip(*kept.values(), strict=True)
-    return fields[0] if len(fields) == 1 else StackedField(fields, weights)
+    return fields[0] if len(fields) == 1 else Mixture(fields, weights)
 
 
 def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -1,8 +1,20 @@
+from __future__ import annotations
+
 import numpy as np
 import pytest
 import torch
 
-from gsparc.models.mixture.weights import Rows, error, explained, share_of_second, weights
+from gsparc.models.mixture.weights import (
+    Rows,
+    best_weights,
+    choose,
+    error,
+    explained,
+    paired,
+    share_of_second,
+    squared,
+    weights,
+)
 
 EACH = np.arange(50)  # every row is a unit
 TARGET = torch.from_numpy(np.random.default_rng(0).standard_normal((50, 3)))
@@ -64,3 +76,67 @@ def test_the_second_has_the_weight_of_largest_psnr():
 def test_every_row_counts_once_whichever_part_it_is_of():
     few, many = rows(0.3, 0.05, 3, 1), rows(0.05, 0.3, 300, 2)
     assert share_of_second([few, many]) < 0.1 < share_of_second([few])
+
+
+def gram_of(errors: np.ndarray) -> np.ndarray:
+    """Products (n, K, K) of errors (n, K)."""
+    return errors[:, :, None] * errors[:, None, :]
+
+
+def drawn(deviations: list[float], rows: int = 400, common: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Errors (rows, K), a part of them common to all."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(rows, len(deviations))) * deviations + common * rng.normal(size=(rows, 1))
+
+
+def test_weights_are_those_of_inverse_variances_where_errors_are_independent():
+    weights = best_weights(np.diag([1.0, 4.0]))
+    assert weights == pytest.approx([0.8, 0.2], abs=1e-6)
+    assert best_weights(np.zeros((1, 1))) == pytest.approx([1.0])
+
+
+def test_no_weight_is_negative_where_plain_least_squares_has_one():
+    gram = np.array([[1.0, 1.5], [1.5, 4.0]])  # unconstrained: 1.25 and -0.25
+    assert best_weights(gram) == pytest.approx([1.0, 0.0], abs=1e-6)
+
+
+def test_weights_are_the_best_of_a_grid():
+    errors = drawn([1.0, 1.2, 0.9], common=0.3)
+    gram = gram_of(errors).mean(0)
+    least = float(best_weights(gram) @ gram @ best_weights(gram))
+    grid = [np.array([a, b, 1 - a - b]) for a in np.linspace(0, 1, 41) for b in np.linspace(0, 1 - a, 41)]
+    assert least <= min(float(w @ gram @ w) for w in grid) + 1e-9
+
+
+def test_rows_of_one_unit_count_as_one():
+    difference = np.repeat(np.random.default_rng(0).normal(size=20), 10)
+    alone = paired(difference, np.arange(200))[1]
+    together = paired(difference, np.repeat(np.arange(20), 10))[1]
+    assert together == pytest.approx(difference[::10].std(ddof=1) / np.sqrt(20), rel=0.03)
+    assert together > 3 * alone
+    assert paired(difference, np.zeros(200)) == (pytest.approx(difference.mean()), np.inf)
+
+
+def test_a_mixture_is_taken_where_it_pays():
+    errors = drawn([1.0, 1.05])
+    weights = choose(gram_of(errors), np.arange(400))
+    assert weights == pytest.approx([0.5, 0.5], abs=0.1)
+    assert squared(weights, gram_of(errors)).mean() < 0.7 * (errors[:, 0] ** 2).mean()
+
+
+@pytest.mark.parametrize("deviations,common", [([1.0, 5.0], 0.0), ([0.1, 0.1], 1.0)])
+def test_one_alone_is_taken_where_a_mixture_does_not_pay_clearly(deviations, common):
+    """The other is much worse, or both err alike."""
+    errors = drawn(deviations, 60, common)
+    weights = choose(gram_of(errors), np.arange(60))
+    assert sorted(weights) == [0.0, 1.0]
+    assert weights.argmax() == (errors**2).mean(0).argmin()
+
+
+def test_of_one_unit_nothing_tells_whether_a_mixture_pays():
+    assert sorted(choose(gram_of(drawn([1.0, 1.0])), np.zeros(400))) == [0.0, 1.0]
+
+
+def test_small_weights_are_left_out():
+    weights = choose(gram_of(drawn([1.0, 1.0, 6.0], 4000)), np.arange(4000))
+    assert weights[2] == 0 and weights.sum() == pytest.approx(1)

@@ -1,0 +1,126 @@
+"""Several solutions of one problem as one field: their weighed mean, and a process on what they leave."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Measurements
+from gsparc.data.site_objects import SiteObjects
+from gsparc.ops import Pose
+from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior, learns
+
+
+class Mixture(ConditionalField):
+    """The weighed mean of members: no single one need be the right one.
+
+    Args:
+        members: at least one.
+        weights: (M,) of the mean, of sum 1.
+        residual: a field without Gaussians, of what the mean leaves of its rows, each predicted from the
+            others; None: there is none.
+        share: of the residual's mean in [0, 1].
+    """
+
+    def __init__(
+        self,
+        members: Sequence[ConditionalField],
+        weights: Sequence[float] = (1.0,),
+        residual: ConditionalField | None = None,
+        share: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+        self.weights = tuple(float(weight) for weight in weights)
+        self.residual, self.share = residual, float(share)
+        if len(members) == 1:
+            self.held = members[0].held
+
+    def parts(self) -> Iterator[tuple[float, ConditionalField]]:
+        """Fields that are no mixtures, with their weights in the mean."""
+        for weight, one in zip(self.weights, self._fields(), strict=True):
+            if isinstance(one, Mixture):
+                yield from ((weight * more, part) for more, part in one.parts())
+            else:
+                yield weight, one
+
+    @property
+    def count(self) -> int:
+        """Gaussians of all members."""
+        return sum(member.count for member in self._fields())
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Terms of any member, and the residual."""
+        more = () if self.residual is None else ("residual",)
+        return tuple(dict.fromkeys([*(term for one in self._fields() for term in one.terms), *more]))
+
+    def objects(self) -> SiteObjects:
+        """Those of the heaviest member that found any."""
+        found = [self._fields()[i].objects() for i in np.argsort(self.weights)[::-1]]
+        return next((one for one in found if len(one)), found[0])
+
+    def _fields(self) -> list[ConditionalField]:
+        return list(self.members)  # type: ignore[arg-type]
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Weighed losses of those members that have parameters; the residual's follow from its likelihood."""
+        learning = [(w, m) for w, m in zip(self.weights, self._fields(), strict=True) if learns(m)]
+        return torch.stack([weight * member.loss(batch) for weight, member in learning]).sum(0)
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """Every member on the same rows, then the process on what they leave."""
+        for member in self._fields():
+            member.condition(data, rows)
+        if self.residual is not None:
+            left = self._mean_left_out()
+            self.residual.condition(residuals(left, data), left.rows)
+
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """The mean of all; what they disagree about is added to their variances.
+
+        The variance errs high by what the residual explains.
+        """
+        found = [member(tx, rx) for member in self._fields()]
+        pairs = list(zip(self.weights, found, strict=True))
+        mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
+        apart = [(one.mean - mean).abs().square().flatten(1).mean(1) for one in found]
+        variance = torch.stack(
+            [w * (one.variance + a) for (w, one), a in zip(pairs, apart, strict=True)]
+        ).sum(0)
+        parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
+        explained = torch.stack(parts).sum(0) if parts else None
+        unknown = torch.stack([weight * one.unknown for weight, one in pairs]).sum(0)
+        if self.residual is not None:
+            mean = mean + self.share * self.residual(tx, rx).mean
+        return Posterior(mean, variance.float(), explained, unknown.float())
+
+    def left_out(self) -> LeftOutRows:
+        """The mean of all."""
+        found = self._mean_left_out()
+        if self.residual is None:
+            return found
+        return replace(found, mean=found.mean + self.share * self.residual.left_out().mean)
+
+    def _mean_left_out(self) -> LeftOutRows:
+        found = [member.left_out() for member in self._fields()]
+        pairs = list(zip(self.weights, found, strict=True))
+        mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
+        variance = torch.stack([weight * one.variance for weight, one in pairs]).sum(0)
+        return LeftOutRows(found[0].rows, mean, variance)
+
+    def state(self) -> dict[str, Any]:
+        """That of none: members are stored by their kinds."""
+        return {"weights": list(self.weights), "share": self.share}
+
+
+def residuals(left: LeftOutRows, data: Measurements) -> Measurements:
+    """The measurements with what is left of rows, left out one by one, as targets."""
+    target = np.zeros_like(data.target)
+    target[left.rows] = data.target[left.rows] - left.mean.numpy().reshape(-1, *data.target.shape[1:])
+    return replace(data, target=target)
