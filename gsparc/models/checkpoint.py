@@ -20,7 +20,7 @@ from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method
 from gsparc.ops import SphereGrid
 
-SCHEMA_VERSION = 2  # of what a checkpoint holds; a file of another is refused
+VERSION = 1  # of what a checkpoint holds; later ones stay readable
 FORMAT = "gsparc-checkpoint"
 DEEPEST = 50  # of containers in containers
 MODEL = "model.ckpt"  # of a run's folder
@@ -93,7 +93,7 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     kind = method.stored_as
     content = {
         "format": FORMAT,
-        "schema_version": SCHEMA_VERSION,
+        "version": VERSION,
         "method": method.name,
         "target": f"{kind.__module__}.{kind.__qualname__}",
         "config": config,
@@ -136,8 +136,8 @@ def read(path: str | Path) -> Stored:
     """Read a checkpoint onto the CPU; runs no code from the file.
 
     Raises:
-        CheckpointError: missing, not a checkpoint, damaged, hostile, of another schema version, or holding
-            numbers that are NaN or infinite.
+        CheckpointError: missing, not a checkpoint, damaged, hostile, of a version before 1 or after ours, or
+            holding numbers that are NaN or infinite.
     """
     path = Path(path)
     return _stored(_content(path), path)
@@ -171,12 +171,14 @@ def _content(path: Path) -> dict[str, Any]:
         )
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
-    version = content.get("schema_version")
-    if type(version) is not int or version != SCHEMA_VERSION:
-        found = "without a schema version" if version is None else f"in schema {version!r}"
+    version = content.get("version")
+    if type(version) is not int or version < 1:
         raise CheckpointError(
-            f"{path}: written {found}, this gsparc reads {SCHEMA_VERSION} alone; "
-            "train again with this version"
+            f"{path}: written before checkpoints of version 1; train again with this gsparc"
+        )
+    if version > VERSION:
+        raise CheckpointError(
+            f"{path}: of version {version}, this gsparc reads up to {VERSION}: update gsparc"
         )
     if _overgrown(content):  # what walks over it would not end
         raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")

@@ -152,10 +152,10 @@ def test_hostile_config_is_refused_and_not_run(fitted, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"schema_version": 99}, "schema 99"),
-        ({"schema_version": "2"}, "schema '2', this gsparc reads 2 alone; train again"),
-        ({"schema_version": 1}, "schema 1, this gsparc reads 2 alone; train again"),
-        ({"schema_version": None}, "without a schema version, this gsparc reads 2 alone; train again"),
+        ({"version": 99}, "of version 99, this gsparc reads up to 1"),
+        ({"version": "1"}, "written before checkpoints of version 1; train again"),
+        ({"version": 0}, "written before checkpoints of version 1"),
+        ({"version": None}, "written before checkpoints of version 1; train again"),
         ({"format": "other"}, "not a gsparc checkpoint"),
         ({"site": {}}, "incomplete"),
         ({"state": 3}, "incomplete"),

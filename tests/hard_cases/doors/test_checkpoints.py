@@ -151,8 +151,8 @@ def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
 @pytest.mark.parametrize(
     "changes,says",
     [
-        ({"schema_version": 99}, "schema 99"),
-        ({"schema_version": None}, "without a schema version, this gsparc reads 2 alone; train again"),
+        ({"version": 99}, "of version 99, this gsparc reads up to 1"),
+        ({"version": None}, "written before checkpoints of version 1; train again"),
         ({"format": "other"}, "not a gsparc checkpoint"),
         ({"site": {}}, "incomplete"),
         ({"site": None}, "incomplete"),
