@@ -30,7 +30,7 @@ from gsparc.models.method import Method, Prediction, Reconditions
 from gsparc.models.reduced import View
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import Clock, Spent, less_repeatable
+from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
 
@@ -122,30 +122,10 @@ class PerStation(Method):
             ValueError: a station of the test rows has too few training rows, or all are learned together, and
                 the method cannot take both ends for moving.
         """
-        assert data.station is not None and data.site.stations is not None
         whole = self.wrapped.usual_s(data.site) if context.budget_s is None else context.budget_s
         budget = context.time_budget(math.inf if whole is None else whole)
-        how = context.stations
-        if how == "auto":
-            how, why = self.wrapped.best_stations(data, fold, replace(context, budget_s=whole))
-            log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
-        together, joint = how == "together", self.wrapped.shares(data.site)
-        self._shared = together and joint
-        if together and not (joint or self.wrapped.both_ends):
-            raise ValueError(f"{self.name}: knows one static end; say stations=each")
-        self.site = data.site
-        known, unheard = trained_stations(self.wrapped, data, fold)
-        numbers = [int(t) for t in np.flatnonzero(known)]
-        if together:
-            numbers = [UNHEARD]
-        elif unheard.any():
-            if not self.wrapped.both_ends and not joint:
-                names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
-                raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
-            numbers.append(UNHEARD)
-        if UNHEARD in numbers and not joint and np.isnan(data.site.stations.position).any():
-            raise ValueError(f"{self.name}: places of stations are unknown, it needs them; say stations=each")
-        notes: list[str] = []
+        numbers = self._numbers(data, fold, replace(context, budget_s=whole))
+        self.site, notes = data.site, []
         left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
         kept = self.wrapped.resumable and context.run_dir != Path()
         limited: Clock | None = None
@@ -153,27 +133,21 @@ class PerStation(Method):
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
         for turn, number in enumerate(numbers):
-            rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
-            copy, part = self._make(), data.subset(rows, self._site_of(data.site, number))
-            inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
-            name = "all stations" if together else "stations never heard"
-            name = name if number == UNHEARD else data.site.stations.name[number]
             folder = "unheard" if number == UNHEARD else f"station{number}"
             share = None
             if whole is not None:
-                share = max(
-                    (whole - budget.spent) / (len(numbers) - turn), LEAST_SHARE * whole / len(numbers)
-                )
-            own = context.within(
-                folder, budget_s=share, datamodule=None, resume=None if left is None else left / folder
-            )
+                even = (whole - budget.spent) / (len(numbers) - turn)
+                share = max(even, LEAST_SHARE * whole / len(numbers))
+            resume = None if left is None else left / folder
+            own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
+            name = self._name_of(number)
             if self.wrapped.takes_budget and len(numbers) > 1:
-                spent = budget.spent
-                rest = spent / turn * (len(numbers) - turn) if whole is None and turn else None
-                rest = rest if whole is None else max(whole - spent, 0.0)
-                said = "" if rest is None else f", about {rest:.0f} s left for all"
-                log.info("station %d of %d: %s%s", turn + 1, len(numbers), name, said)
-            before = budget.counted.wall
+                log.info(
+                    "station %d of %d: %s%s", turn + 1, len(numbers), name, _rest(turn, len(numbers), budget)
+                )
+            rows, part = self._part(data, number)
+            inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
+            copy, before = self._make(), budget.counted.wall
             try:
                 report = parts.fit(copy, part, inner, own)
             except KeyboardInterrupt:
@@ -184,26 +158,61 @@ class PerStation(Method):
             if kept and len(numbers) > 1:
                 extra = parts.marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
-            earlier = max(
-                report.seconds - (budget.counted.wall - before), 0.0
-            )  # spent by the interrupted run
+            earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
             self._copies[number] = copy
             limited = less_repeatable(limited, report.limited_by)
             notes += [f"{name}: {note}" for note in report.notes]
         return FitReport(budget.counted.wall, tuple(notes), limited)
 
+    def _numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
+        """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.
+
+        Raises:
+            ValueError: see `fit`.
+        """
+        stations = data.site.stations
+        assert stations is not None
+        how = context.stations
+        if how == "auto":
+            how, why = self.wrapped.best_stations(data, fold, context)
+            log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
+        together, joint = how == "together", self.wrapped.shares(data.site)
+        self._shared = together and joint
+        if together and not (joint or self.wrapped.both_ends):
+            raise ValueError(f"{self.name}: knows one static end; say stations=each")
+        known, unheard = trained_stations(self.wrapped, data, fold)
+        numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
+        if not together and unheard.any():
+            if not self.wrapped.both_ends and not joint:
+                names = ", ".join(stations.name[t] for t in np.flatnonzero(unheard)[:3])
+                raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
+            numbers.append(UNHEARD)
+        if UNHEARD in numbers and not joint and np.isnan(stations.position).any():
+            raise ValueError(f"{self.name}: places of stations are unknown, it needs them; say stations=each")
+        return numbers
+
+    def _name_of(self, number: int) -> str:
+        assert self.site is not None and self.site.stations is not None
+        if number != UNHEARD:
+            return self.site.stations.name[number]
+        return "all stations" if self._shared or not self._copies else "stations never heard"
+
+    def _part(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
+        """Rows of the copy of a station, and the measurements as it sees them."""
+        assert data.station is not None
+        rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+        return rows, data.subset(rows, self._site_of(data.site, number))
+
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; stations without rows among these are then as if never heard."""
-        assert data.station is not None
         found = PerStation(self._make)
         found.site, found._shared = data.site, self._shared
         for number, copy in self._copies.items():
-            own = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+            own, part = self._part(data, number)
             chosen = np.flatnonzero(np.isin(own, rows))
             if len(chosen) < LEAST_ROWS:
                 continue
-            part = data.subset(own, self._site_of(data.site, number))
             learned = copy.reconditioned(part, chosen) if isinstance(copy, Reconditions) else None
             if learned is None:
                 return None
@@ -315,6 +324,14 @@ class OfStation(View):
         rows = torch.arange(len(tx))
         station = torch.full_like(rows, self.number)
         return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
+
+
+def _rest(turn: int, count: int, budget: TimeBudget) -> str:
+    """What a log says of the seconds that are left, before the station `turn` of so many."""
+    rest = budget.seconds - budget.spent
+    if math.isinf(rest):
+        rest = budget.spent / turn * (count - turn) if turn else math.inf
+    return "" if math.isinf(rest) else f", about {max(rest, 0.0):.0f} s left for all"
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:
