@@ -16,14 +16,12 @@ import numpy as np
 
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
-from gsparc.data.checks.far_ends import far_ends
-from gsparc.data.checks.outliers import peaks, too_strong
+from gsparc.data.checks.outliers import far_ends, peaks, too_strong
 from gsparc.data.errors import DataError
-from gsparc.data.fields import FIELDS, NORMALISATIONS
 from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import LIGHT, Kind, Links, Measurements
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements
 
 log = logging.getLogger(__name__)
 
