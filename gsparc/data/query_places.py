@@ -155,7 +155,11 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
             wanted = "latitude and longitude, or " if alone else ""
             raise DataError(f"{source}: no places of the {WORDS[end]}; expected {wanted}{end}_position")
         if pair:
-            across = np.column_stack([_numbers(raw, source, name, 1) for name in _same(raw, source, pair)])
+            shapes = [str(raw.arrays[name].shape) for name in pair]
+            if shapes[0] != shapes[1]:
+                both = f"latitude and longitude have shapes {' and '.join(shapes)}"
+                raise DataError(f"{source}: {both}; expected one shape")
+            across = np.column_stack([_numbers(raw, source, name, 1) for name in pair])
         else:
             across = _numbers(raw, source, position[0], 2)
             if across.shape[1] not in (2, 3):
@@ -174,13 +178,6 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     if not rows:
         raise DataError(f"{source}: no rows; expected a place or more")
     return _checked(QueryPlaces(source, ends, rows, _stations(raw, source, len(rows))))
-
-
-def _same(raw: Raw, source: str, pair: Sequence[str]) -> Sequence[str]:
-    if raw.arrays[pair[0]].shape != raw.arrays[pair[1]].shape:
-        shapes = " and ".join(str(raw.arrays[name].shape) for name in pair)
-        raise DataError(f"{source}: latitude and longitude have shapes {shapes}; expected one shape")
-    return pair
 
 
 def _numbers(raw: Raw, source: str, name: str, axes: int) -> np.ndarray:

@@ -218,7 +218,7 @@ def _read_hdf5(path: Path) -> Raw:
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
                     text = h5py.check_string_dtype(item.dtype)
-                    arrays[name] = on_disk(item) if not text and is_big(item) else _values(item, text)
+                    arrays[name] = on_disk(item) if not text and is_big(item) else _values(item, fixed=True)
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
@@ -235,8 +235,10 @@ def _read_hdf5(path: Path) -> Raw:
     return raw
 
 
-def _values(item: h5py.Dataset, text: Any) -> np.ndarray:
-    return np.asarray(item.asstr()[()] if text else item[()])
+def _values(item: h5py.Dataset, fixed: bool = False) -> np.ndarray:
+    """Values of a dataset; text of variable length, and `fixed` where wanted, as text."""
+    text = h5py.check_string_dtype(item.dtype)
+    return np.asarray(item.asstr()[()] if text and (fixed or text.length is None) else item[()])
 
 
 def _plain(value: Any) -> Any:
@@ -323,24 +325,17 @@ def read_netcdf(path: str | Path) -> Raw:
 
 def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     with netcdf_file(str(path), "r", mmap=False) as file:
-        return {
-            name: (np.array(variable.data), getattr(variable, "_FillValue", None))
-            for name, variable in file.variables.items()
-        }
+        held = file.variables.items()
+        return {name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in held}
 
 
 def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
-    reason = read_error(path)
-    if reason is not None:
-        raise DataError(f"{path}: damaged ({reason})")
-    found: dict[str, tuple[np.ndarray, Any]] = {}
+    fault = read_error(path)
+    if fault is not None:
+        raise DataError(f"{path}: damaged ({fault})")
     with h5py.File(path, "r") as file:
-        for name, item in file.items():
-            if isinstance(item, h5py.Dataset):
-                text = h5py.check_string_dtype(item.dtype)
-                values = np.asarray(item.asstr()[()] if text and text.length is None else item[()])
-                found[str(name)] = values, item.attrs.get("_FillValue")
-    return found
+        held = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
+        return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in held}
 
 
 def _of_netcdf(array: np.ndarray, fill: Any) -> np.ndarray:

@@ -280,16 +280,11 @@ class Measurements:
         """Rows (n,) alone, seen as measurements of `site`."""
 
         def of(value: Any) -> Any:
-            return (
-                None
-                if value is None
-                else [value[i] for i in rows]
-                if isinstance(value, list)
-                else taken(value, rows)
-            )
+            return [value[i] for i in rows] if isinstance(value, list) else taken(value, rows)
 
         whole = ("site", "provenance", "release_split")
-        parts = {name: of(value) for name, value in vars(self).items() if name not in whole}
+        given = {name: value for name, value in vars(self).items() if value is not None and name not in whole}
+        parts = {name: of(value) for name, value in given.items()}
         return Measurements(site=site or self.site, provenance=self.provenance, **parts)
 
     def batch(self, index: np.ndarray | Tensor) -> Batch:
@@ -300,16 +295,15 @@ class Measurements:
             rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
         else:
             rx = Pose(self._f32(self.rx_position[rows]), self._f32(self.rx_rotation[rows]))
+        given = ((name, getattr(self, name)) for name in ("mask", "uplink", "station", "run"))
+        held: dict[str, Any] = {name: torch.from_numpy(v[rows]) for name, v in given if v is not None}
         return Batch(
             index=torch.from_numpy(rows.astype(np.int64)),
             tx=self._f32(self.tx[rows]),
             rx=rx,
             target=self.targets(rows),
-            mask=None if self.mask is None else torch.from_numpy(self.mask[rows]),
             noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
-            uplink=None if self.uplink is None else torch.from_numpy(self.uplink[rows]),
-            station=None if self.station is None else torch.from_numpy(self.station[rows]),
-            run=None if self.run is None else torch.from_numpy(self.run[rows]),
+            **held,
         )
 
     @staticmethod

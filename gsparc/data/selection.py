@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,16 +81,14 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Selected:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
     notes: list[str] = []
-    for apply in (
-        None if selection.stations is None else partial(keep_stations, stations=selection.stations),
-        None if selection.runs is None else partial(keep_runs, runs=selection.runs),
-        None if selection.min_rssi_db is None else partial(keep_above, min_rssi_db=selection.min_rssi_db),
-        None if selection.max_rows is None else partial(keep_rows, max_rows=selection.max_rows),
-    ):
-        if apply is not None:
-            part = apply(raw, source=source)
-            raw = part.raw
-            notes += part.notes
+    steps: tuple[tuple[Callable[..., Selected], Any], ...] = (
+        *((keep_stations, selection.stations), (keep_runs, selection.runs)),
+        *((keep_above, selection.min_rssi_db), (keep_rows, selection.max_rows)),
+    )
+    for keep, setting in steps:
+        if setting is not None:
+            part = keep(raw, setting, source)
+            raw, notes = part.raw, [*notes, *part.notes]
     return Selected(raw, tuple(notes))
 
 

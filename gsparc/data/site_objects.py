@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
@@ -74,14 +75,6 @@ class GaussianCloud:
 
     def covariances(self) -> np.ndarray:
         """(N, 3, 3) [m^2]: R S S R^T (Kerbl et al. 2023, eq. 6)."""
-        w, x, y, z = self.quats.T
-        turn = np.stack(
-            [
-                1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-                2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-                2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-            ],
-            axis=-1,
-        ).reshape(-1, 3, 3)  # fmt: skip
+        turn = Rotation.from_quat(np.roll(self.quats, -1, axis=1)).as_matrix()
         half = turn * self.scales[:, None, :]
         return np.asarray(half @ half.transpose(0, 2, 1))

@@ -229,7 +229,7 @@ class Argos(Release):
     """The Argos release or any folder in its layout.
 
     Args:
-        root, stand_in, name, batch_size: see `Release`.
+        root, name, **rest: see `Release`.
         antenna, positions, align: see `load_argos`.
         encoder: `file` or `folder`, and `EncoderSettings`.
     """
@@ -243,11 +243,10 @@ class Argos(Release):
         positions: str | bool = "encoder",
         align: bool = True,
         encoder: Mapping[str, Any] | None = None,
-        stand_in: StandIn | None = None,
         name: str = "argos",
-        batch_size: int = 16,
+        **rest: Any,
     ) -> None:
-        super().__init__(root, stand_in, name, batch_size)
+        super().__init__(root, name, **rest)
         self.antenna, self.align = antenna, bool(align)
         self.positions = str(positions).lower()  # `true` in YAML is no text
         given = dict(encoder or {})
@@ -281,7 +280,9 @@ class ArgosSim(Argos):
         name: str = "argos_sim",
         batch_size: int = 16,
     ) -> None:
-        super().__init__(None, antenna, positions, align, encoder, stand_in, name, batch_size)
+        super().__init__(
+            None, antenna, positions, align, encoder, name, stand_in=stand_in, batch_size=batch_size
+        )
 
     def load(self) -> Measurements:
         """As `Argos.load`, without a word about the release."""

@@ -90,7 +90,9 @@ class Release(DataModule):
 
     called = ""  # the release, in messages
 
-    def __init__(self, root: str | Path | None, stand_in: StandIn | None, name: str, batch_size: int) -> None:
+    def __init__(
+        self, root: str | Path | None, name: str, stand_in: StandIn | None = None, batch_size: int = 16
+    ) -> None:
         super().__init__(name, batch_size)
         self.root, self.stand_in = None if root is None else Path(root), stand_in
 

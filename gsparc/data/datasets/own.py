@@ -1,4 +1,4 @@
-"""Measurements of one's own: `dataset=own`."""
+"""Measurements of one's own, `dataset=own`, and whatever file or folder `gsparc check` is given."""
 
 from __future__ import annotations
 

@@ -272,9 +272,7 @@ class Powder(Campaign):
     """Powers of a walking transmitter at fixed stations; see `raw_of_powder`.
 
     Args:
-        file: *.npz, or the release's *.csv.
-        station_table: coordinates of the stations of a CSV; None: `location_coordinates.json` beside it.
-        tx_height, station_height: above ground [m].
+        file, station_table, tx_height, station_height: see `raw_of_powder`.
         name: of run directories.
         **rest: see `Campaign`.
     """

@@ -19,7 +19,7 @@ from PIL import Image
 
 from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.blocks import empty
-from gsparc.data.datasets.campaign import Release, StandIn
+from gsparc.data.datasets.campaign import Release
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
 from gsparc.data.own_checks import quaternion_to_matrix
@@ -251,7 +251,7 @@ class RFID(Release):
     """The RFID release (NeRF2, set s23) or any folder in its layout.
 
     Args:
-        root, stand_in, name, batch_size: see `Release`.
+        root, name, **rest: see `Release`.
         array: rows, columns and spacing_m of the receiver's array, see `planar_array`; None: the release's.
         gateway, wavelength_m, normalisation: see `load_rfid`.
     """
@@ -265,11 +265,10 @@ class RFID(Release):
         wavelength_m: float = WAVELENGTH,
         array: Mapping[str, Any] | None = None,
         normalisation: str = "max",
-        stand_in: StandIn | None = None,
         name: str = "rfid",
-        batch_size: int = 16,
+        **rest: Any,
     ) -> None:
-        super().__init__(root, stand_in, name, batch_size)
+        super().__init__(root, name, **rest)
         self.settings: dict[str, Any] = {
             "gateway": gateway,
             "wavelength_m": float(wavelength_m),

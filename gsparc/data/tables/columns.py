@@ -80,10 +80,7 @@ Chosen = dict[str, tuple[Column, ...]]
 
 
 def choose(
-    sheet: Sheet,
-    said: Mapping[str, object],
-    labelled: Iterable[str] = (),
-    only: Container[str] | None = None,
+    sheet: Sheet, said: Mapping[str, object], labelled: Iterable[str] = (), only: Container[str] | None = None
 ) -> tuple[Chosen, list[str]]:
     """The columns of each quantity, and a note for each that was guessed.
 
@@ -143,8 +140,9 @@ def choose(
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact:
             notes.append(_note(chosen[role]))
-    for columns in chosen.values():
-        notes += [_conversion(c) for c in columns[:1] if not c.word and c.unit is not None and c.unit.changes]
+    for column in (columns[0] for columns in chosen.values()):
+        if not column.word and column.unit is not None and column.unit.changes:
+            notes.append(f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}")
     _one_unit(sheet, chosen)
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head and head not in used]
@@ -317,11 +315,6 @@ def _note(columns: tuple[Column, ...]) -> str:
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
     turned = first.unit is not None and first.unit.changes
     return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
-
-
-def _conversion(column: Column) -> str:
-    assert column.unit is not None
-    return f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}"
 
 
 def schema_unit(column: Column) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import difflib
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from gsparc.data.raw import Raw
 from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
@@ -252,7 +253,8 @@ class Builder:
         if self.listed is not None:
             self._all_listed(words, column.head or "")
             return None if self.sheet.problems else self._by_list(words)
-        names, index = _in_order(words)
+        index, distinct = pd.factorize(words)  # in the order of their first rows
+        names = tuple(map(str, distinct))
         if where is not None:
             each = one_each(self.sheet, where, index, names)
             return None if each is None else _Stations(names, index, each)
@@ -308,15 +310,14 @@ class Builder:
                 continue
             close = difflib.get_close_matches(word, self.listed.names, 1, 0.5)
             hint = f"; did you mean {close[0]!r}?" if close else ""
-            place = (
-                "the heads" if head is None else f"column {head!r}, {self.sheet.rows[_first(words, word)]}"
-            )
+            place = "the heads"
+            if head is not None:
+                place = f"column {head!r}, {self.sheet.rows[int(np.argmax(words == word))]}"
             self.sheet.problems.add(f"{self.sheet.source}, {place}", f"{word!r} is no listed station{hint}")
 
     def _by_list(self, words: np.ndarray) -> _Stations:
         assert self.listed is not None
-        number = {name: i for i, name in enumerate(self.listed.names)}
-        index = np.array([number[word] for word in words.tolist()], np.int64)
+        index = pd.Index(self.listed.names).get_indexer(words)
         self.arrays |= self.listed.extra
         silent = [name for i, name in enumerate(self.listed.names) if i not in set(index.tolist())]
         if silent:
@@ -417,14 +418,3 @@ class Builder:
         self.arrays["carrier_hz"] = values[0] if same else values
         if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:
             self.arrays["frequency_hz"] = values[0]
-
-
-def _in_order(words: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
-    """Different words in the order of their first rows, and the number of each row's."""
-    names: Sequence[str] = list(dict.fromkeys(words.tolist()))
-    number = {name: i for i, name in enumerate(names)}
-    return tuple(names), np.array([number[word] for word in words.tolist()], np.int64)
-
-
-def _first(words: np.ndarray, word: str) -> int:
-    return int(np.argmax(words == word))

@@ -85,20 +85,14 @@ class Sheet:
             if bad.any():
                 bad[bad] = self.words(head)[bad] != ""
         if bad.any():
-            shown = column.astype(str).to_numpy(dtype=object)
-            rows = (f"{self.rows[i]}: {_shown(shown[i])}" for i in np.flatnonzero(bad))
-            mark = (
-                "decimal commas" if self.decimal == "," else "decimal points, and no marks between thousands"
-            )
-            marks = f"; this table has {mark}" if any("," in c or "." in c for c in shown[bad]) else ""
-            return self.problems.add_rows(
-                self.where(head), rows, f"is no finite number{marks}; or leave it empty"
-            )
+            cells = column.astype(str).to_numpy(dtype=object)[bad]
+            shown = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
+            rows = (f"{self.rows[i]}: {cell}" for i, cell in zip(np.flatnonzero(bad), shown, strict=True))
+            mark = "commas" if self.decimal == "," else "points, and no marks between thousands"
+            hint = f"; this table has decimal {mark}" if any("," in c or "." in c for c in cells) else ""
+            what = f"is no finite number{hint}; or leave it empty"
+            return self.problems.add_rows(self.where(head), rows, what)
         return values
-
-
-def _shown(cell: str) -> str:
-    return repr(cell if len(cell) <= 40 else cell[:37] + "...")
 
 
 def read_parquet(source: str) -> Sheet:
@@ -181,7 +175,10 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     notes += dropped
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
-    _distinct(heads, source)
+    for i, head in enumerate(heads):
+        if head and head in heads[:i]:
+            where = f"columns {heads.index(head) + 1} and {i + 1}"
+            raise DataError(f"{source}: {where} are both named {head!r}; rename one")
     if not rows:
         raise DataError(f"{source}: line {lines.number[0]} names columns, but there are no rows below it")
     frame = pd.DataFrame(rows, dtype=object)
@@ -328,13 +325,6 @@ def _rectangular(lines: _Lines, delimiter: str, source: str) -> list[list[str]]:
     problems.add_rows(source, names, f"expected {counts[0]} cells between {mark}, as there are heads")
     problems.raise_if_any()
     return cells
-
-
-def _distinct(heads: list[str], source: str) -> None:
-    for i, head in enumerate(heads):
-        if head and head in heads[:i]:
-            where = f"columns {heads.index(head) + 1} and {i + 1}"
-            raise DataError(f"{source}: {where} are both named {head!r}; rename one")
 
 
 def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
