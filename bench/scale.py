@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from town import TESTED, city, hall, town
 
-from gsparc.data.campaigns.rfid import load_rfid
+from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.own import load_own
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold

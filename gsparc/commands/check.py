@@ -8,9 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gsparc.data.checks.describe import describe, read_any
-from gsparc.data.checks.link_levels import link_levels
-from gsparc.data.checks.plausibility import plausibility_warnings, steps_of
+from gsparc.data.checks.describe import describe
+from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
+from gsparc.data.datasets.own import read_any
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
 

@@ -13,8 +13,7 @@ from omegaconf import DictConfig
 
 from gsparc.commands.run_lock import in_use
 from gsparc.commands.settings import plain
-from gsparc.data.claims import claimed
-from gsparc.data.files import whole_file
+from gsparc.data.files import claimed, whole_file
 from gsparc.evaluation.report.sweep import FAILURE
 from gsparc.evaluation.summary import provenance
 from gsparc.models.parts import LAST

@@ -9,7 +9,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
 
-from gsparc.data.plugins import GROUPS, plugins, settings_of
+from gsparc.data.instantiate import GROUPS, plugins, settings_of
 from gsparc.simulate.scenes.shipped import settings, shipped
 
 

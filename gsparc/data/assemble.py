@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.data.blocks import blocks, contents, is_big
+from gsparc.data.blocks import blocks, contents
 from gsparc.data.checks.outliers import peaks, too_far, too_strong
 from gsparc.data.errors import Problems
 from gsparc.data.schema import Links, Measurements, Site
@@ -42,26 +42,18 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     rounding keeps any single row (which may be a test row) from influencing it. `weight` is a bool mask of
     measured entries.
     """
-    usual = ~too_strong(peaks(values, weight))
-    if weight is None and is_big(values):
-        return _rounded_rms_of_blocks(values, usual)
-    values, weight = values[usual], None if weight is None else weight[usual]
-    magnitude = np.abs(values if weight is None else values[weight]).astype(np.float64)
-    peak = float(magnitude.max(initial=0.0))
-    if peak == 0.0:
-        return 0.0
-    # Relative to the peak, so that squares of 1e-200 or 1e200 neither vanish nor overflow.
-    rms = peak * float(np.sqrt(np.mean((magnitude / peak) ** 2)))
-    return float(10 ** (round(20 * np.log10(rms)) / 20))
-
-
-def _rounded_rms_of_blocks(values: np.ndarray, usual: np.ndarray) -> float:
-    peak = float(peaks(values)[usual].max(initial=0.0))
+    highest = peaks(values, weight)
+    usual = ~too_strong(highest)
+    peak = float(highest[usual].max(initial=0.0))
     if peak == 0.0:
         return 0.0
     total, count = 0.0, 0
     for part in blocks(values):
-        magnitude = np.abs(values[part][usual[part]]).astype(np.float64) / peak
+        rows = values[part][usual[part]]
+        # Relative to the peak, so that squares of 1e-200 or 1e200 neither vanish nor overflow.
+        magnitude = (
+            np.abs(rows if weight is None else rows[weight[part][usual[part]]]).astype(np.float64) / peak
+        )
         total, count = total + float((magnitude**2).sum()), count + magnitude.size
     return float(10 ** (round(20 * np.log10(peak * np.sqrt(total / count))) / 20))
 

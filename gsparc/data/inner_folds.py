@@ -86,7 +86,7 @@ def inner_folds(
             return _of_all(known, settings.name, cut, stations, unit)
         settings = replace(settings, name="random", leave_out=())
     found = _cut(where, settings, count, rng)
-    folds = [Fold(*(np.flatnonzero(np.isin(which, p)) for p in vars(one).values())) for one in found.folds]
+    folds = [one.each(lambda part: np.flatnonzero(np.isin(which, part))) for one in found.folds]
     return _of_all(known, found.name, folds, found.unit[which], unit)
 
 
@@ -163,7 +163,7 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.
         side = settings.side_m or 0.0
         for _ in range(HALVINGS):
             try:
-                folds = _least_shared(_drawn(where, replace(settings, side_m=side), count, rng), count)
+                folds = _drawn(where, replace(settings, side_m=side), count, rng)
             except DataError:
                 side /= 2
                 continue
@@ -203,16 +203,18 @@ def _pieces(
         yield np.sort(turned[size:]), np.sort(turned[:size])
 
 
-def _drawn(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator) -> list[Fold]:
-    """Draws of a split by seeds of their own, distinct ones."""
+def _drawn(
+    where: np.ndarray,
+    settings: SplitSettings,
+    count: int,
+    rng: np.random.Generator,
+    station: np.ndarray | None = None,
+) -> tuple[Fold, ...]:
+    """`count` distinct draws of a split by seeds of their own, each with the fewest rows again."""
     seeds = rng.integers(2**31, size=DRAWS * count)
-    drawn = [make_split(where, replace(settings, seed=int(one))).folds[0] for one in seeds]
-    return list({fold.test.tobytes(): fold for fold in drawn}.values())
-
-
-def _least_shared(drawn: list[Fold], count: int) -> tuple[Fold, ...]:
-    """`count` of the draws, one after the other that leaves out the fewest rows again."""
-    chosen, rest = [drawn[0]], drawn[1:]
+    drawn = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
+    first, *rest = {fold.test.tobytes(): fold for fold in drawn}.values()
+    chosen = [first]
     while rest and len(chosen) < count:
         seen = np.concatenate([fold.test for fold in chosen])
         shared = [float(np.isin(fold.test, seen).mean()) for fold in rest]
@@ -238,9 +240,7 @@ def _stations(
     if together <= 1:
         every = make_split(where, replace(settings, leave_out=0), station=station).folds
         return [every[i] for i in rng.permutation(number)[:count]]
-    seeds = rng.integers(2**31, size=DRAWS * count)
-    drawn = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
-    return list(_least_shared(list({fold.test.tobytes(): fold for fold in drawn}.values()), count))
+    return list(_drawn(where, settings, count, rng, station))
 
 
 def _by_fold(name: str, folds: list[Fold], places: int) -> InnerFolds:
@@ -255,7 +255,7 @@ def _of_all(
     known: np.ndarray, name: str, folds: Sequence[Fold], unit: np.ndarray, every: np.ndarray
 ) -> InnerFolds:
     """Folds of rows counted within `known` (n,) as rows of all, their units (n,) among those of all (S,)."""
-    whole = tuple(Fold(*(known[part] for part in vars(fold).values())) for fold in folds)
+    whole = tuple(fold.each(lambda part: known[part]) for fold in folds)
     tested = np.isin(known, np.concatenate([fold.test for fold in whole]))
     every[known[tested]] = unit[tested]
     return InnerFolds(name, whole, every)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from importlib import import_module
+from importlib.metadata import entry_points
 from typing import Any
 
 from gsparc.data.errors import DataError
-from gsparc.data.plugins import GROUPS, plugins
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
@@ -64,3 +65,24 @@ def refuse_foreign(path: Any) -> None:
         return  # before plugins are looked for: that reads the notes of all installed packages
     if not any(path in plugins(group).values() for group in GROUPS):
         raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")
+
+
+GROUPS = {"model": "gsparc.models", "dataset": "gsparc.datasets"}
+PLAIN = (bool, int, float, str, list, dict, type(None))
+
+
+def plugins(group: str) -> dict[str, str]:
+    """Import path `module.Class` of every plugin for a config group (`model` or `dataset`), by its name."""
+    return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=GROUPS[group])}
+
+
+def settings_of(kind: type) -> dict[str, Any]:
+    """What `kind.__init__` takes, with its defaults; `???` where there is none, classes left out."""
+    taken = inspect.signature(kind).parameters.values()
+    named = [p for p in taken if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    found = {p.name: "???" if p.default is p.empty else p.default for p in named}
+    return {
+        name: list(v) if isinstance(v, tuple) else v
+        for name, v in found.items()
+        if isinstance(v, (*PLAIN, tuple))
+    }

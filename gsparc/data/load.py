@@ -19,15 +19,7 @@ from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import (
-    FileSettings,
-    Split,
-    SplitSettings,
-    left_out,
-    make_split,
-    read_split,
-    without,
-)
+from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
 
 # A dataset is a file or a folder: who says the one may mean the other.
 PATHS = {"file": "root", "root": "file"}

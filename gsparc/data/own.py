@@ -7,7 +7,7 @@ lists everything that is wrong, `load_own` is its strict form, `write_own` refus
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,11 @@ import numpy as np
 
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
-from gsparc.data.checks.far_ends import far_ends
-from gsparc.data.checks.outliers import peaks, too_strong
-from gsparc.data.errors import DataError
-from gsparc.data.fields import FIELDS, NORMALISATIONS
+from gsparc.data.checks.outliers import far_ends, peaks, too_strong
 from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import LIGHT, Kind, Links, Measurements
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +151,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     target, scale = _scaled(measured, values, mask, links.censored)
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
-        check.refuse_rows(measured, ~_finite(target), huge)
+        check.refuse_rows(measured, _infinite(target), huge)
     if not (np.isfinite(scale) and scale > 0):
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
@@ -243,7 +240,7 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     unmarked = "not finite; expected numbers (mark what was not measured in mask)"
     with np.errstate(over="ignore"):
         if mask is None:
-            check.refuse_rows(name, ~_finite(values), unmarked)
+            check.refuse_rows(name, _infinite(values), unmarked)
         else:
             check.refuse_rows(name, ~np.isfinite(np.abs(values)) & measured, unmarked)
     if name == "csi" or values.dtype.kind == "u":
@@ -252,21 +249,19 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
         if name == "rssi_db":
             bad = np.abs(values) > 400
         else:
-            bad = values < 0 if mask is not None else _negative(values)
+            bad = values < 0 if mask is not None else _rows(values, lambda part: part < 0)
     wanted = "dB between -400 and 400" if name == "rssi_db" else "linear power, at least 0 (is it in dB?)"
     check.refuse_rows(name, bad if mask is None else bad & mask, f"out of range; expected {wanted}")
 
 
-def _negative(values: np.ndarray) -> np.ndarray:
-    """Rows (S,) of `values` (S, ...) with an entry below 0."""
-    rows = (values[part].reshape(len(values[part]), -1) for part in blocks(values))
-    return np.concatenate([(part < 0).any(1) for part in rows])
+def _rows(values: np.ndarray, test: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Rows (S,) of `values` (S, ...) with an entry that passes `test`, a block at a time."""
+    parts = (values[part].reshape(len(values[part]), -1) for part in blocks(values))
+    return np.concatenate([test(part).any(1) for part in parts])
 
 
-def _finite(values: np.ndarray) -> np.ndarray:
-    """Rows (S,) of `values` (S, ...) that are finite throughout."""
-    rows = (values[part].reshape(len(values[part]), -1) for part in blocks(values))
-    return np.concatenate([np.isfinite(np.abs(part)).all(1) for part in rows])
+def _infinite(values: np.ndarray) -> np.ndarray:
+    return _rows(values, lambda part: ~np.isfinite(np.abs(part)))
 
 
 def _static(
@@ -335,10 +330,9 @@ def _scaled(
     name: str, values: np.ndarray, mask: np.ndarray | None, censored: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
     """The target as stored and the constant it was divided by (0 for silence); censored rows are levels."""
+    mask_or_level = mask
     if censored is not None:
         mask_or_level = censored[:, None] if mask is None else mask | censored[:, None]
-    else:
-        mask_or_level = mask
     if mask_or_level is not None:
         values = np.where(mask_or_level, values, np.zeros((), values.dtype))
     if values.dtype == np.uint8:
@@ -364,6 +358,3 @@ def _scaled(
         for part in blocks(values):
             target[part] = values[part].astype(exact) * lift / (scale * lift)
         return target, scale
-
-
-__all__ = ["DataError", "Reading", "from_arrays", "interpret", "load_own", "write_own"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import DataError, Problems
+from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import End
@@ -16,8 +16,8 @@ from gsparc.data.tables import is_table
 from gsparc.data.tables.columns import Chosen, choose
 from gsparc.data.tables.heads import AXES
 from gsparc.data.tables.places import Places, places
-from gsparc.data.tables.read import NOTHING, sheet_of
-from gsparc.data.tables.sheet import Sheet
+from gsparc.data.tables.read import NOTHING
+from gsparc.data.tables.sheet import Sheet, sheet_of
 
 WORDS: dict[End, str] = {"rx": "receiver", "tx": "transmitter"}
 GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "station")
@@ -85,9 +85,8 @@ def read_times(path: str | Path) -> np.ndarray | None:
         sheet, _ = sheet_of(path)
         if "time_s" not in sheet.heads:
             return None
-        problems = Problems(path)
-        times, rows = sheet.numbers("time_s", problems), sheet.rows
-        problems.raise_if_any()
+        times, rows = sheet.numbers("time_s"), sheet.rows
+        sheet.problems.raise_if_any()
     else:
         raw = read_raw(path)
         if "time_s" not in raw.arrays:
@@ -103,11 +102,10 @@ def read_times(path: str | Path) -> np.ndarray | None:
 
 def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
     sheet, notes = sheet_of(path)
-    problems = Problems(path)
-    chosen, guessed = choose(sheet, columns, problems, only=GUESSED)
-    problems.raise_if_any()
-    given = {end: places(sheet, chosen, end, problems) for end in ("", "rx_", "tx_")}
-    problems.raise_if_any()
+    chosen, guessed = choose(sheet, columns, only=GUESSED)
+    sheet.problems.raise_if_any()
+    given = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
+    sheet.problems.raise_if_any()
     found = {end: where for end, where in given.items() if where is not None}
     ends: dict[End, Places] = {}
     for end in moving:
@@ -120,8 +118,8 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     )
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
-    station = _words(sheet, chosen, "station", problems)
-    problems.raise_if_any()
+    station = _words(sheet, chosen, "station")
+    sheet.problems.raise_if_any()
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
     return _checked(QueryPlaces(str(path), ends, sheet.rows, station, name, (*notes, *guessed)))
 
@@ -136,13 +134,12 @@ def _missing(sheet: Sheet, end: End, both: bool) -> str:
     return f"{sheet.source}: no coordinates of the {WORDS[end]} among {heads}; say {axes}"
 
 
-def _words(sheet: Sheet, chosen: Chosen, role: str, problems: Problems) -> np.ndarray | None:
+def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
     if role not in chosen:
         return None
     head = chosen[role][0].head or ""
     words = sheet.words(head)
-    rows = (sheet.rows[i] for i in np.flatnonzero(words == ""))
-    problems.add_rows(sheet.where(head), rows, f"no {role}; expected its name")
+    sheet.refuse_rows(head, np.flatnonzero(words == ""), f"no {role}; expected its name")
     return words
 
 
@@ -158,7 +155,11 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
             wanted = "latitude and longitude, or " if alone else ""
             raise DataError(f"{source}: no places of the {WORDS[end]}; expected {wanted}{end}_position")
         if pair:
-            across = np.column_stack([_numbers(raw, source, name, 1) for name in _same(raw, source, pair)])
+            shapes = [str(raw.arrays[name].shape) for name in pair]
+            if shapes[0] != shapes[1]:
+                both = f"latitude and longitude have shapes {' and '.join(shapes)}"
+                raise DataError(f"{source}: {both}; expected one shape")
+            across = np.column_stack([_numbers(raw, source, name, 1) for name in pair])
         else:
             across = _numbers(raw, source, position[0], 2)
             if across.shape[1] not in (2, 3):
@@ -177,13 +178,6 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     if not rows:
         raise DataError(f"{source}: no rows; expected a place or more")
     return _checked(QueryPlaces(source, ends, rows, _stations(raw, source, len(rows))))
-
-
-def _same(raw: Raw, source: str, pair: Sequence[str]) -> Sequence[str]:
-    if raw.arrays[pair[0]].shape != raw.arrays[pair[1]].shape:
-        shapes = " and ".join(str(raw.arrays[name].shape) for name in pair)
-        raise DataError(f"{source}: latitude and longitude have shapes {shapes}; expected one shape")
-    return pair
 
 
 def _numbers(raw: Raw, source: str, name: str, axes: int) -> np.ndarray:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import mmap
 import re
 import struct
+import subprocess
+import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -16,11 +19,11 @@ from typing import Any
 
 import h5py
 import numpy as np
+from scipy.io import netcdf_file
 
 from gsparc.data.blocks import contents, is_big, on_disk
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
-from gsparc.data.hdf5_probe import read_error
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
@@ -215,7 +218,7 @@ def _read_hdf5(path: Path) -> Raw:
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
                     text = h5py.check_string_dtype(item.dtype)
-                    arrays[name] = on_disk(item) if not text and is_big(item) else _values(item, text)
+                    arrays[name] = on_disk(item) if not text and is_big(item) else _values(item, fixed=True)
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
@@ -232,8 +235,10 @@ def _read_hdf5(path: Path) -> Raw:
     return raw
 
 
-def _values(item: h5py.Dataset, text: Any) -> np.ndarray:
-    return np.asarray(item.asstr()[()] if text else item[()])
+def _values(item: h5py.Dataset, fixed: bool = False) -> np.ndarray:
+    """Values of a dataset; text of variable length, and `fixed` where wanted, as text."""
+    text = h5py.check_string_dtype(item.dtype)
+    return np.asarray(item.asstr()[()] if text and (fixed or text.length is None) else item[()])
 
 
 def _plain(value: Any) -> Any:
@@ -250,3 +255,101 @@ def numbered_rows(count: int) -> np.ndarray:
 def renamed(raw: Raw, names: Mapping[str, str]) -> Raw:
     """The same content with arrays renamed from the keys to the values of `names`."""
     return Raw({names.get(k, k): v for k, v in raw.arrays.items()}, raw.attributes, raw.units)
+
+
+HEAP = b"GCOL"  # signature of a global heap (HDF5 file format specification 3.0, III.E)
+SECONDS = 20.0
+READ = """
+import sys, h5py
+with h5py.File(sys.argv[1], "r") as file:
+    for item in file.values():
+        if isinstance(item, h5py.Dataset):
+            if item.dtype.hasobject:
+                item[()]
+            dict(item.attrs)
+    dict(file.attrs)
+"""
+
+
+def read_error(path: Path, seconds: float = SECONDS) -> str | None:
+    """Why text in an HDF5 file cannot be read within `seconds`; None when it can, or when there is none."""
+    if not _has_heap(path):
+        return None
+    try:
+        read, nothing = [sys.executable, "-I", "-c", READ, str(path.absolute())], subprocess.DEVNULL
+        done = subprocess.run(read, stdin=nothing, capture_output=True, timeout=seconds)
+    except subprocess.TimeoutExpired:
+        return f"its text cannot be read in {seconds:g} s"
+    if done.returncode < 0:
+        return "its text crashes the HDF5 library"
+    last = done.stderr.decode(errors="replace").strip().splitlines()
+    return None if done.returncode == 0 else last[-1] if last else "its text cannot be read"
+
+
+def _has_heap(path: Path) -> bool:
+    if path.stat().st_size == 0:
+        return False
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return content.find(HEAP) >= 0
+
+
+NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
+NEVER_WRITTEN = 9e36  # default fill value of NetCDF's floating point numbers is 9.97e36
+
+
+def read_netcdf(path: str | Path) -> Raw:
+    """Every variable of the root group; text as text, fill values of floating point numbers as NaN.
+
+    Raises:
+        DataError: no such file, another format, or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected a NetCDF file")
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start == b"CDF\x05":
+        raise DataError(f"{path}: NetCDF classic of 64-bit data is not read; convert with nccopy -k nc4")
+    read = _classic if start[:3] == b"CDF" else _hdf5 if start == b"\x89HDF" else None
+    if read is None:
+        raise DataError(f"{path}: neither NetCDF3 nor NetCDF4; its first bytes are {start!r}")
+    try:
+        arrays = {name: _of_netcdf(*variable) for name, variable in read(path).items()}
+    except DataError:
+        raise
+    except (*DAMAGED, AssertionError, IndexError, AttributeError) as error:  # what SciPy raises on damage
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(f"{path}: damaged or not a NetCDF file ({why})") from None
+    return Raw(arrays)
+
+
+def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
+    with netcdf_file(str(path), "r", mmap=False) as file:
+        held = file.variables.items()
+        return {name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in held}
+
+
+def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
+    fault = read_error(path)
+    if fault is not None:
+        raise DataError(f"{path}: damaged ({fault})")
+    with h5py.File(path, "r") as file:
+        held = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
+        return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in held}
+
+
+def _of_netcdf(array: np.ndarray, fill: Any) -> np.ndarray:
+    """Numbers in the machine's byte order, rows of characters joined to text."""
+    if array.dtype == object:
+        return array.astype(str)
+    if array.dtype.kind == "S":
+        if array.dtype.itemsize == 1 and array.ndim and array.shape[-1]:
+            array = np.ascontiguousarray(array).view(f"S{array.shape[-1]}")[..., 0]
+        return np.char.strip(np.char.decode(array, "utf-8", errors="replace"), "\0 ")
+    array = array.astype(array.dtype.newbyteorder("="))
+    if array.dtype.kind == "f":
+        never = np.abs(array) > NEVER_WRITTEN
+        if fill is not None:
+            never |= array == np.asarray(fill).ravel()[0]
+        array[never] = np.nan
+    return array

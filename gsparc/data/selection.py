@@ -6,9 +6,9 @@ All work on the arrays of a file (`Raw`, named as in docs/own-data.md) before th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +16,18 @@ import numpy as np
 
 from gsparc.data.blocks import taken
 from gsparc.data.errors import DataError
-from gsparc.data.fields import MEASUREMENTS
 from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
 from gsparc.data.raw import Raw, numbered_rows
+from gsparc.data.schema import FIELDS, MEASUREMENTS, axes_from
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
 FEWEST = 2  # rows of a dataset
 SEED = 0  # of the rows that `max_rows` keeps: the same in every run
-# Arrays with a row per sample, and the number of their axes where they have one.
-ALWAYS = (
-    *MEASUREMENTS,
-    *("mask", "station", "run", "latitude", "longitude", "row_name"),
-    *("line_of_sight", "received_power", "delay_spread", "spectrum_peak", "source_visible"),
-)
-AXES = {
-    **{"rx_position": 2, "tx_position": 2, "rx_orientation": 2, "rx_rotation": 3},
-    **{"noise_variance": 1, "carrier_hz": 1, "rx_height": 1, "tx_height": 1},
-}
-PATHS = ("path_direction", "path_last_point", "path_gain", "path_delay", "path_mechanisms", "path_order")
+# Names of arrays with a row per sample, station or path, and how many axes they then have.
+ROW_AXES, STATION_AXES, PATH_AXES = axes_from("S"), axes_from("T"), axes_from("P")
+ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
 SPLIT = ("split_train", "split_test")
-# Arrays with a row per station, and the number of their axes where they have one.
-STATION_AXES = {
-    **{"station_position": 2, "station_latitude": 1, "station_longitude": 1, "station_height": 1},
-    **{"station_name": 1, "station_orientation": 2, "sensitivity_db": 1, "carrier_hz": 1},
-}
 
 
 @dataclass(frozen=True)
@@ -94,16 +81,14 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Selected:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
     notes: list[str] = []
-    for apply in (
-        None if selection.stations is None else partial(keep_stations, stations=selection.stations),
-        None if selection.runs is None else partial(keep_runs, runs=selection.runs),
-        None if selection.min_rssi_db is None else partial(keep_above, min_rssi_db=selection.min_rssi_db),
-        None if selection.max_rows is None else partial(keep_rows, max_rows=selection.max_rows),
-    ):
-        if apply is not None:
-            part = apply(raw, source=source)
-            raw = part.raw
-            notes += part.notes
+    steps: tuple[tuple[Callable[..., Selected], Any], ...] = (
+        *((keep_stations, selection.stations), (keep_runs, selection.runs)),
+        *((keep_above, selection.min_rssi_db), (keep_rows, selection.max_rows)),
+    )
+    for keep, setting in steps:
+        if setting is not None:
+            part = keep(raw, setting, source)
+            raw, notes = part.raw, [*notes, *part.notes]
     return Selected(raw, tuple(notes))
 
 
@@ -299,11 +284,11 @@ def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
 
 def per_station(name: str, array: np.ndarray, count: int) -> bool:
     """Whether an array of a file has an entry for each of `count` stations."""
-    return STATION_AXES.get(name) == array.ndim and len(array) == count
+    return array.ndim in STATION_AXES.get(name, ()) and len(array) == count
 
 
 def _per_row(name: str, array: np.ndarray, count: int, stations: int | None, source: str | Path) -> bool:
-    if name not in ALWAYS and AXES.get(name) != array.ndim:
+    if name not in ALWAYS and array.ndim not in ROW_AXES.get(name, ()):
         return False
     if name == "carrier_hz" and len(array) == stations:
         return False
@@ -324,7 +309,7 @@ def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[s
     kept = np.flatnonzero(place[owner] >= 0)
     kept = kept[np.argsort(place[owner[kept]], kind="stable")]
     found = {"path_offsets": np.concatenate([[0], np.cumsum(lengths[rows])])}
-    for name in PATHS:
+    for name in PATH_AXES:
         if name in raw.arrays:
             if len(raw.arrays[name]) != len(owner):
                 raise DataError(f"{source}, {name}: expected {len(owner)} paths as path_offsets says")
@@ -351,3 +336,73 @@ def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Selected
 def _left(rows: np.ndarray, said: str, source: str | Path) -> None:
     if len(rows) < FEWEST:
         raise DataError(f"{said}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
+
+
+def rows_by_station(given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """The setting `dataset.level_steps`, checked.
+
+    Raises:
+        DataError: what it holds is not lists of rows.
+    """
+    found = {}
+    for station, firsts in given.items():
+        rows = (firsts,) if isinstance(firsts, int) else firsts
+        good = isinstance(rows, Sequence) and not isinstance(rows, str) and len(rows) > 0
+        if not good or not all(type(row) is int for row in rows):
+            raise DataError(
+                f"dataset.level_steps.{station}={firsts}: expected first rows after steps, like [1162]"
+            )
+        found[str(station)] = tuple(rows)
+    return found
+
+
+def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | Path) -> Raw:
+    """Each station of `steps` becomes several of the same place and kind, `NAME`, `NAME from row 1162`, ...
+
+    Args:
+        raw: arrays of a file, named as in docs/own-data.md.
+        steps: by name or number of a station, the first rows (from 0) after each step.
+        source: for messages.
+
+    Raises:
+        DataError: no such station or row, or the file has no stations.
+    """
+    for station, firsts in steps.items():
+        for first in sorted(firsts):
+            raw = _split(raw, station, first, source)
+    return raw
+
+
+def _split(raw: Raw, station: str, first: int, source: str | Path) -> Raw:
+    count, rows = station_count(raw), row_count(raw, source)
+    said = f"dataset.level_steps.{station}={first}"
+    if count is None:
+        raise DataError(f"{said}: {source} has no stations; expected station_position")
+    if not 0 < first < rows:
+        raise DataError(f"{said}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
+    names = [str(name) for name in raw.arrays.get("station_name", np.arange(count)).ravel()]
+    number = known_station(station, names, count, said, source)
+    last = parts_of(number, names)[-1]  # later steps divide the part after earlier ones
+    arrays = {
+        name: np.concatenate([array, array[number : number + 1]])
+        if per_station(name, array, count)
+        else array
+        for name, array in raw.arrays.items()
+    }
+    arrays["station_name"] = np.array([*names, f"{names[number]}{FROM_ROW}{first}"])
+    after = np.arange(rows) >= first
+    if "station" in arrays:
+        of_row = arrays["station"]
+        arrays["station"] = np.where((of_row == last) & after, count, of_row)
+        return replace(raw, arrays=arrays)
+    measured = measured_links(raw, source)
+    for name in (*MEASUREMENTS, "mask"):
+        if name in arrays:
+            refuse_columns(arrays[name], name, count, source)
+    here = measured[:, last : last + 1] & after.reshape(-1, *[1] * (measured.ndim - 1))
+    mask = np.concatenate([measured, here], axis=1)
+    mask[:, last] &= ~after.reshape(-1, *[1] * (measured.ndim - 2))
+    for name in MEASUREMENTS:
+        if name in arrays:
+            arrays[name] = np.concatenate([arrays[name], arrays[name][:, last : last + 1]], axis=1)
+    return replace(raw, arrays={**arrays, "mask": mask})

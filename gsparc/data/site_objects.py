@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
@@ -47,3 +48,33 @@ class SiteObjects:
         """These and others."""
         both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return SiteObjects(*(np.concatenate(pair) for pair in both))
+
+
+@dataclass(frozen=True)
+class GaussianCloud:
+    """N Gaussians in the local coordinates of a site.
+
+    Attributes:
+        means: (N, 3) float64 [m].
+        scales: (N, 3) float64, standard deviations along their own axes [m].
+        quats: (N, 4) float64, unit (w, x, y, z), own axes to local.
+        opacities: (N,) float64 in [0, 1].
+        strengths: (N,) float64, what each emits or takes, in the unit of `label`.
+        label: of the strengths, with the unit.
+    """
+
+    means: np.ndarray
+    scales: np.ndarray
+    quats: np.ndarray
+    opacities: np.ndarray
+    strengths: np.ndarray
+    label: str
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def covariances(self) -> np.ndarray:
+        """(N, 3, 3) [m^2]: R S S R^T (Kerbl et al. 2023, eq. 6)."""
+        turn = Rotation.from_quat(np.roll(self.quats, -1, axis=1)).as_matrix()
+        half = turn * self.scales[:, None, :]
+        return np.asarray(half @ half.transpose(0, 2, 1))

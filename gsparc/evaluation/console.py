@@ -12,9 +12,8 @@ from hydra import errors
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.data.instantiate import suggest
+from gsparc.data.instantiate import GROUPS, plugins, suggest
 from gsparc.data.limits import SettingError
-from gsparc.data.plugins import GROUPS, plugins
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"

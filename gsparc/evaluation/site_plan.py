@@ -12,12 +12,10 @@ import numpy as np
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
-from gsparc.data.checks.describe import neighbours, places_of
+from gsparc.data.checks.describe import held_out, neighbours, places_of, side_of_squares
 from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.checks.outliers import outliers, too_far
-from gsparc.data.checks.plausibility import wild_of
-from gsparc.data.checks.proposal import held_out, side_of_squares
+from gsparc.data.checks.plausibility import LinkLevels, wild_of
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
 

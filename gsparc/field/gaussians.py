@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.limits import POSITIVE, SHARE, Checked, number, or_null, setting, whole
+from gsparc.data.site_objects import GaussianCloud
 
 FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
 

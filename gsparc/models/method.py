@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.data.site_objects import SiteObjects
+from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport

@@ -8,8 +8,7 @@ from typing import Any
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.instantiate import refuse_foreign, suggest, targets
-from gsparc.data.plugins import plugins
+from gsparc.data.instantiate import plugins, refuse_foreign, suggest, targets
 from gsparc.models.method import Method
 
 METHODS = {

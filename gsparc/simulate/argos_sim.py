@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from gsparc.data.campaigns import argos
-from gsparc.data.campaigns.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
+from gsparc.data.datasets import argos
+from gsparc.data.datasets.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.streets import Rays, Streets, trace
@@ -188,7 +188,7 @@ def ensure_argos_sim(
 
 @dataclass(frozen=True)
 class ArgosStandIn:
-    """What `dataset=argos` falls back on; a `gsparc.data.modules.stand_in.StandIn`.
+    """What `dataset=argos` falls back on; a `gsparc.data.datasets.campaign.StandIn`.
 
     Attributes:
         count: users, at least 10.

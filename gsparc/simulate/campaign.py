@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.claims import each_once
+from gsparc.data.files import each_once
 from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings, Choice

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsparc.data.datamodule import DataModule
-from gsparc.data.modules.rfid import simulated
+from gsparc.data.datasets.campaign import simulated
+from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.schema import Measurements
 from gsparc.simulate.rfid_sim import RFIDStandIn
 
@@ -31,4 +32,4 @@ class RFIDSim(DataModule):
 
     def load(self) -> Measurements:
         """Simulated when it is not there yet, then read like the release."""
-        return simulated(self.stand_in)
+        return simulated(self.stand_in, "RFID", load_rfid)

@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from gsparc.data.campaigns.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
+from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
@@ -98,7 +98,7 @@ def ensure_rfid_sim(parent: Path, count: int = 640, seed: int = 0) -> Path:
 
 @dataclass(frozen=True)
 class RFIDStandIn:
-    """What `dataset=rfid` falls back on; a `gsparc.data.modules.stand_in.StandIn`.
+    """What `dataset=rfid` falls back on; a `gsparc.data.datasets.campaign.StandIn`.
 
     Attributes:
         count: tag positions, at least 2.

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.schema import Site
-from gsparc.data.site_objects import SiteObjects
+from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.levels import MAPPED

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
-from gsparc.data.gaussian_cloud import GaussianCloud
+from gsparc.data.site_objects import GaussianCloud
 
 FIELDS = (
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",

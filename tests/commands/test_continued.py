@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from gsparc.commands.cli import _message_of
 from gsparc.commands.continued import once
-from gsparc.data.claims import claimed
+from gsparc.data.files import claimed
 from gsparc.evaluation.report.sweep import FAILURE
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from releases import SPOILT
 
-from gsparc.data.campaigns.newrf import load_newrf
-from gsparc.data.campaigns.rfid import load_rfid
+from gsparc.data.datasets.newrf import load_newrf
+from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays, load_own, write_own

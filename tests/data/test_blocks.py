@@ -14,7 +14,7 @@ from releases import write_release
 
 from gsparc.data import blocks
 from gsparc.data.assemble import content_hash
-from gsparc.data.campaigns.rfid import load_rfid
+from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own, write_own
 from gsparc.models.target_rows import training_targets

@@ -85,7 +85,7 @@ def test_techtile_is_links_to_antennas(tmp_path, caplog):
 
 def read_of_release(folder):
     """The arrays of the release's file in `folder`."""
-    from gsparc.data.campaigns.techtile import raw_of_techtile
+    from gsparc.data.datasets.techtile import raw_of_techtile
 
     return raw_of_techtile(folder / "csi.nc").arrays
 

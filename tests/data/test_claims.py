@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gsparc.data import claims
+from gsparc.data import files
 
 FORK = multiprocessing.get_context("fork")
 
@@ -26,9 +26,9 @@ def share(folder: Path, dies_at: int | None = None) -> None:
         time.sleep(0.01)
         (folder / f"{piece}.done").write_text("x")
 
-    claims.POLL_S = 0.02
+    files.POLL_S = 0.02
     done = lambda piece: (folder / f"{piece}.done").exists()  # noqa: E731
-    claims.each_once(range(12), lambda piece: folder / f"{piece}.lock", done, work)
+    files.each_once(range(12), lambda piece: folder / f"{piece}.lock", done, work)
 
 
 def begun(folder: Path) -> list[tuple[int, int]]:
@@ -54,9 +54,9 @@ def test_every_piece_is_done_once_and_that_of_a_killed_process_is_taken_over(tmp
 
 def test_a_claim_is_one_process_s_and_ends_with_its_block(tmp_path):
     lock = tmp_path / "new" / "piece.lock"
-    with claims.claimed(lock) as mine, claims.claimed(lock) as other:
+    with files.claimed(lock) as mine, files.claimed(lock) as other:
         assert mine and not other
-    with claims.claimed(lock) as again:
+    with files.claimed(lock) as again:
         assert again
 
 
@@ -65,6 +65,6 @@ def test_a_failure_ends_the_claim_and_is_not_swallowed(tmp_path):
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError, match="no"):
-        claims.each_once([1], lambda piece: tmp_path / "lock", lambda piece: False, fails)
-    with claims.claimed(tmp_path / "lock") as mine:
+        files.each_once([1], lambda piece: tmp_path / "lock", lambda piece: False, fails)
+    with files.claimed(tmp_path / "lock") as mine:
         assert mine

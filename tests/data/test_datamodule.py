@@ -151,11 +151,11 @@ def test_data_modules_are_of_different_classes():
             "is no gsparc.data.datamodule.DataModule",
         ),
         (
-            {"name": "own", "_target_": "gsparc.data.modules.own.Onw"},
+            {"name": "own", "_target_": "gsparc.data.datasets.own.Onw"},
             "is no gsparc.data.datamodule.DataModule",
         ),
         (
-            {"name": "own", "_target_": "gsparc.data.modules.rfid.RFID"},
+            {"name": "own", "_target_": "gsparc.data.datasets.rfid.RFID"},
             "this is dataset=rfid; say dataset=own",
         ),
         (

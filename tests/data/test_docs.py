@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from gsparc.data.fields import FIELDS
+from gsparc.data.schema import FIELDS
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "own-data.md").read_text(encoding="utf-8")
 

@@ -12,9 +12,10 @@ import pytest
 from campaigns import channels, powers, spectra
 from releases import write_release
 
-from gsparc.data.campaigns.argos import load_argos
-from gsparc.data.campaigns.sionna import load_sionna
-from gsparc.data.checks.describe import describe, read_any
+from gsparc.data.checks.describe import describe
+from gsparc.data.datasets.argos import load_argos
+from gsparc.data.datasets.own import read_any
+from gsparc.data.datasets.sionna import load_sionna
 from gsparc.data.errors import DataError
 from gsparc.data.raw import Raw, write_raw
 

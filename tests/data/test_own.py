@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsparc.data.campaigns.newrf import load_newrf
+from gsparc.data.datasets.newrf import load_newrf
 from gsparc.data.own import SSIM_WINDOW, from_arrays, load_own, write_own
 from gsparc.training.losses import WINDOW_RADIUS
 

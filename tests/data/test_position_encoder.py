@@ -9,9 +9,7 @@ from cities import city, fold
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
-from gsparc.data.position_encoder.autoencoder import EncoderSettings, spread
-from gsparc.data.position_encoder.features import features
-from gsparc.data.position_encoder.store import encoder_for, load, places
+from gsparc.data.position_encoder import EncoderSettings, encoder_for, features, load, places, spread
 
 QUICK = EncoderSettings(hidden=32, steps=150, batch=64)
 

@@ -7,7 +7,7 @@ import pytest
 from measured import ble_arrays, techtile_arrays
 from releases import real
 
-from gsparc.data.campaigns.techtile import raw_of_techtile
+from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.raw import Raw, read_raw

@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gsparc.data.campaigns.rfid import load_rfid
+from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import inner_folds
 from gsparc.data.load import split_for

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from releases import real
 
+from gsparc.data.datasets.own import Own
 from gsparc.data.errors import DataError
-from gsparc.data.modules.own import Own
 from gsparc.data.own import interpret
 from gsparc.data.tables.heads import understand
 from gsparc.data.tables.read import read_table, understand_table

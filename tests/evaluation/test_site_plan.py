@@ -9,8 +9,7 @@ from PIL import Image
 from releases import real
 
 from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.link_levels import link_levels
-from gsparc.data.checks.plausibility import steps_of
+from gsparc.data.checks.plausibility import link_levels, steps_of
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.evaluation import site_plan

@@ -14,7 +14,7 @@ from contexts import short
 from known_arrays import array_site, spectra
 from torch import Tensor
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import frozen_view, seen_by_array

@@ -9,7 +9,7 @@ from tempfile import mkdtemp
 
 import numpy as np
 
-from gsparc.data.campaigns.argos import load_argos
+from gsparc.data.datasets.argos import load_argos
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.simulate.argos_sim import ensure_argos_sim

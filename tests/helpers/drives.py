@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from releases import real
 
-from gsparc.data.campaigns.powder import raw_of_powder
+from gsparc.data.datasets.powder import raw_of_powder
 
 STATIONS = ("ebc-nuc1-b210", "law73-nuc2-b210")
 

@@ -11,7 +11,7 @@ from boxes import room_of_spectra
 from campaigns import channels, powers, spectra
 from known_arrays import array_site, measure, room_vectors, walk
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsparc.data.campaigns.rfid import HEIGHT, WIDTH
+from gsparc.data.datasets.rfid import HEIGHT, WIDTH
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 

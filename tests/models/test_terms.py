@@ -8,7 +8,7 @@ import pytest
 from invented import invent
 from known_arrays import array_site
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.field.initial import InitSettings
 from gsparc.models.gsparc import plan
 from gsparc.models.terms import EffectSettings

@@ -12,7 +12,7 @@ from campaigns import STILL, channels, compose, powers, spectra
 from contexts import short
 from shoeboxes import scatter
 
-from gsparc.data.campaigns.argos import load_argos
+from gsparc.data.datasets.argos import load_argos
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import LIGHT
 from gsparc.models.registry import METHODS, build, method_class

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 from gsparc.physics import array_response
 from gsparc.simulate import rfid_sim

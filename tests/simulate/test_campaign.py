@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from gsparc.commands.check import main as check
-from gsparc.data import blocks, claims
-from gsparc.data.campaigns.sionna import _heard
+from gsparc.data import blocks, files
+from gsparc.data.datasets.sionna import _heard
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
@@ -495,7 +495,7 @@ def shares(out: Path, begun: Path, killed_at: int | None) -> None:
         return real(self, receivers, *rest, **named)
 
     ShoeboxEngine.trace = counted
-    claims.POLL_S = 0.02
+    files.POLL_S = 0.02
     torch.set_num_threads(1)  # OpenMP's threads are not in a forked process, which would wait for them
     simulate(plan(shard=8), out, shared=True)
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from poses import boresight_degrees
 
-from gsparc.data.campaigns.rfid import HEIGHT, WAVELENGTH, WIDTH, load_rfid, planar_array
+from gsparc.data.datasets.rfid import HEIGHT, WAVELENGTH, WIDTH, load_rfid, planar_array
 from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import bartlett, steering

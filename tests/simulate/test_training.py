@@ -9,7 +9,7 @@ from campaigns import compose
 
 import gsparc
 from gsparc.commands.train import train
-from gsparc.data.campaigns.sionna import with_true_targets
+from gsparc.data.datasets.sionna import with_true_targets
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.simulate.campaign import simulate

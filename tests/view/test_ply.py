@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsparc.data.errors import DataError
-from gsparc.data.gaussian_cloud import GaussianCloud
+from gsparc.data.site_objects import GaussianCloud
 from gsparc.view.ply import FIELDS, Y00, ply_bytes, write_ply
 
 

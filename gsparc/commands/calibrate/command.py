@@ -23,7 +23,7 @@ from gsparc.commands.calibrate.trial import (
 )
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
-from gsparc.data.campaigns.argos import published_figures, published_normalisation
+from gsparc.data.datasets.argos import published_figures, published_normalisation
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.open_runs import Opened, open_files

@@ -16,8 +16,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 
 from gsparc.commands.compare.problem import Problem
-from gsparc.data.instantiate import find, targets
-from gsparc.data.plugins import plugins
+from gsparc.data.instantiate import find, plugins, targets
 from gsparc.models.registry import METHODS
 
 ANY = "any"  # stands for the budget or seed of a method that has none

@@ -30,8 +30,7 @@ from gsparc.commands.compare.overview import overview
 from gsparc.commands.compare.problem import Problem, load_problems, split_choices, stored_problems
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
-from gsparc.data.claims import each_once
-from gsparc.data.files import no_room, platform_cache, whole_file
+from gsparc.data.files import each_once, no_room, platform_cache, whole_file
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 

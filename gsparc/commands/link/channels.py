@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.campaigns.argos import FACTS
+from gsparc.data.datasets.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.image_sources.phase_offsets import estimate

@@ -2,76 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.campaigns.netcdf import SUFFIXES
-from gsparc.data.campaigns.newrf import is_newrf, read_newrf
-from gsparc.data.campaigns.recognise import LOADERS, campaign_of
-from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.checks import outliers
-from gsparc.data.checks.proposal import proposal
-from gsparc.data.errors import DataError
-from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.tables import is_table
+from gsparc.data.splits import SplitSettings, make_split
 from gsparc.ops import SphereGrid
 
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
 ENDS = {"rx": "receiver", "tx": "transmitter"}
-
-
-def read_any(
-    path: str | Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
-) -> Reading:
-    """Read a folder of the RFID release, a file of another campaign, one of one's own, or a table.
-
-    Args:
-        path: folder or file.
-        columns, stations_file: of a table, see `Own`.
-
-    Raises:
-        DataError: it is none of them, or something in it is wrong.
-    """
-    path = Path(path)
-    if path.is_dir():
-        if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
-            raise DataError(
-                f"{path}: a folder without gateway_info.yml, tx_pos.csv and spectrum/ (the RFID release's "
-                "layout); for measurements of your own give the npz or HDF5 file"
-            )
-        return Reading(load_rfid(path), ())
-    if path.suffix.lower() in SUFFIXES:  # NetCDF, as Techtile's release is
-        return interpret(LOADERS["techtile"](path), path)
-    raw, notes = raw_of(path, columns, stations_file)
-    campaign = campaign_of(raw)
-    if campaign is not None:
-        raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
-    reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
-    return Reading(reading.data, (*notes, *reading.notes))
-
-
-def raw_of(
-    path: Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
-) -> tuple[Raw, tuple[str, ...]]:
-    """The arrays of a file of the schema, or of a table, and how its columns were understood.
-
-    Raises:
-        DataError: not readable, or columns that nothing can be made of.
-    """
-    if not is_table(path):
-        told = any(value is not None for value in (columns or {}).values())
-        for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
-            raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
-        return read_raw(path), ()
-    from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
-
-    found = understand_table(path, columns or {}, stations_file)
-    return found.raw, found.notes
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
@@ -231,3 +173,43 @@ def _grid(grid: SphereGrid) -> str:
         f"rows are elevations {first[0]:.4g} to {last[0]:.4g} degrees, "
         f"columns azimuths {first[1]:.4g} to {last[1]:.4g} degrees{closed}"
     )
+
+
+ROUND = (1.0, 2.0, 3.0, 5.0, 10.0)
+APART = 3.0  # least side of a square, in distances of neighbours
+
+
+def side_of_squares(data: Measurements) -> float | None:
+    """Side [m] for `split=blocks`: a tenth of the site and several neighbours wide, a round number.
+
+    None where the places are too few to hold squares of them out.
+    """
+    places = np.unique(data.moving[:, -3:], axis=0)[:, :2]
+    extent = float(np.ptp(places, axis=0).max()) if len(places) > 1 else 0.0
+    if extent == 0:
+        return None
+    apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    least = max(extent / 10, APART * apart)
+    decade = 10 ** np.floor(np.log10(least))
+    side = next(float(decade * step) for step in ROUND if decade * step >= 0.99 * least)
+    return side if side < extent / 2 else None
+
+
+def held_out(data: Measurements, side: float) -> np.ndarray:
+    """Rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
+    try:
+        settings = SplitSettings("blocks", side_m=side)
+        split = make_split(data.moving, settings, None, np.zeros(0, np.int64), data.place, data.station)
+        split.check()
+    except ValueError:
+        return np.zeros(0, np.int64)
+    return split.folds[0].test
+
+
+def proposal(data: Measurements) -> str:
+    """One sentence for `gsparc check`."""
+    between = "split=random asks about places between these"
+    side = side_of_squares(data)
+    if side is None or not len(held_out(data, side)):
+        return f"{between}; too few places to hold out squares of floor"
+    return f"{between}; split=blocks split.side_m={side:g} about holes of {side:g} m"

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker
-from gsparc.data.rotation import is_unit, quaternion_to_matrix
+from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker, is_unit, quaternion_to_matrix
 from gsparc.data.schema import End, Links, Stations
 
 OTHER: dict[End, End] = {"rx": "tx", "tx": "rx"}

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.data.errors import Problems
 from gsparc.data.tables.heads import (
     AXES,
     END_WORDS,
@@ -19,33 +18,25 @@ from gsparc.data.tables.heads import (
     KINDS,
     MANY,
     OTHER_NAMES,
+    SCHEMA,
     STATION_WORDS,
+    UNITS,
     Head,
+    Unit,
+    known,
     suits,
     understand,
     unit_of,
     words_of,
 )
 from gsparc.data.tables.sheet import Sheet
-from gsparc.data.tables.units import SCHEMA, UNITS, Unit, known
 
 LEVELS = ("rssi_db", "rssi")
 CHANNELS = ("csi_re", "csi_im")
 # Beside the word for a level: which radio, antenna or cell it is of.
 PLAIN = {
-    "wifi",
-    "wlan",
-    "lte",
-    "nr",
-    "5g",
-    "gsm",
-    "umts",
-    "ble",
-    "bluetooth",
-    "lora",
-    "zigbee",
-    "uwb",
-    "serving",
+    *("wifi", "wlan", "lte", "nr", "5g", "gsm", "umts", "ble", "bluetooth", "lora", "zigbee"),
+    *("uwb", "serving"),
 }
 STATION = re.compile(
     r"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|" + "|".join(STATION_WORDS) + r")?[\W_]*\d+)[\W_]*$"
@@ -73,16 +64,15 @@ class Column:
     value: tuple[float, ...] = ()
     word: str = ""
 
-    def numbers(self, sheet: Sheet, problems: Problems) -> np.ndarray | None:
+    def numbers(self, sheet: Sheet) -> np.ndarray | None:
         """(S,) float64 in the schema's unit, NaN where there is no value; None, and noted, where unusable."""
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not suits(self.role, self.unit):
             kind = KINDS[self.role]
             wanted = f"one of {known(kind)}" if kind in SCHEMA else "no unit"
-            fault = f"is in {self.unit.name}; {self.role} needs {wanted}"
-            return problems.add(sheet.where(self.head), fault)
-        values = sheet.numbers(self.head, problems)
+            return sheet.refuse(f"is in {self.unit.name}; {self.role} needs {wanted}", self.head)
+        values = sheet.numbers(self.head)
         return values if values is None or self.unit is None else self.unit.convert(values)
 
 
@@ -90,18 +80,13 @@ Chosen = dict[str, tuple[Column, ...]]
 
 
 def choose(
-    sheet: Sheet,
-    said: Mapping[str, object],
-    problems: Problems,
-    labelled: Iterable[str] = (),
-    only: Container[str] | None = None,
+    sheet: Sheet, said: Mapping[str, object], labelled: Iterable[str] = (), only: Container[str] | None = None
 ) -> tuple[Chosen, list[str]]:
     """The columns of each quantity, and a note for each that was guessed.
 
     Args:
         sheet: the table.
         said: heads, patterns with a `*` or numbers by quantity, as in `dataset.columns`.
-        problems: takes what is wrong.
         labelled: names of stations; columns called so are taken as their levels.
         only: quantities that are guessed; None: all.
     """
@@ -110,10 +95,10 @@ def choose(
     for key, value in said.items():
         if value is not None:
             role = OTHER_NAMES.get(key, key)
-            columns = _said(sheet, key, role, value, problems)
+            columns = _said(sheet, key, role, value)
             if columns:
                 chosen[role] = columns
-    if problems:
+    if sheet.problems:
         return chosen, []
     taken = {column.head for columns in chosen.values() for column in columns}
     guesses: dict[str, list[Column]] = {}
@@ -128,14 +113,15 @@ def choose(
         ):
             continue
         if found.strange:
-            fault = f"[{found.strange}] is no known unit; expected one of {known(KINDS[found.role])}"
-            problems.add(sheet.where(head), fault)
+            sheet.refuse(
+                f"[{found.strange}] is no known unit; expected one of {known(KINDS[found.role])}", head
+            )
         guesses.setdefault(found.role, []).append(
             Column(found.role, head, found.label, found.unit, word=found.word)
         )
-    _one_measurement(sheet, guesses, problems)
+    _one_measurement(sheet, guesses)
     for end in ENDS:
-        _one_system(sheet, guesses, end, problems)
+        _one_system(sheet, guesses, end)
     notes = []
     for role, candidates in guesses.items():
         one_each = role in CHANNELS or "station" not in {**chosen, **guesses}  # of a row: tones, or stations
@@ -145,18 +131,19 @@ def choose(
         )
         exact = [column for column in candidates if column.head == role]
         if len(candidates) > 1 and not several and not exact:
-            _ambiguous(sheet, role, candidates, problems)
+            _ambiguous(sheet, role, candidates)
             continue
         if role in LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled):
             fault = "a received level or power, or something else? if it is one, say dataset.columns."
-            problems.add(sheet.where(candidates[0].head or ""), f"{fault}{role}={candidates[0].head}")
+            sheet.refuse(f"{fault}{role}={candidates[0].head}", candidates[0].head or "")
             continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact:
             notes.append(_note(chosen[role]))
-    for columns in chosen.values():
-        notes += [_conversion(c) for c in columns[:1] if not c.word and c.unit is not None and c.unit.changes]
-    _one_unit(sheet, chosen, problems)
+    for column in (columns[0] for columns in chosen.values()):
+        if not column.word and column.unit is not None and column.unit.changes:
+            notes.append(f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}")
+    _one_unit(sheet, chosen)
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head and head not in used]
     if unused:
@@ -182,12 +169,12 @@ def _perhaps_stations(sheet: Sheet, used: Container[str | None]) -> list[str]:
     return found
 
 
-def _said(sheet: Sheet, key: str, role: str, value: object, problems: Problems) -> tuple[Column, ...]:
+def _said(sheet: Sheet, key: str, role: str, value: object) -> tuple[Column, ...]:
     where = f"dataset.columns.{key}={value}"
     if role not in KINDS:
         close = difflib.get_close_matches(key, [*KINDS, *OTHER_NAMES], 1, 0.4)
         hint = f"; did you mean {close[0]}?" if close else f"; known are {', '.join(KINDS)}"
-        return problems.add(where, f"no such quantity{hint}") or ()
+        return sheet.problems.add(where, f"no such quantity{hint}") or ()
     text = str(value).strip()
     head = _head(sheet, text)
     if head is not None:
@@ -201,7 +188,7 @@ def _said(sheet: Sheet, key: str, role: str, value: object, problems: Problems) 
             pairs = zip(heads, labels, strict=True)
             return tuple(Column(role, h, label, _unit(h, role)) for h, label in pairs)
         fault = "expected one * only" if "*" in after else "no column is called so"
-        return problems.add(where, fault) or ()
+        return sheet.problems.add(where, fault) or ()
     numbers = tuple(_number(part) for part in text.split(":"))
     constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
@@ -210,7 +197,7 @@ def _said(sheet: Sheet, key: str, role: str, value: object, problems: Problems) 
     near = next((h for h in sheet.heads if close and h.lower() == close[0]), None)
     there = ", ".join(repr(h) for h in sheet.heads[:8] if h)
     hint = f"; did you mean {near!r}?" if near else f"; there are {there}"
-    return problems.add(where, f"{sheet.source} has no such column{hint}") or ()
+    return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
 
 
 def _number(text: str) -> float:
@@ -256,7 +243,7 @@ def _systems(end: str) -> tuple[tuple[str, str], tuple[str, str]]:
     return (f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")
 
 
-def _one_system(sheet: Sheet, guesses: dict[str, list[Column]], end: str, problems: Problems) -> None:
+def _one_system(sheet: Sheet, guesses: dict[str, list[Column]], end: str) -> None:
     """Refuse an end that has both metres and degrees."""
     metres, degrees = ([c for r in roles for c in guesses.get(r, ())] for roles in _systems(end))
     if metres and degrees:
@@ -264,19 +251,19 @@ def _one_system(sheet: Sheet, guesses: dict[str, list[Column]], end: str, proble
             f"{_names(metres)} and {_names(degrees)} both say where; say dataset.columns.{metres[0].role}="
         )
         fault += f"{metres[0].head} or dataset.columns.{degrees[0].role}={degrees[0].head}"
-        problems.add(sheet.source, fault)
+        sheet.refuse(fault)
         for column in (*metres, *degrees):
             guesses.pop(column.role, None)
 
 
-def _one_measurement(sheet: Sheet, guesses: dict[str, list[Column]], problems: Problems) -> None:
+def _one_measurement(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
     """Refuse columns of several measurements: levels and powers, or powers and channels."""
     found = [guesses[name] for name in (*LEVELS, "csi_re") if name in guesses]
     if len(found) < 2:
         return
     first = [columns[0] for columns in found]
     choices = " or ".join(f"dataset.columns.{c.role}={c.head}" for c in first)
-    problems.add(sheet.source, f"{_names(first)} are different measurements; say {choices}")
+    sheet.refuse(f"{_names(first)} are different measurements; say {choices}")
     for name in (*LEVELS, *CHANNELS):
         guesses.pop(name, None)
 
@@ -288,7 +275,7 @@ def _is_plain(column: Column, stations: Container[str]) -> bool:
     return bool(absolute or named or set(words_of(column.label)) <= PLAIN or STATION.search(column.label))
 
 
-def _one_unit(sheet: Sheet, chosen: Chosen, problems: Problems) -> None:
+def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
     """Refuse a column in another unit than the schema's beside one of its kind that says none."""
     for kind in SCHEMA:
         columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
@@ -299,14 +286,14 @@ def _one_unit(sheet: Sheet, chosen: Chosen, problems: Problems) -> None:
             said = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} "
             said += "says no unit" if other is None else f"in {other.name} of nothing"
             plain = unit_of(silent[0].head or "")[0]
-            problems.add(sheet.source, f"{said}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
+            sheet.refuse(f"{said}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
 
 
-def _ambiguous(sheet: Sheet, role: str, columns: list[Column], problems: Problems) -> None:
+def _ambiguous(sheet: Sheet, role: str, columns: list[Column]) -> None:
     choice = f"dataset.columns.{role}={columns[0].head}"
     stations = role in LEVELS and all(c.label for c in columns)
     more = f", or dataset.columns.{role}='NAME_*' where they are stations" if stations else ""
-    problems.add(sheet.source, f"{_names(columns)} could each be {role}; say which: {choice}{more}")
+    sheet.refuse(f"{_names(columns)} could each be {role}; say which: {choice}{more}")
 
 
 def _names(columns: Iterable[Column]) -> str:
@@ -328,11 +315,6 @@ def _note(columns: tuple[Column, ...]) -> str:
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
     turned = first.unit is not None and first.unit.changes
     return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
-
-
-def _conversion(column: Column) -> str:
-    assert column.unit is not None
-    return f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}"
 
 
 def schema_unit(column: Column) -> str:

@@ -5,22 +5,64 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from gsparc.data.tables.units import UNITS, Unit
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit as people write it.
+
+    Attributes:
+        name: as messages write it.
+        kind: `length`, `angle`, `frequency`, `power` or `level`; one kind has one unit in the schema.
+        factor: multiplies a value.
+        offset: is added after that.
+    """
+
+    name: str
+    kind: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def convert(self, values: np.ndarray) -> np.ndarray:
+        """Values of this unit in the schema's unit of its kind."""
+        return values if (self.factor, self.offset) == (1.0, 0.0) else values * self.factor + self.offset
+
+    @property
+    def changes(self) -> bool:
+        """Whether `convert` does anything."""
+        return (self.factor, self.offset) != (1.0, 0.0)
+
+
+SCHEMA = {"length": "m", "angle": "deg", "frequency": "Hz", "power": "W", "level": "dBm"}
+_LISTED = [
+    *(Unit(name, "length", factor) for name, factor in (("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("km", 1e3))),
+    *(Unit(name, "length", 0.3048) for name in ("ft", "feet")),
+    *(Unit(name, "length") for name in ("meter", "metre", "meters", "metres")),
+    *(Unit(name, "angle") for name in ("deg", "°", "degree", "degrees")),
+    *(Unit(name, "angle", 180 / np.pi) for name in ("rad", "radians")),
+    *(Unit(n, "frequency", f) for n, f in (("Hz", 1.0), ("kHz", 1e3), ("MHz", 1e6), ("GHz", 1e9))),
+    *(Unit(n, "power", f) for n, f in (("W", 1.0), ("mW", 1e-3), ("uW", 1e-6), ("µW", 1e-6), ("nW", 1e-9))),
+    *(Unit(n, "power", f) for n, f in (("pW", 1e-12), ("fW", 1e-15))),
+    *(Unit("dB", "level"), Unit("dBm", "level"), Unit("dBW", "level", offset=30.0)),
+]
+# Without case: nobody receives megawatts.
+UNITS = {unit.name.lower(): unit for unit in _LISTED} | {"μw": Unit("µW", "power", 1e-6)}
+
+
+def known(kind: str) -> str:
+    """The units of a kind, for messages."""
+    return ", ".join(unit.name for unit in _LISTED if unit.kind == kind)
+
 
 # Quantities a column can hold: of an end (the moving one when it is not named), and of a row.
 ENDS = ("", "rx_", "tx_", "station_")
 AXES = {"x": "length", "y": "length", "z": "length", "latitude": "angle", "longitude": "angle"}
 KINDS: dict[str, str] = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | {
-    "rssi_db": "level",
-    "rssi": "power",
-    "sensitivity_db": "level",
-    "csi_re": "number",
-    "csi_im": "number",
-    "carrier_hz": "frequency",
-    "frequency_hz": "frequency",
-    "station": "text",
-    "run": "text",
-    "row_name": "text",
+    **{"rssi_db": "level", "rssi": "power", "sensitivity_db": "level"},
+    **{"csi_re": "number", "csi_im": "number"},
+    **{"carrier_hz": "frequency", "frequency_hz": "frequency"},
+    **{"station": "text", "run": "text", "row_name": "text"},
 }
 MANY = ("rssi_db", "rssi", "csi_re", "csi_im")  # may be several columns: stations, or frequencies
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
@@ -28,8 +70,8 @@ OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long 
 
 END_WORDS = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
 STATION_WORDS = (
-    *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb", "ap"),
-    *("anchor", "pci", "bssid"),
+    *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb"),
+    *("ap", "anchor", "pci", "bssid"),
 )
 _AXIS = {"x": "x", "easting": "x", "y": "y", "northing": "y", "z": "z"}
 _AXIS |= dict.fromkeys(("height", "alt", "altitude", "elevation", "elev"), "z")
@@ -37,34 +79,16 @@ _AXIS |= dict.fromkeys(("lat", "latitude"), "latitude")
 _AXIS |= dict.fromkeys(("lon", "lng", "long", "longitude"), "longitude")
 _PLACE = ("position", "pos", "coordinate", "coord", "location", "loc", "gps", "local", "wgs84")
 _LEVEL = ("rssi", "rsrp", "rss", "rxlev", "power", "level", "signal", "prx")
-_ABOUT_LEVEL: tuple[str, ...] = (
-    "rx",
-    "received",
-    "receive",
-    "strength",
-    "signal",
-    "mean",
-    "avg",
-    "average",
-    "median",
+_ABOUT_LEVEL = (
+    *("rx", "received", "receive", "strength", "signal", "mean", "avg", "average", "median"),
+    *("measured", "value"),
 )
-_ABOUT_LEVEL += ("measured", "value")
-_NO_LEVEL: tuple[str, ...] = (
-    "tx",
-    "transmit",
-    "transmitted",
-    "eirp",
-    "noise",
-    "std",
-    "stdev",
-    "var",
-    "min",
-    "max",
-    "count",
+_NO_LEVEL = (
+    *("tx", "transmit", "transmitted", "eirp", "noise", "std", "stdev", "var", "min", "max"),
+    *("count", "loss", "delay", "angle", "interference", "quality", "headroom", "class", "control"),
+    *("delta", "diff", "difference", "change", "error", "residual", "offset", "threshold", "limit"),
+    *("predicted", "prediction", "estimated", "expected", "simulated", "gain", "battery", "supply"),
 )
-_NO_LEVEL += ("loss", "delay", "angle", "interference", "quality", "headroom", "class", "control")
-_NO_LEVEL += ("delta", "diff", "difference", "change", "error", "residual", "offset", "threshold", "limit")
-_NO_LEVEL += ("predicted", "prediction", "estimated", "expected", "simulated", "gain", "battery", "supply")
 _LABEL = ("name", "id", "nr", "no", "number", "index", "mac", "address", "label")
 _CHANNEL = ("csi", "h", "channel", "cfr")
 _PART = {"re": "csi_re", "real": "csi_re", "i": "csi_re", "im": "csi_im", "imag": "csi_im", "q": "csi_im"}

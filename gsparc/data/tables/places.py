@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.data.errors import Problems
-from gsparc.data.tables.columns import Chosen
+from gsparc.data.tables.columns import Chosen, as_station, choose
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
@@ -37,9 +36,7 @@ class Places:
         return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
 
 
-def places(
-    sheet: Sheet, chosen: Chosen, end: str, problems: Problems, unknown: bool = False
-) -> Places | None:
+def places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Places | None:
     """Coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none of it.
 
     Where places may be `unknown`, rows without any coordinate are NaN.
@@ -52,49 +49,44 @@ def places(
         if len(given) == 1:
             missing = next(role for role in roles if role not in chosen)
             fault = f"{given[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
-            return problems.add(sheet.source, fault)
+            return sheet.refuse(fault)
         absent = np.zeros(len(sheet), bool)
         if unknown:
             given = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
             absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in given], axis=0)
-        found = [_complete(sheet, chosen, role, problems, absent) for role in roles]
-        height = _complete(sheet, chosen, f"{end}z", problems, absent) if f"{end}z" in chosen else None
+        found = [_complete(sheet, chosen, role, absent) for role in roles]
+        height = _complete(sheet, chosen, f"{end}z", absent) if f"{end}z" in chosen else None
         if found[0] is None or found[1] is None:
             return None
         across = np.stack([found[0], found[1]], axis=1)
         if degrees:
-            _on_earth(sheet, chosen, roles, across, problems)
+            _on_earth(sheet, chosen, roles, across)
         return Places(across, height, degrees)
     return None
 
 
-def _complete(
-    sheet: Sheet, chosen: Chosen, role: str, problems: Problems, absent: np.ndarray
-) -> np.ndarray | None:
+def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np.ndarray | None:
     column = chosen[role][0]
-    values = column.numbers(sheet, problems)
+    values = column.numbers(sheet)
     if values is not None and (np.isnan(values) & ~absent).any():
-        rows = (sheet.rows[i] for i in np.flatnonzero(np.isnan(values) & ~absent))
-        problems.add_rows(
-            sheet.where(column.head or ""), rows, f"no value; {role} is needed, or take the row out"
-        )
-        return None
+        rows = np.flatnonzero(np.isnan(values) & ~absent)
+        return sheet.refuse_rows(column.head, rows, f"no value; {role} is needed, or take the row out")
     return values
 
 
-def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray, problems: Problems) -> None:
+def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray) -> None:
     for i, (role, low, high) in enumerate(zip(roles, (-90, -180), (90, 360), strict=True)):
         bad = np.flatnonzero((across[:, i] < low) | (across[:, i] > high))
         swapped = i == 0 and len(bad) and (np.abs(across[:, 1]) <= 90).all()
         hint = "; are latitude and longitude swapped?" if swapped else ""
         rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in bad)
-        problems.add_rows(
+        sheet.problems.add_rows(
             sheet.where(chosen[role][0].head or ""), rows, f"{role} is outside {low} to {high} degrees{hint}"
         )
 
 
 def one_each(
-    sheet: Sheet, found: Places, station: np.ndarray, names: Sequence[str], problems: Problems | None
+    sheet: Sheet, found: Places, station: np.ndarray, names: Sequence[str], ask: bool = False
 ) -> Places | None:
     """The place of each station, which must be the same in all its rows; None, and noted, when it is not.
 
@@ -103,17 +95,63 @@ def one_each(
         found: (S,) places, one for each row.
         station: (S,) which station each row is of.
         names: of the stations.
-        problems: takes what is wrong; None to ask only.
+        ask: say whether it is so, and note nothing.
     """
     values = found.all()
     first = np.array([int(np.argmax(station == t)) for t in range(len(names))])
     moved = np.flatnonzero((values != values[first[station]]).any(axis=1))
     if len(moved) == 0:
         return found.take(first)
-    if problems is not None:
+    if not ask:
         row = moved[0]
         here, there = first[station[row]], row
         at = [f"({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in (here, there)]
         fault = f"station {names[station[row]]!r} is at {at[0]} and at {at[1]}; expected one place for each"
-        problems.add(sheet.source, fault)
+        sheet.refuse(fault)
     return None
+
+
+PER_STATION = ("sensitivity_db", "carrier_hz")
+
+
+@dataclass(frozen=True)
+class StationList:
+    """Stations in the order of their file.
+
+    Attributes:
+        names: (T,).
+        places: (T,).
+        extra: (T,) arrays by name: `sensitivity_db`, `carrier_hz`.
+    """
+
+    names: tuple[str, ...]
+    places: Places
+    extra: dict[str, np.ndarray]
+
+
+def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
+    """The stations of a table: name, and x, y, z or latitude, longitude, height, empty where nobody knows."""
+    called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
+    chosen, notes = choose(sheet, {"station": called[0]} if len(called) == 1 else {})
+    chosen = {columns[0].role: columns for columns in (tuple(map(as_station, c)) for c in chosen.values())}
+    notes = [f"{sheet.source}: {note}" for note in notes if not note.startswith("not used")]
+    if "station" not in chosen:
+        return sheet.refuse("no column of names; expected one called name or station"), notes
+    found = places(sheet, chosen, "station_", unknown=True)
+    if found is None:
+        if not sheet.problems:
+            sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
+        return None, notes
+    names = sheet.words(chosen["station"][0].head or "")
+    for i in np.flatnonzero(names == ""):
+        sheet.problems.add(f"{sheet.source}, {sheet.rows[i]}", "no name; expected the station's")
+    values, counts = np.unique(names, return_counts=True)
+    for name in values[(counts > 1) & (values != "")]:
+        rows = " and ".join(sheet.rows[i] for i in np.flatnonzero(names == name)[:2])
+        sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
+    extra = {}
+    for role in PER_STATION:
+        array = chosen[role][0].numbers(sheet) if role in chosen else None
+        if array is not None:
+            extra[role] = array
+    return StationList(tuple(map(str, names)), found, extra), notes

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsparc.data.errors import DataError, Problems
+import numpy as np
+import pandas as pd
+
 from gsparc.data.raw import Raw
-from gsparc.data.tables import TEXT_SUFFIXES
-from gsparc.data.tables.arrays import Builder
-from gsparc.data.tables.columns import choose, schema_unit
-from gsparc.data.tables.sheet import Sheet, read_parquet
-from gsparc.data.tables.stations import read_stations
-from gsparc.data.tables.text import read_text
+from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
+from gsparc.data.tables.places import (
+    PER_STATION,
+    UNKNOWN_HEIGHT,
+    Places,
+    StationList,
+    one_each,
+    places,
+    read_stations,
+)
+from gsparc.data.tables.sheet import Sheet, sheet_of
 
 log = logging.getLogger(__name__)
 
@@ -59,35 +68,353 @@ def understand_table(
 ) -> Table:
     """As `read_table`, with the notes."""
     sheet, notes = sheet_of(path)
-    problems = Problems(path)
     listed = None
     if stations_file is not None:
-        second, _ = sheet_of(stations_file)
-        listed, said = read_stations(second, problems)
+        second, _ = sheet_of(stations_file, sheet.problems)
+        listed, said = read_stations(second)
         notes += said
-        problems.raise_if_any()
-    chosen, guessed = choose(sheet, columns, problems, () if listed is None else listed.names)
-    problems.raise_if_any()
-    builder = Builder(sheet, chosen, listed, problems)
+        sheet.problems.raise_if_any()
+    chosen, guessed = choose(sheet, columns, () if listed is None else listed.names)
+    sheet.problems.raise_if_any()
+    builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
-    problems.raise_if_any()
+    sheet.problems.raise_if_any()
     level = chosen["rssi_db"][0] if "rssi_db" in chosen else None
     about = {} if level is None or level.unit is None else {"level_unit": schema_unit(level)}
     about |= {"level_unit": "dBW"} if "rssi" in chosen else {}
     return Table(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
-def sheet_of(path: str | Path) -> tuple[Sheet, list[str]]:
-    """The cells of a table, and notes on what was recognised.
+ENDS = {"rx": "receiver", "tx": "transmitter"}
+HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
 
-    Raises:
-        DataError: no such file, another ending, or no table.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")
-    if path.suffix.lower() == ".parquet":
-        return read_parquet(str(path)), []
-    if path.suffix.lower() not in TEXT_SUFFIXES:
-        raise DataError(f"{path}: expected a name ending in .csv, .tsv, .txt or .parquet")
-    return read_text(path)
+
+@dataclass(frozen=True)
+class _Stations:
+    """Names (T,), station of each row (S,) or None in the wide layout, and places (T,)."""
+
+    names: tuple[str, ...]
+    index: np.ndarray | None
+    places: Places
+
+
+class Builder:
+    """Takes arrays out of a table, noting what is wrong."""
+
+    def __init__(self, sheet: Sheet, chosen: Chosen, listed: StationList | None) -> None:
+        self.sheet, self.chosen, self.listed = sheet, chosen, listed
+        self.refuse = sheet.refuse
+        self.notes: list[str] = []
+        self.arrays: dict[str, np.ndarray] = {}
+        self.tones = np.zeros(1, int)
+
+    def build(self) -> dict[str, np.ndarray]:
+        """All arrays; what is wrong is in `sheet.problems`."""
+        measured = self._measurement()
+        self._ends(measured)
+        self._frequency(channels="csi" in self.arrays)
+        if "sensitivity_db" in self.chosen:
+            self._one("sensitivity_db")
+        for role in ("run", "row_name"):
+            if role in self.chosen:
+                self.arrays[role] = self.sheet.words(self.chosen[role][0].head or "")
+        self.arrays.setdefault("row_name", np.array(self.sheet.rows))
+        return self.arrays
+
+    def _measurement(self) -> str | None:
+        """Add the measurement; its quantity."""
+        role = next((name for name in (*LEVELS, *CHANNELS) if name in self.chosen), None)
+        if role is None:
+            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
+            return self.refuse(
+                f"no column of levels, powers or channels among {heads}; say dataset.columns.rssi_db=COLUMN"
+            )
+        if role in CHANNELS:
+            self._channels()
+            return role
+        columns = self.chosen[role]
+        found = [column.numbers(self.sheet) for column in columns]
+        if any(values is None for values in found):
+            return role
+        values = np.stack([v for v in found if v is not None], axis=1)
+        if np.isnan(values).all():
+            self.refuse("no value in any row", columns[0].head or "")
+        first = columns[0]
+        guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
+        if guessed and not (values < 0).any():  # the head says neither decibels nor watts
+            said = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
+            self.refuse(f"no value below 0: dBm or W? say {said}", first.head or "")
+        self.arrays[role] = values[:, 0] if len(columns) == 1 else values
+        return role
+
+    def _channels(self) -> None:
+        pairs = [self._tones(part) for part in CHANNELS]
+        self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
+        parts: list[list[np.ndarray]] = [[], []]
+        for tone in self.tones.tolist():
+            for part, columns, other in zip(CHANNELS, pairs, pairs[::-1], strict=True):
+                if tone not in columns:
+                    self.refuse(
+                        f"{other[tone].head!r} has no {part} beside it; say dataset.columns.{part}=COLUMN"
+                    )
+                    continue
+                values = columns[tone].numbers(self.sheet)
+                if values is not None:
+                    parts[CHANNELS.index(part)].append(values)
+        if self.sheet.problems:
+            return
+        csi = np.stack(parts[0], axis=1) + 1j * np.stack(parts[1], axis=1)
+        csi = csi[:, 0] if csi.shape[1] == 1 else csi
+        self.arrays["csi"] = csi
+        if np.isnan(csi).any():
+            self.arrays["mask"] = ~np.isnan(csi)
+
+    def _tones(self, part: str) -> dict[int, Column]:
+        """Columns by the number of their tone, which may be negative; 0 of a single one without."""
+        found: dict[int, Column] = {}
+        for column in self.chosen.get(part, ()):
+            label = column.label.strip(" _.:()[]")
+            where = self.sheet.where(column.head or "")
+            if not re.fullmatch(r"[-+]?\d+|", label):
+                fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
+                self.sheet.problems.add(where, f"{fault}, or say dataset.columns.{part}='NAME*'")
+            elif found.setdefault(int(label or 0), column) is not column:
+                self.sheet.problems.add(
+                    where, f"the same tone as {found[int(label or 0)].head!r}; rename one"
+                )
+        return found
+
+    def _ends(self, measured: str | None) -> None:
+        """Add positions and stations."""
+        given = {end: places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
+        found = {end: where for end, where in given.items() if where is not None}
+        if self.sheet.problems:
+            return
+        if not found:
+            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
+            return self.refuse(
+                f"no coordinates among {heads}; say dataset.columns.x=COLUMN and .y, or .latitude, .longitude"
+            )
+        if len(found) == 3:
+            return self.refuse(
+                "coordinates of rx, of tx and of an end without a name; expected two ends, rename one"
+            )
+        stations = self._stations(measured, found)
+        if self.sheet.problems:
+            return
+        stay = next((end for end, where in given.items() if where is not None and end not in found), "")
+        moving, where = self._moving(found, stay)
+        if stations is not None:
+            self._add_stations(stations, where.degrees)
+        self._add_places(moving, where)
+        for other in found.values():  # the end that is left, where there are no stations
+            self._add_other("tx" if moving == "rx" else "rx", other, where)
+
+    def _moving(self, found: dict[str, Places], stay: str) -> tuple[str, Places]:
+        """Which end the rows are places of, where `stay` are stations; it is taken out of `found`."""
+        named: list[str] = [end for end in ("rx_", "tx_") if end in found]
+        if "" in found:
+            named = named or [stay] * bool(stay)
+            moving = "tx" if named == ["rx_"] else "rx"
+            station = self.chosen.get("station") or self.chosen.get("station_x") or ()
+            if not named and station and station[0].word in HEARING:
+                moving = "tx"
+            if not named:
+                other = "tx" if moving == "rx" else "rx"
+                axis = "latitude" if found[""].degrees else "x"
+                rename = f"if not, name them {other}_{axis}, ..., or say dataset.columns.{other}_{axis}=..."
+                self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; {rename}")
+            return moving, found.pop("")
+        if len(named) == 2 and len(np.unique(found["rx_"].all(), axis=0)) == 1:
+            named = ["tx_"]
+        return named[0][:2], found.pop(named[0])
+
+    def _stations(self, measured: str | None, found: dict[str, Places]) -> _Stations | None:
+        """The stations, where there are; an end that is their place is taken out of `found`."""
+        where = places(self.sheet, self.chosen, "station_")
+        labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
+        for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
+            self.refuse(f"two columns of the station {label!r}; rename one")
+        if len(labels) > 1:
+            return self._wide(labels, where)
+        column = self.chosen.get("station", (None,))[0]
+        if column is None:
+            if self.listed is not None and len(self.listed.names) == 1:
+                return self._by_list(np.array(self.listed.names * len(self.sheet.rows)))
+            if self.listed is not None:
+                return self.refuse(
+                    "no column says which station a row is of; say dataset.columns.station=COLUMN"
+                )
+            if where is None:
+                where = self._second_in_degrees(found)
+            return None if where is None else self._unnamed(where)
+        words = self.sheet.words(column.head or "")
+        self.sheet.refuse_rows(column.head, np.flatnonzero(words == ""), "no station; expected its name")
+        if self.listed is not None:
+            self._all_listed(words, column.head or "")
+            return None if self.sheet.problems else self._by_list(words)
+        index, distinct = pd.factorize(words)  # in the order of their first rows
+        names = tuple(map(str, distinct))
+        if where is not None:
+            each = one_each(self.sheet, where, index, names)
+            return None if each is None else _Stations(names, index, each)
+        if self.sheet.problems:
+            return None
+        ends = [end for end in ("tx_", "rx_") if end in found] if len(found) > 1 else []
+        for end in ends:
+            each = one_each(self.sheet, found[end], index, names, ask=True)
+            if each is not None:
+                found.pop(end)
+                return _Stations(names, index, each)
+        if ends:
+            one_each(self.sheet, found[ends[0]], index, names)
+            return None
+        if measured in LEVELS:
+            nowhere = np.full((len(names), 3), np.nan)
+            degrees = next(iter(found.values())).degrees
+            self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
+            return _Stations(names, index, Places(nowhere[:, :2], nowhere[:, 2], degrees))
+        fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
+        return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
+
+    def _wide(self, labels: tuple[str, ...], where: Places | None) -> _Stations | None:
+        if self.listed is None:
+            hint = "in one place for all columns" if where is not None else "without places"
+            return self.refuse(
+                f"{len(labels)} columns of stations {hint}; say dataset.stations_file=FILE (name, x, y, z)"
+            )
+        self._all_listed(np.array(labels), None)
+        silent = [name for name in self.listed.names if name not in labels]
+        used = {column.head for columns in self.chosen.values() for column in columns}
+        for name in silent:
+            close = difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6)
+            for head in close:
+                self.refuse(f"no column of the listed station {name!r}, but {head!r}; the same?")
+        if self.sheet.problems:
+            return None
+        if silent:
+            self.notes.append(
+                f"listed, but without a column: {', '.join(silent[:8])}{', ...' * (len(silent) > 8)}"
+            )
+        order = np.array([self.listed.names.index(label) for label in labels])
+        for role in PER_STATION:
+            if role in self.listed.extra:
+                self.arrays[role] = self.listed.extra[role][order]
+        return _Stations(labels, None, self.listed.places.take(order))
+
+    def _all_listed(self, words: np.ndarray, head: str | None) -> None:
+        """Refuse names that the list of stations does not have."""
+        assert self.listed is not None
+        for word in dict.fromkeys(words[words != ""].tolist()):
+            if word in self.listed.names:
+                continue
+            close = difflib.get_close_matches(word, self.listed.names, 1, 0.5)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            place = "the heads"
+            if head is not None:
+                place = f"column {head!r}, {self.sheet.rows[int(np.argmax(words == word))]}"
+            self.sheet.problems.add(f"{self.sheet.source}, {place}", f"{word!r} is no listed station{hint}")
+
+    def _by_list(self, words: np.ndarray) -> _Stations:
+        assert self.listed is not None
+        index = pd.Index(self.listed.names).get_indexer(words)
+        self.arrays |= self.listed.extra
+        silent = [name for i, name in enumerate(self.listed.names) if i not in set(index.tolist())]
+        if silent:
+            self.notes.append(f"listed, but in no row: {', '.join(silent[:8])}{', ...' * (len(silent) > 8)}")
+        return _Stations(self.listed.names, index, self.listed.places)
+
+    def _second_in_degrees(self, found: dict[str, Places]) -> Places | None:
+        """Of two ends in degrees, the one with fewer places, which are then stations."""
+        if len(found) < 2 or not all(where.degrees for where in found.values()):
+            return None
+        few = min(found, key=lambda end: len(np.unique(found[end].all(), axis=0)))
+        return found.pop(few)
+
+    def _unnamed(self, where: Places) -> _Stations | None:
+        """Stations told apart by their places alone."""
+        values, index = np.unique(where.all(), axis=0, return_inverse=True)
+        if len(values) > max(1, len(self.sheet) // 2):
+            return self.refuse(
+                f"{len(values)} places of stations in {len(self.sheet)} rows; stations stay where they are"
+            )
+        each = Places(values[:, :2], values[:, 2] if values.shape[1] > 2 else None, where.degrees)
+        return _Stations(tuple(f"station {i}" for i in range(len(values))), index.reshape(-1), each)
+
+    def _add_stations(self, stations: _Stations, degrees: bool) -> None:
+        if stations.places.degrees != degrees:
+            words = ("degrees", "metres") if degrees else ("metres", "degrees")
+            return self.refuse(
+                f"the places of rows are in {words[0]}, those of stations in {words[1]}; expected one of them"
+            )
+        self.arrays["station_name"] = np.array(stations.names)
+        if stations.index is not None:
+            self.arrays["station"] = stations.index.astype(np.int64)
+        self._add_places("station", stations.places)
+        return None
+
+    def _add_other(self, name: str, other: Places, moving: Places) -> None:
+        if other.degrees != moving.degrees:
+            self.refuse("one end is in degrees, the other in metres; expected one of them for both")
+        else:
+            still = len(np.unique(other.all(), axis=0)) == 1
+            self._add_places(name, other.take(np.array([0])) if still else other, still=still)
+
+    def _add_places(self, name: str, where: Places, still: bool = False) -> None:
+        """Add positions [m], or degrees and heights."""
+        height = where.height
+        if height is None:
+            self.notes.append(f"no height of the {ENDS.get(name, 'stations')}: taken as {UNKNOWN_HEIGHT:g} m")
+        elif len(np.unique(height)) == 1:
+            height = height[:1]
+        flat = np.array(UNKNOWN_HEIGHT) if height is None else height[0] if len(height) == 1 else height
+        if where.degrees:
+            before = "station_" if name == "station" else ""
+            self.arrays[f"{before}latitude"] = where.across[:, 0]
+            self.arrays[f"{before}longitude"] = where.across[:, 1]
+            self.arrays[f"{name}_height"] = np.asarray(flat)
+            return
+        values = where.all()
+        self.arrays[f"{name}_position"] = values[0] if still else values
+        if where.height is None:
+            self.arrays[f"{name}_height"] = np.asarray(flat)
+
+    def _one(self, role: str) -> None:
+        """Add a number for all rows."""
+        column = self.chosen[role][0]
+        values = column.numbers(self.sheet)
+        if values is None:
+            return
+        different = np.unique(values[~np.isnan(values)])
+        if len(different) == 1:
+            self.arrays[role] = different[0]
+        else:
+            fault = f"{len(different)} values; expected one {role} for all rows"
+            self.refuse(fault, column.head or "")
+
+    def _frequency(self, channels: bool) -> None:
+        """Add frequencies of tones, or the carrier."""
+        if "frequency_hz" in self.chosen:
+            column = self.chosen["frequency_hz"][0]
+            if len(column.value) == 2:
+                if not channels or len(self.tones) == 1:
+                    fault = f"two frequencies {column.value} for one tone"
+                    return self.refuse(f"dataset.columns.frequency_hz: {fault}")
+                self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], column.value)
+                if np.ptp(np.diff(self.tones)):
+                    self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
+            else:
+                self._one("frequency_hz")
+        if "carrier_hz" not in self.chosen:
+            return
+        column = self.chosen["carrier_hz"][0]
+        values = column.numbers(self.sheet)
+        if values is None:
+            return
+        self.sheet.refuse_rows(
+            column.head, np.flatnonzero(np.isnan(values)), "no value; expected a frequency"
+        )
+        same = len(np.unique(values)) == 1
+        self.arrays["carrier_hz"] = values[0] if same else values
+        if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:
+            self.arrays["frequency_hz"] = values[0]

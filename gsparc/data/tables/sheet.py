@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import codecs
+import csv
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import DataError, Problems
+from gsparc.data.tables import TABLE_SUFFIXES
+from gsparc.data.tables.heads import understand
 
 # What stands for no value, in small letters.
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "#n/a", "null", "none", "nil", "?", ".")
@@ -25,6 +32,7 @@ class Sheet:
         columns: as many Series, of text or of numbers.
         rows: what a message calls each row: `line 2`, `row 0`.
         decimal: `.` or `,`, of numbers that are text.
+        problems: takes what is wrong.
     """
 
     source: str
@@ -32,6 +40,7 @@ class Sheet:
     columns: tuple[pd.Series, ...]
     rows: tuple[str, ...]
     decimal: str = "."
+    problems: Problems = field(default_factory=lambda: Problems(""))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -39,6 +48,14 @@ class Sheet:
     def where(self, head: str) -> str:
         """How messages name a column."""
         return f"{self.source}, column {head!r}"
+
+    def refuse(self, what: str, head: str | None = None) -> Any:
+        """Note what is wrong with the table, or with a column; returns None."""
+        return self.problems.add(self.source if head is None else self.where(head), what)
+
+    def refuse_rows(self, head: str | None, rows: np.ndarray, what: str) -> Any:
+        """Note `what` for rows (n,) of a column; returns None."""
+        return self.problems.add_rows(self.where(head or ""), (self.rows[i] for i in rows), what)
 
     def words(self, head: str) -> np.ndarray:
         """Text (S,) of a column, without surrounding spaces; empty where there is no value."""
@@ -50,11 +67,11 @@ class Sheet:
         empty = missing | np.isin(np.char.lower(text.astype(str)), MISSING)
         return np.where(empty, "", text).astype(str)
 
-    def numbers(self, head: str, problems: Problems) -> np.ndarray | None:
+    def numbers(self, head: str) -> np.ndarray | None:
         """Numbers (S,) float64 of a column, NaN for no value; None, and noted, where a cell is text."""
         column = self.columns[self.heads.index(head)]
         if pd.api.types.is_bool_dtype(column.dtype):
-            return problems.add(self.where(head), "holds True and False; expected numbers")
+            return self.refuse("holds True and False; expected numbers", head)
         if pd.api.types.is_numeric_dtype(column.dtype):
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
             bad = np.isinf(values)
@@ -68,18 +85,14 @@ class Sheet:
             if bad.any():
                 bad[bad] = self.words(head)[bad] != ""
         if bad.any():
-            shown = column.astype(str).to_numpy(dtype=object)
-            rows = (f"{self.rows[i]}: {_shown(shown[i])}" for i in np.flatnonzero(bad))
-            mark = (
-                "decimal commas" if self.decimal == "," else "decimal points, and no marks between thousands"
-            )
-            marks = f"; this table has {mark}" if any("," in c or "." in c for c in shown[bad]) else ""
-            return problems.add_rows(self.where(head), rows, f"is no finite number{marks}; or leave it empty")
+            cells = column.astype(str).to_numpy(dtype=object)[bad]
+            shown = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
+            rows = (f"{self.rows[i]}: {cell}" for i, cell in zip(np.flatnonzero(bad), shown, strict=True))
+            mark = "commas" if self.decimal == "," else "points, and no marks between thousands"
+            hint = f"; this table has decimal {mark}" if any("," in c or "." in c for c in cells) else ""
+            what = f"is no finite number{hint}; or leave it empty"
+            return self.problems.add_rows(self.where(head), rows, what)
         return values
-
-
-def _shown(cell: str) -> str:
-    return repr(cell if len(cell) <= 40 else cell[:37] + "...")
 
 
 def read_parquet(source: str) -> Sheet:
@@ -109,3 +122,253 @@ def read_parquet(source: str) -> Sheet:
         raise DataError(f"{source}: no rows")
     rows = tuple(f"row {i}" for i in range(len(frame)))
     return Sheet(source, heads, tuple(frame.iloc[:, i] for i in range(len(heads))), rows)
+
+
+DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+THOUSANDS = r"\s*[-+]?[1-9]\d{0,2},\d{3}\s*"  # 448,262: a mark between thousands, or three decimals
+LOOKED_AT = 200  # lines and cells that decide about delimiter and decimal mark
+COMMENTS = ("#", "%", "//")
+# What files of other kinds begin with: the name may say .csv all the same.
+OTHERS = {
+    b"PK\x03\x04": "an Excel workbook or another zip archive; save it as CSV",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook; save it as CSV",
+    b"PAR1": "a Parquet file; name it *.parquet",
+    b"\x1f\x8b": "compressed by gzip; unpack it first",
+    b"\x89HDF": "an HDF5 file; name it *.h5",
+    b"%PDF": "a PDF document; save the table as CSV",
+    b"<": "HTML or XML; save the table as CSV",
+    b"{": "JSON; save the table as CSV",
+    b"[{": "JSON; save the table as CSV",
+}
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Lines with something in them, and their numbers from 1."""
+
+    text: list[str]
+    number: list[int]
+    comment_before: str  # the last comment before the first of them
+
+
+def read_text(path: Path) -> tuple[Sheet, list[str]]:
+    """The cells of a text file, and notes on what was recognised.
+
+    Raises:
+        DataError: empty, not text, no heads, ragged lines or two columns of one name.
+    """
+    source, notes = str(path), []
+    text, encoding = _decoded(path)
+    if encoding != "UTF-8":
+        notes.append(f"read as {encoding}")
+    lines = _lines(text)
+    if not lines.text:
+        raise DataError(f"{source}: empty; expected a line of heads and rows below it")
+    said = re.fullmatch(r"sep=(.)", lines.text[0].strip())
+    if said:  # Excel's own hint
+        lines = _Lines(lines.text[1:], lines.number[1:], "")
+    delimiter = said[1] if said else _delimiter(lines)
+    if delimiter is None or not lines.text:
+        fault = f"line 1 ({lines.text[0][:40]!r}) is a single column" if lines.text else "no heads"
+        raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
+    lines, dropped = _without_comments(_with_heads(lines, delimiter, source), delimiter, source)
+    notes += dropped
+    heads, *rows = _rectangular(lines, delimiter, source)
+    heads = [cell.strip() for cell in heads]
+    for i, head in enumerate(heads):
+        if head and head in heads[:i]:
+            where = f"columns {heads.index(head) + 1} and {i + 1}"
+            raise DataError(f"{source}: {where} are both named {head!r}; rename one")
+    if not rows:
+        raise DataError(f"{source}: line {lines.number[0]} names columns, but there are no rows below it")
+    frame = pd.DataFrame(rows, dtype=object)
+    decimal = "." if delimiter == "," and not _quoted_decimals(text, frame) else _decimal(frame)
+    if delimiter != ",":
+        notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
+    if decimal == ",":
+        notes.append("decimal commas" + _perhaps_thousands(frame))
+    columns = tuple(frame[i] for i in range(len(heads)))
+    return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines.number[1:]), decimal), notes
+
+
+def _decoded(path: Path) -> tuple[str, str]:
+    """The text of a file and the name of its encoding."""
+    content = path.read_bytes()
+    for start, what in OTHERS.items():
+        if content.lstrip().startswith(start):
+            raise DataError(f"{path}: not a table of text but {what}")
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            return content.decode("utf-16"), "UTF-16"
+        except UnicodeDecodeError as error:
+            raise DataError(f"{path}: damaged UTF-16 at byte {error.start}; save it as UTF-8") from None
+    if b"\0" in content:
+        raise DataError(
+            f"{path}: not text (byte {content.index(0)} is zero; UTF-16 without its mark?); save it as UTF-8"
+        )
+    try:
+        return content.decode("utf-8-sig"), "UTF-8"
+    except UnicodeDecodeError:
+        # Every byte means something in Latin-1; Windows-1252 is what spreadsheets write.
+        return content.decode("cp1252", errors="replace"), "Windows-1252, as it is not UTF-8"
+
+
+def _lines(text: str) -> _Lines:
+    found: list[str] = []
+    numbers: list[int] = []
+    comment = ""
+    # Not str.splitlines, which also ends lines at characters that may stand in a cell.
+    for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
+        stripped = line.strip()
+        if stripped.startswith(COMMENTS) and not found:
+            comment = stripped.lstrip("#%/ ")
+        elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
+            found.append(line)
+            numbers.append(number)
+    return _Lines(found, numbers, comment)
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        line = " ".join(line.split())
+    if '"' not in line:
+        return line.split(delimiter)
+    return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+
+
+def _delimiter(lines: _Lines) -> str | None:
+    """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
+    best: tuple[bool, float, int, str] | None = None
+    sample = lines.text[:LOOKED_AT]
+    for delimiter in DELIMITERS:
+        count = len(_cells(sample[0], delimiter))
+        said = _cells(lines.comment_before, delimiter) if lines.comment_before else []
+        heads = len(said) == count and any(understand(cell).role for cell in said)
+        if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
+            continue
+        agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
+        if best is None or (heads, agree, count) > best[:3]:
+            best = (heads, agree, count, delimiter)
+    return None if best is None else best[3]
+
+
+def _with_heads(lines: _Lines, delimiter: str, source: str) -> _Lines:
+    """The lines, the first of them heads; a comment before values is taken for them where it fits."""
+    first = _cells(lines.text[0], delimiter)
+    values = all(_is_number(cell) for cell in first)
+    heads = _cells(lines.comment_before, delimiter) if lines.comment_before else []
+    named = [sum(understand(cell).role is not None for cell in cells) for cells in (heads, first)]
+    fits = len(heads) == len(first) and not all(_is_number(cell) for cell in heads)
+    if not values and not (fits and named[0] > named[1]):
+        return lines
+    if fits:
+        return _Lines([lines.comment_before, *lines.text], [lines.number[0] - 1, *lines.number], "")
+    fault = f"line {lines.number[0]} holds numbers; expected the names of the columns above them"
+    raise DataError(f"{source}: {fault}")
+
+
+def _is_number(cell: str) -> bool:
+    return re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE) is not None
+
+
+def _without_comments(lines: _Lines, delimiter: str, source: str) -> tuple[_Lines, list[str]]:
+    """The lines without comments below the heads, and a note.
+
+    A line that begins like a comment and has as many cells as there are heads is a row, as stations may be
+    called #1; it is refused where it may be a row that somebody took out.
+    """
+    marked = [i for i, line in enumerate(lines.text) if i and line.lstrip().startswith(COMMENTS)]
+    if not marked:
+        return lines, []
+    at = f"line {lines.number[marked[0]]}"
+    count = len(_cells(lines.text[0], delimiter))
+    like = {n: lines.text[n].lstrip(" #%/") for n in marked}  # between spaces a mark may be a cell
+    if all(
+        count not in (len(_cells(lines.text[i], delimiter)), len(_cells(like[i], delimiter))) for i in marked
+    ):
+        kept = sorted(set(range(len(lines.text))) - set(marked))
+        note = f"{len(marked)} comments below the heads, the first in {at}"
+        return _Lines([lines.text[i] for i in kept], [lines.number[i] for i in kept], ""), [note]
+    first = [_cells(line, delimiter)[0].strip() for line in lines.text]
+    plain = [cell for i, cell in enumerate(first) if i and i not in set(marked)]
+    numbers = bool(plain) and all(map(_is_number, plain))
+    for i in marked:
+        mark = next(mark for mark in COMMENTS if first[i].startswith(mark))
+        name = first[i].removeprefix(mark).strip('"')
+        if not name.strip() or name[0].isspace() or name in first or (numbers and _is_number(name)):
+            fault = f"begins with {first[i][:20]!r}: a row, or a comment? quote the cell or take the line out"
+            raise DataError(f"{source}, line {lines.number[i]}: {fault}")
+    return lines, [f"{len(marked)} rows begin with {first[marked[0]]!r} or the like, the first in {at}"]
+
+
+def _rectangular(lines: _Lines, delimiter: str, source: str) -> list[list[str]]:
+    """All cells; quotes that stay open, and lines with more or fewer cells than heads, are refused."""
+    problems = Problems(source)
+    for line, number in zip(lines.text, lines.number, strict=True):
+        if line.count('"') % 2:
+            fault = (
+                "a quotation mark is not closed on this line; close it, or remove the line break in the cell"
+            )
+            raise DataError(f"{source}, line {number}: {fault}")
+    cells = [_cells(line, delimiter) for line in lines.text]
+    counts = [len(row) for row in cells]
+    wrong = [i for i, count in enumerate(counts) if count != counts[0]]
+    if wrong and len(wrong) == len(counts) - 1 and len(set(counts[1:])) == 1:
+        hint = "; decimal commas need semicolons or tabs between columns" if delimiter == "," else ""
+        longer = cells[1:] if counts[1] > counts[0] else cells[:1]
+        if abs(counts[1] - counts[0]) == 1 and not any(row[-1].strip() for row in longer):
+            hint = ", the last of them empty: end heads and rows alike"
+        fault = f"{counts[0]} heads, but every line below has {counts[1]} cells{hint}"
+        raise DataError(f"{source}, line {lines.number[0]}: {fault}")
+    names = (f"line {lines.number[i]} ({counts[i]} cells)" for i in wrong)
+    mark = DELIMITERS.get(delimiter, delimiter)
+    problems.add_rows(source, names, f"expected {counts[0]} cells between {mark}, as there are heads")
+    problems.raise_if_any()
+    return cells
+
+
+def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
+    """Whether cells in quotes hold decimal commas between commas, not marks between thousands alone."""
+    if '"' not in text:
+        return False
+    cells = pd.concat([frame[i] for i in frame.columns])
+    return bool((cells.str.fullmatch(DECIMAL_COMMA) & ~cells.str.fullmatch(THOUSANDS)).any())
+
+
+def _perhaps_thousands(frame: pd.DataFrame) -> str:
+    """A question where all cells with a comma may be marked between thousands; else nothing."""
+    cells = pd.concat([frame[i] for i in frame.columns])
+    marked = cells[cells.str.fullmatch(DECIMAL_COMMA)]
+    if not marked.str.fullmatch(THOUSANDS).all():
+        return ""
+    first = marked.iloc[0].strip()
+    return f": {first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
+
+
+def _decimal(frame: pd.DataFrame) -> str:
+    """The mark that most numbers have that have one."""
+    counts = [0, 0]
+    for i in frame.columns:
+        for cell in frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)]:
+            counts[0] += re.fullmatch(DECIMAL_COMMA, cell) is not None
+            counts[1] += re.fullmatch(DECIMAL_POINT, cell) is not None
+    return "," if counts[0] > counts[1] else "."
+
+
+def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
+    """The cells of a table, and notes on what was recognised.
+
+    Args:
+        path: of the table.
+        problems: of another table, which take what is wrong with this one, too.
+
+    Raises:
+        DataError: no such file, another ending, or no table.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")
+    if path.suffix.lower() not in TABLE_SUFFIXES:
+        raise DataError(f"{path}: expected a name ending in .csv, .tsv, .txt or .parquet")
+    sheet, notes = (read_parquet(str(path)), []) if path.suffix.lower() == ".parquet" else read_text(path)
+    return replace(sheet, problems=Problems(path) if problems is None else problems), notes

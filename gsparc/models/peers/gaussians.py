@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from gsparc.data.gaussian_cloud import GaussianCloud
+from gsparc.data.site_objects import GaussianCloud
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
 from gsparc.field.model import FULL_SPHERE_ROWS
 from gsparc.models.peers.network import Network, Scene

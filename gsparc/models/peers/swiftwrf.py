@@ -21,8 +21,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.schema import Kind
+from gsparc.data.site_objects import GaussianCloud
 from gsparc.models.peers.deformation import Deformation
 from gsparc.models.peers.gaussians import GaussianNetwork, GaussianPeer, render_each
 from gsparc.models.peers.network import Network, Scene

@@ -14,10 +14,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import check_arguments, or_null, switch, whole
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
 from gsparc.field import edit
 from gsparc.field.confidence import Confidence, ConfidenceSettings

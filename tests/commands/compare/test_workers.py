@@ -16,7 +16,7 @@ from gsparc.commands.compare import command
 from gsparc.commands.compare.cells import Cell
 from gsparc.commands.compare.fitting import Filled, Prepared
 from gsparc.commands.compare.problem import Problem
-from gsparc.data import claims
+from gsparc.data import files
 
 FORK = multiprocessing.get_context("fork")
 BROKEN = {5: ValueError, 7: AttributeError}  # the latter, a bug of a plugin, ended the comparison of all
@@ -41,7 +41,7 @@ def worker(folder: Path, killed_at: int | None = None) -> None:
         (one.folder / "cell.json").write_text(json.dumps(facts))
         return Filled(one.cell, one.folder, facts)
 
-    command.fill, claims.POLL_S = fill, 0.02
+    command.fill, files.POLL_S = fill, 0.02
     filled = command.fill_all(prepared, failed=command.Failed(folder))
     assert [one.cell.method for one in filled] == [f"m{n}" for n in range(COUNT) if n not in BROKEN]
 

@@ -7,7 +7,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.data.checks import plausibility
 from gsparc.data.checks.level_steps import level_steps
-from gsparc.data.checks.link_levels import LinkLevels, link_levels
+from gsparc.data.checks.plausibility import LinkLevels, link_levels
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.data.checks.proposal import held_out, proposal, side_of_squares
+from gsparc.data.checks.describe import held_out, proposal, side_of_squares
 from gsparc.data.own import load_own, write_own
 
 

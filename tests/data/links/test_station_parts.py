@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from gsparc.data.errors import DataError
-from gsparc.data.links.station_parts import rows_by_station, split_stations
 from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
-from gsparc.data.selection import keep_stations
+from gsparc.data.selection import keep_stations, rows_by_station, split_stations
 
 
 def wide(**more: np.ndarray) -> Raw:

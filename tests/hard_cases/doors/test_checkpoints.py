@@ -29,7 +29,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main as train
 from gsparc.data.errors import DataError
 from gsparc.data.load import load, split_for
-from gsparc.data.position_encoder.store import load as load_encoder
+from gsparc.data.position_encoder import load as load_encoder
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.models.image_sources.search_cache import SearchCache

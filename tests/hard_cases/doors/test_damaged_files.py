@@ -1,7 +1,7 @@
 """Files whose bytes are damaged: cut short, overwritten, made to hang or crash the library that reads them.
 
-Remedy: gsparc/data/raw.py; text of variable length is first read by a program of its own, for a bounded time
-(gsparc/data/hdf5_probe.py). Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
+Remedy: gsparc/data/raw.py; text of variable length is first read by a program of its own, for a
+bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from doors import assert_found_bad, knock
 from ledger import LEDGER
 
 from gsparc.commands.check import main as check
-from gsparc.data import hdf5_probe
+from gsparc.data import raw as raw_files
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 
@@ -61,7 +61,7 @@ def test_cut_short(tmp_path, share, suffix):
 )
 def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
     good = users_file(tmp_path / "good.h5").read_bytes()
-    heap = good.index(hdf5_probe.HEAP)
+    heap = good.index(raw_files.HEAP)
     for seed in range(count):
         draw, spoilt = random.Random(seed), bytearray(good)
         for _ in range(3):
@@ -77,9 +77,9 @@ def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
 
 def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
     path = users_file(tmp_path / "mine.h5")
-    monkeypatch.setattr(hdf5_probe, "READ", "import time; time.sleep(60)")
-    assert "cannot be read in 0.5 s" in str(hdf5_probe.read_error(path, seconds=0.5))
-    monkeypatch.setattr(hdf5_probe, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    monkeypatch.setattr(raw_files, "READ", "import time; time.sleep(60)")
+    assert "cannot be read in 0.5 s" in str(raw_files.read_error(path, seconds=0.5))
+    monkeypatch.setattr(raw_files, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(DataError, match=r"mine\.h5: damaged \(its text crashes the HDF5 library\)"):
         load_own(path)
     LEDGER.count("bad inputs", 2)
@@ -98,10 +98,10 @@ def test_ours_need_no_trial(tmp_path, monkeypatch):
 def test_a_heap_that_makes_libhdf5_loop_is_refused(tmp_path, monkeypatch):
     """Found by fuzzing: an object that says it is 2 kB larger is walked past for ever."""
     spoilt = bytearray(users_file(tmp_path / "good.h5").read_bytes())
-    spoilt[spoilt.index(hdf5_probe.HEAP) + 25] = 8  # second byte of the first object's size
+    spoilt[spoilt.index(raw_files.HEAP) + 25] = 8  # second byte of the first object's size
     path = tmp_path / "loops.h5"
     path.write_bytes(spoilt)
-    monkeypatch.setattr(hdf5_probe.read_error, "__defaults__", (3.0,))
+    monkeypatch.setattr(raw_files.read_error, "__defaults__", (3.0,))
     with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 3 s\)"):
         load_own(path)
     LEDGER.count("bad inputs")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from known_arrays import array_site, measure, room_vectors, walk
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from known_arrays import array_site, measure, room_vectors, spectra, walk
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.models.array_vectors import splat_init, vector_cache

@@ -357,7 +357,7 @@ CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-cs
 
 @pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")
 def test_measured_channels_in_squares():
-    from gsparc.data.modules.techtile import Techtile
+    from gsparc.data.datasets.techtile import Techtile
 
     data = Techtile(CHANNELS, runs=["EXP006"], stations=[5]).load()
     fold = make_split(data.moving, SplitSettings(name="blocks", side_m=0.6)).folds[0]

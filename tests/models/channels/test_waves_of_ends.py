@@ -199,7 +199,7 @@ CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-cs
 @pytest.mark.slow
 @pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")
 def test_measured_ceiling_in_squares():
-    from gsparc.data.modules.techtile import Techtile
+    from gsparc.data.datasets.techtile import Techtile
 
     data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
     split = make_split(data.moving, SplitSettings(name="blocks", side_m=0.6), place=data.place)

@@ -12,7 +12,7 @@ from rooms import directed
 from scenes import error
 
 from gsparc.commands.study.disturb import turned
-from gsparc.data.campaigns.newrf import load_newrf
+from gsparc.data.datasets.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.gp_likelihood import steering

@@ -9,7 +9,7 @@ from known_arrays import array_site, measure, room_vectors, walk
 from scenes import error, fold_of, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.peers.directions import virtual_transmitters
 from gsparc.models.peers.radiance import fourier_legendre, terms

@@ -10,7 +10,7 @@ import pytest
 import torch
 from known_arrays import array_site, measure, spectra, walk
 
-from gsparc.data.campaigns.rfid import planar_array
+from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load, split_for
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.scores import score

@@ -9,7 +9,7 @@ import pytest
 import torch
 from cities import city, deaf, fold, folder
 
-from gsparc.data.campaigns.argos import load_argos
+from gsparc.data.datasets.argos import load_argos
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.peers.fire import Fire

@@ -11,7 +11,7 @@ import torch
 from releases import real
 
 import gsparc
-from gsparc.data.modules.ble import BLE
+from gsparc.data.datasets.ble import BLE
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split

@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.campaigns.layout import COMPLEX, FLAGS, LABELS, TEXT, Expected, check_layout
-from gsparc.data.campaigns.netcdf import SUFFIXES, read_netcdf
+from gsparc.data.datasets.campaign import COMPLEX, FLAGS, LABELS, TEXT, Campaign, Expected, check_layout
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
-from gsparc.data.raw import Raw, read_raw, renamed
+from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf, read_raw, renamed
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
 CHANNEL = 1  # of the two antennas of a tile, the one that received
@@ -67,7 +66,7 @@ def raw_of_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw
         DataError: no such file, or variables missing or wrong; all problems with array and row.
     """
     path = Path(path)
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in NETCDF_SUFFIXES:
         return _of_release(_with_experiments(read_netcdf(path), path), path, antennas)
     raw = read_raw(path)
     check_layout(raw, path, NPZ)
@@ -163,3 +162,24 @@ def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
     if not np.isfinite(place).all():
         raise DataError(f"{path}, {host}: expected x, y, z [m] of channel {CHANNEL}, found {channels!r:.80}")
     return place
+
+
+class Techtile(Campaign):
+    """Channels of a moving transmitter at 42 ceiling antennas; see `raw_of_techtile`.
+
+    Args:
+        file: *.npz, or the release's *.nc.
+        antennas: places of the antennas of a NetCDF file; None: `techtile_antenna_locations.yml` beside it.
+        name: of run directories.
+        **rest: see `Campaign`.
+    """
+
+    def __init__(
+        self, file: str | Path, antennas: str | Path | None = None, name: str = "techtile", **rest: Any
+    ) -> None:
+        super().__init__(file, name, **rest)
+        self.antennas = antennas
+
+    def raw(self) -> Raw:
+        """Channels (S, T) of a moving transmitter at T stations."""
+        return raw_of_techtile(self.file, self.antennas)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from releases import real
 
-from gsparc.data.checks.describe import read_any
+from gsparc.data.datasets.own import read_any
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw, read_raw, renamed
@@ -119,3 +120,29 @@ def _heard(power: np.ndarray) -> dict[str, np.ndarray]:
         lower, upper = np.quantile(arrived, (0.25, 0.75))
         level = arrived[arrived >= lower - 1.5 * (upper - lower)].min()
     return {"rssi_db": np.where(decibels < level, np.nan, decibels), "sensitivity_db": np.array(level)}
+
+
+class Sionna(DataModule):
+    """One transmitter, many receivers, read as spectra or as channels.
+
+    Args:
+        file: *.h5.
+        target: `spectrum`, `csi` or `rssi`; None takes what the file was mainly made for.
+        truth: another simulation of the same receivers, which test rows are compared with.
+        name, batch_size: see `DataModule`.
+    """
+
+    def __init__(
+        self,
+        file: str | Path,
+        target: str | None = None,
+        truth: str | Path | None = None,
+        name: str = "sionna",
+        batch_size: int = 16,
+    ) -> None:
+        super().__init__(name, batch_size)
+        self.file, self.target, self.truth = Path(file), target, truth
+
+    def load(self) -> Measurements:
+        """Spectra (S, H, W), channels (S, A, K) or powers (S, 1)."""
+        return load_sionna(self.file, self.target, self.truth)

@@ -12,16 +12,17 @@ import csv
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.blocks import empty
+from gsparc.data.datasets.campaign import Release
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
-from gsparc.data.rotation import quaternion_to_matrix
+from gsparc.data.own_checks import quaternion_to_matrix
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 
@@ -246,11 +247,46 @@ def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray
     return np.sort(np.array(rows, dtype=np.int64))
 
 
-def describe_missing(root: str | Path | None) -> str:
-    """Message that the release is not on disk, and how to get it."""
-    wanted = "dataset.root is not set" if root is None else f"dataset.root={root} does not exist"
-    return (
-        f"{wanted}: the RFID release is NOT on disk. Get it from the NeRF2 project "
-        "(https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, tx_pos.csv, spectrum/), "
-        "then set dataset.root=DIR."
-    )
+class RFID(Release):
+    """The RFID release (NeRF2, set s23) or any folder in its layout.
+
+    Args:
+        root, name, **rest: see `Release`.
+        array: rows, columns and spacing_m of the receiver's array, see `planar_array`; None: the release's.
+        gateway, wavelength_m, normalisation: see `load_rfid`.
+    """
+
+    called = "RFID"
+
+    def __init__(
+        self,
+        root: str | Path | None = None,
+        gateway: str | None = None,
+        wavelength_m: float = WAVELENGTH,
+        array: Mapping[str, Any] | None = None,
+        normalisation: str = "max",
+        name: str = "rfid",
+        **rest: Any,
+    ) -> None:
+        super().__init__(root, name, **rest)
+        self.settings: dict[str, Any] = {
+            "gateway": gateway,
+            "wavelength_m": float(wavelength_m),
+            "array": planar_array(**array) if array else None,
+            "normalisation": str(normalisation),
+        }
+
+    def missing(self) -> str:
+        """See `Release`."""
+        wanted = (
+            "dataset.root is not set" if self.root is None else f"dataset.root={self.root} does not exist"
+        )
+        return (
+            f"{wanted}: the RFID release is NOT on disk. Get it from the NeRF2 project "
+            "(https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, tx_pos.csv, spectrum/), "
+            "then set dataset.root=DIR."
+        )
+
+    def read(self, folder: Path) -> Measurements:
+        """Spectra (S, 90, 360) uint8 of tags that move about a static gateway; stand-ins have no settings."""
+        return load_rfid(folder, **(self.settings if folder == self.root else {}))

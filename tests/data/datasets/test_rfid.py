@@ -5,7 +5,7 @@ import pytest
 import torch
 from poses import boresight_degrees
 
-from gsparc.data.campaigns.rfid import WAVELENGTH, load_rfid, planar_array
+from gsparc.data.datasets.rfid import WAVELENGTH, load_rfid, planar_array
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 

@@ -7,7 +7,6 @@ truth. Every prediction therefore uses a fresh uplink of the same snapshot, if o
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import assemble, check_positions, rounded_rms
+from gsparc.data.datasets.campaign import Release, StandIn, simulated
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
+from gsparc.data.position_encoder import EncoderSettings, encoder_for
 from gsparc.data.schema import Measurements
-
-log = logging.getLogger(__name__)
 
 UPLINK = 26  # tones
 CARRIER_HZ = 2.4e9
@@ -30,15 +29,6 @@ STAND_IN = "argos-sim"
 FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets are rebuilt
 
 Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def describe_missing(root: str | Path | None) -> str:
-    """Why the release is not used, and how to get it."""
-    where = "dataset.root is not set" if root is None else f"{root} is not there"
-    return (
-        f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
-        "csidata.npy and base-station.yml into a folder and set dataset.root=FOLDER."
-    )
 
 
 def load_argos(
@@ -233,3 +223,68 @@ def _true_positions(path: Path, rows: int) -> np.ndarray:
     check_positions(problems, str(path), places, [f"row {i}" for i in range(rows)])
     problems.raise_if_any()
     return places
+
+
+class Argos(Release):
+    """The Argos release or any folder in its layout.
+
+    Args:
+        root, name, **rest: see `Release`.
+        antenna, positions, align: see `load_argos`.
+        encoder: `file` or `folder`, and `EncoderSettings`.
+    """
+
+    called = "Argos"
+
+    def __init__(
+        self,
+        root: str | Path | None = None,
+        antenna: int | str = 0,
+        positions: str | bool = "encoder",
+        align: bool = True,
+        encoder: Mapping[str, Any] | None = None,
+        name: str = "argos",
+        **rest: Any,
+    ) -> None:
+        super().__init__(root, name, **rest)
+        self.antenna, self.align = antenna, bool(align)
+        self.positions = str(positions).lower()  # `true` in YAML is no text
+        given = dict(encoder or {})
+        file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
+        self.encoder = (room, EncoderSettings(**given), file)
+
+    def missing(self) -> str:
+        """See `Release`."""
+        where = "dataset.root is not set" if self.root is None else f"{self.root} is not there"
+        return (
+            f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
+            "csidata.npy and base-station.yml into a folder and set dataset.root=FOLDER."
+        )
+
+    def read(self, folder: Path) -> Measurements:
+        """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
+        encode = encoder_for(*self.encoder)
+        return load_argos(folder, encode, antenna=self.antenna, positions=self.positions, align=self.align)
+
+
+class ArgosSim(Argos):
+    """The simulated stand-in in the Argos layout: `dataset=argos_sim`; arguments as of `Argos`."""
+
+    def __init__(
+        self,
+        stand_in: StandIn,
+        antenna: int | str = 0,
+        positions: str | bool = "encoder",
+        align: bool = True,
+        encoder: Mapping[str, Any] | None = None,
+        name: str = "argos_sim",
+        batch_size: int = 16,
+    ) -> None:
+        super().__init__(
+            None, antenna, positions, align, encoder, name, stand_in=stand_in, batch_size=batch_size
+        )
+
+    def load(self) -> Measurements:
+        """As `Argos.load`, without a word about the release."""
+        assert self.stand_in is not None
+        return simulated(self.stand_in, self.called, self.read)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cities import city, folder
 
-from gsparc.data.campaigns.argos import TONES, aligned, load_argos, published_figures, published_normalisation
+from gsparc.data.datasets.argos import TONES, aligned, load_argos, published_figures, published_normalisation
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 

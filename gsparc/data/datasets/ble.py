@@ -7,8 +7,9 @@ frequency_hz () [Hz]
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from gsparc.data.campaigns.layout import TEXT, Expected, check_layout
+from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
 from gsparc.data.raw import Raw, read_raw, renamed
 
 LAYOUT = {
@@ -35,3 +36,20 @@ def raw_of_ble(path: str | Path) -> Raw:
     check_layout(raw, path, LAYOUT)
     known = Raw({name: raw.arrays[name] for name in LAYOUT if name in raw.arrays})
     return Raw(renamed(known, NAMES).arrays, {**raw.attributes, "layout": "ble"})
+
+
+class BLE(Campaign):
+    """Powers of a beacon at many places, at the sensors of a hall; see `raw_of_ble`.
+
+    Args:
+        file: *.npz.
+        name: of run directories.
+        **rest: see `Campaign`.
+    """
+
+    def __init__(self, file: str | Path, name: str = "ble", **rest: Any) -> None:
+        super().__init__(file, name, **rest)
+
+    def raw(self) -> Raw:
+        """Powers (S, T) of a moving transmitter at T stations."""
+        return raw_of_ble(self.file)

@@ -20,16 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.campaigns.layout import TEXT, Expected, check_layout
+from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
 from gsparc.data.errors import DataError, Problems, shortened
 from gsparc.data.raw import Raw, read_raw
 
 CARRIER_HZ = 462.7e6
 NO_VALUE_DB = -101.0
-WALKER_M, STATION_M = (
-    1.5,
-    10.0,
-)  # above ground: a radio in a hand; a wall or mast, which the release does not say
+# Above ground: a radio in a hand; a wall or mast, which the release does not say.
+WALKER_M, STATION_M = 1.5, 10.0
 STATIONS = "location_coordinates.json"
 LATITUDES = ("tx_x_coord", "tx_lat", "tx_latitude", "latitude", "lat")
 LONGITUDES = ("tx_y_coord", "tx_lon", "tx_lng", "tx_long", "tx_longitude", "longitude", "lon", "lng", "long")
@@ -97,21 +95,13 @@ def _of_npz(raw: Raw, path: Path) -> Raw:
     return Raw({**arrays, **metric}, raw.attributes)
 
 
-def _degrees_of(
-    stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: str | Path
-) -> np.ndarray:
+def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: Path) -> np.ndarray:
     """Latitude and longitude (T, 2) of `stations` (T, 2) [m] by the affine map of rows known in both.
 
     Args:
         places, degrees: (S, 2), the same rows in metres and in degrees.
     """
-    problems = Problems(path)
-    for name, column, most in (("latitude", 0, 90), ("longitude", 1, 180)):
-        with np.errstate(invalid="ignore"):
-            bad = np.flatnonzero(~(np.abs(degrees[:, column]) <= most))
-        rows = (f"row {i} = {degrees[i, column]}" for i in bad)
-        problems.add_rows(f"{path}, {name}", rows, f"expected degrees, at most {most}")
-    problems.raise_if_any()
+    _check_degrees(path, ("latitude", "longitude"), degrees, [f"row {i}" for i in range(len(degrees))])
     middle, mean = places.mean(axis=0), degrees.mean(axis=0)
     turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
     error = 111e3 * np.abs((places - middle) @ turn + mean - degrees).max(axis=1)  # a degree is 111 km
@@ -146,7 +136,8 @@ def _of_csv(path: Path, table: Path) -> Raw:
     numbers = _numbers(path, names, rows, [*(i for i in found if i is not None), *columns.values()])
     degrees, rssi = numbers[:, :2], numbers[:, 2:]
     lines = [f"line {number}" for number, _ in rows]
-    _check_degrees(path, [names[i] for i in found if i is not None], degrees, lines)
+    called = [names[i] for i in found if i is not None]
+    _check_degrees(path, called, degrees, lines, f"; are {called[0]} and {called[1]} swapped?")
     where = np.array(list(places[name] for name in columns))
     rest = [n for n, p in zip(names, plain, strict=True) if n not in columns and p not in TIMES]
     rest = [n for n in rest if names.index(n) not in found]
@@ -203,13 +194,14 @@ def _numbers(
     return values
 
 
-def _check_degrees(path: Path, names: Sequence[str], degrees: np.ndarray, lines: Sequence[str]) -> None:
+def _check_degrees(
+    path: Path, names: Sequence[str], degrees: np.ndarray, rows: Sequence[str], hint: str = ""
+) -> None:
     problems = Problems(path)
     for column, most in ((0, 90), (1, 180)):
         bad = np.flatnonzero(~(np.abs(degrees[:, column]) <= most)).tolist()
-        rows = (f"{lines[i]} = {degrees[i, column]}" for i in bad)
-        hint = f"expected degrees, at most {most}; are {names[0]} and {names[1]} swapped?"
-        problems.add_rows(f"{path}, {names[column]}", rows, hint)
+        found = (f"{rows[i]} = {degrees[i, column]}" for i in bad)
+        problems.add_rows(f"{path}, {names[column]}", found, f"expected degrees, at most {most}{hint}")
     problems.raise_if_any()
 
 
@@ -274,3 +266,29 @@ def _rows_by_name(path: Path, text: str) -> Mapping[str, Any]:
         raise DataError(f"{path}, line 1: expected the columns name, latitude, longitude")
     name, *degrees = keys
     return {str(line[name]): tuple(line[key] for key in degrees) for line in lines}
+
+
+class Powder(Campaign):
+    """Powers of a walking transmitter at fixed stations; see `raw_of_powder`.
+
+    Args:
+        file, station_table, tx_height, station_height: see `raw_of_powder`.
+        name: of run directories.
+        **rest: see `Campaign`.
+    """
+
+    def __init__(
+        self,
+        file: str | Path,
+        station_table: str | Path | None = None,
+        tx_height: float = WALKER_M,
+        station_height: float = STATION_M,
+        name: str = "powder",
+        **rest: Any,
+    ) -> None:
+        super().__init__(file, name, **rest)
+        self.station_table, self.heights = station_table, (tx_height, station_height)
+
+    def raw(self) -> Raw:
+        """Powers (S, T) of a moving transmitter at T stations."""
+        return raw_of_powder(self.file, self.station_table, *self.heights)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw, renamed
@@ -47,3 +48,20 @@ def read_newrf(raw: Raw, path: str | Path) -> Reading:
     if reading.data.site.static_end != "tx":
         raise DataError(f"{path}: rx_pos does not move; expected one transmitter and many receivers", path)
     return reading
+
+
+class NeWRF(DataModule):
+    """One transmitter, many receivers, complex channels.
+
+    Args:
+        file: *.npz.
+        name, batch_size: see `DataModule`.
+    """
+
+    def __init__(self, file: str | Path, name: str = "newrf", batch_size: int = 16) -> None:
+        super().__init__(name, batch_size)
+        self.file = Path(file)
+
+    def load(self) -> Measurements:
+        """Channels (S, 1, K) complex64."""
+        return load_newrf(self.file)

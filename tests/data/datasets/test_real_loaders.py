@@ -23,12 +23,11 @@ from measured import (
 )
 from releases import real
 
-from gsparc.data.campaigns.ble import raw_of_ble
-from gsparc.data.campaigns.netcdf import read_netcdf
-from gsparc.data.campaigns.powder import raw_of_powder
-from gsparc.data.campaigns.techtile import raw_of_techtile
+from gsparc.data.datasets.ble import raw_of_ble
+from gsparc.data.datasets.powder import raw_of_powder
+from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.errors import DataError
-from gsparc.data.raw import read_raw
+from gsparc.data.raw import read_netcdf, read_raw
 
 READERS = {"techtile": raw_of_techtile, "powder": raw_of_powder, "ble": raw_of_ble}
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)

@@ -1,0 +1,198 @@
+"""What campaigns and releases share: arrays are checked, a part is selected, a stand-in takes their place."""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from gsparc.data.assemble import FARTHEST, bad_positions
+from gsparc.data.checks.describe import suspicious_values
+from gsparc.data.datamodule import DataModule
+from gsparc.data.errors import DataError, Problems
+from gsparc.data.own import interpret
+from gsparc.data.raw import Raw
+from gsparc.data.schema import Measurements
+from gsparc.data.selection import Selection, rows_by_station, select, split_stations
+
+log = logging.getLogger(__name__)
+
+
+class Campaign(DataModule):
+    """A published campaign with stations, of which all rows or a part are used.
+
+    Args:
+        file: what `raw` reads.
+        name, batch_size: see `DataModule`.
+        stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
+        level_steps: by station, rows from which it counts as another; see `gsparc.data.selection`.
+    """
+
+    def __init__(
+        self,
+        file: str | Path,
+        name: str,
+        batch_size: int = 16,
+        stations: Sequence[str | int] | None = None,
+        runs: Sequence[str | int] | None = None,
+        min_rssi_db: float | None = None,
+        max_rows: int | None = None,
+        level_steps: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
+        super().__init__(name, batch_size)
+        self.file = Path(file)
+        self.selection = Selection(stations, runs, min_rssi_db, max_rows)
+        self.level_steps = rows_by_station(level_steps or {})
+
+    @abstractmethod
+    def raw(self) -> Raw:
+        """The file's arrays, named as in docs/own-data.md.
+
+        Raises:
+            DataError: bad input.
+        """
+
+    def load(self) -> Measurements:
+        """Read, select and interpret; what is left out and what looks wrong is logged."""
+        raw = self.raw()
+        selected = select(split_stations(raw, self.level_steps, self.file), self.selection, self.file)
+        reading = interpret(selected.raw, self.file)
+        said = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
+        for note in (*said, *selected.notes, *reading.notes):
+            log.warning("%s: %s", self.file, note)
+        for hint in suspicious_values(reading.data):
+            log.warning("%s: units? %s", self.file, hint)
+        return reading.data
+
+
+class StandIn(Protocol):
+    """Simulated measurements in a release's layout, handed to the release's module by the configuration."""
+
+    def folder(self) -> Path:
+        """Where they are; simulated when they are not there yet.
+
+        Raises:
+            ValueError: settings that cannot be simulated.
+        """
+
+
+class Release(DataModule):
+    """A folder of a published release or, where none is named, what stands in for it.
+
+    Args:
+        root: the folder; absent: the stand-in.
+        stand_in: used, loudly, when no root is given.
+        name, batch_size: see `DataModule`.
+    """
+
+    called = ""  # the release, in messages
+
+    def __init__(
+        self, root: str | Path | None, name: str, stand_in: StandIn | None = None, batch_size: int = 16
+    ) -> None:
+        super().__init__(name, batch_size)
+        self.root, self.stand_in = None if root is None else Path(root), stand_in
+
+    @abstractmethod
+    def missing(self) -> str:
+        """Why the release is not used, and how to get it."""
+
+    @abstractmethod
+    def read(self, folder: Path) -> Measurements:
+        """A folder in the release's layout; `DataError` where something is missing or wrong."""
+
+    def load(self) -> Measurements:
+        """The release's measurements, or, loudly, the stand-in's."""
+        if self.root is not None and self.root.exists():
+            return self.read(self.root)
+        if self.root is not None or self.stand_in is None:
+            raise DataError(self.missing())
+        log.warning("%s Using the SIMULATED stand-in %s-sim instead.", self.missing(), self.called.lower())
+        return simulated(self.stand_in, self.called, self.read)
+
+
+def simulated(stand_in: StandIn, called: str, read: Callable[[Path], Measurements]) -> Measurements:
+    """The measurements of what stands in for the release `called`."""
+    folder = stand_in.folder()
+    layout = f"{called.lower()}-sim: SIMULATED data in the layout of the {called} release"
+    log.warning("%s, at %s", layout, folder)
+    return read(folder)
+
+
+REAL, COMPLEX, FLAGS, TEXT, LABELS = "iuf", "c", "biuf", "US", "USiu"  # kinds of NumPy's dtypes
+IN_WORDS = {
+    REAL: "real numbers",
+    COMPLEX: "complex numbers",
+    FLAGS: "True and False",
+    TEXT: "text",
+    LABELS: "text or whole numbers",
+}
+
+
+@dataclass(frozen=True)
+class Expected:
+    """One array of a layout.
+
+    Attributes:
+        shape: per axis a size, or a letter that stands for the same size in all arrays.
+        kinds: allowed kinds of NumPy's dtypes, one of those above.
+        place: whether rows are coordinates [m], all of which must be finite and on Earth.
+        optional: whether the array may be absent.
+    """
+
+    shape: tuple[str | int, ...]
+    kinds: str = REAL
+    place: bool = False
+    optional: bool = False
+
+
+def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> None:
+    """Refuse arrays that do not fit `layout`; a letter's size is that of the first array that has it.
+
+    Raises:
+        DataError: all that is missing, of another shape or type, or no place, with array and row.
+    """
+    problems = Problems(source)
+    sizes: dict[str, tuple[int, str]] = {}
+    for name, expected in layout.items():
+        where, array = f"{source}, {name}", raw.arrays.get(name)
+        if array is None:
+            if not expected.optional:
+                problems.add(where, f"missing; expected {IN_WORDS[expected.kinds]} {_text(expected.shape)}")
+        elif array.dtype.kind not in expected.kinds:
+            problems.add(where, f"expected {IN_WORDS[expected.kinds]}, found dtype {array.dtype}")
+        elif not _fits(array.shape, expected.shape, sizes):
+            problems.add(where, _misfit(array.shape, expected.shape, sizes))
+        else:
+            for letter, size in zip(expected.shape, array.shape, strict=True):
+                if isinstance(letter, str):
+                    sizes.setdefault(letter, (size, name))
+            if expected.place:
+                bad = bad_positions(array)
+                rows = (f"row {i} = ({', '.join(f'{x:g}' for x in array[i])})" for i in bad)
+                what = f"expected finite coordinates in metres, none beyond {FARTHEST:.0e}"
+                problems.add_rows(where, rows, what)
+    problems.raise_if_any()
+
+
+def _fits(found: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> bool:
+    if len(found) != len(shape):
+        return False
+    wanted = (sizes.get(axis, (None,))[0] if isinstance(axis, str) else axis for axis in shape)
+    return all(want is None or want == got for want, got in zip(wanted, found, strict=True))
+
+
+def _misfit(
+    found: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]
+) -> str:
+    known = [f"{a} = {sizes[a][0]} as in {sizes[a][1]}" for a in shape if isinstance(a, str) and a in sizes]
+    here = f" with {', '.join(known)}" if known else ""
+    turned = len(found) > 1 and found != found[::-1] and _fits(found[::-1], shape, sizes)
+    return f"expected shape {_text(shape)}{here}, found {found}{'; transposed?' if turned else ''}"
+
+
+def _text(shape: tuple[str | int, ...]) -> str:
+    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"

@@ -1,0 +1,122 @@
+"""Measurements of one's own, `dataset=own`, and whatever file or folder `gsparc check` is given."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gsparc.data.datasets.ble import raw_of_ble
+from gsparc.data.datasets.campaign import Campaign
+from gsparc.data.datasets.newrf import is_newrf, read_newrf
+from gsparc.data.datasets.powder import raw_of_powder
+from gsparc.data.datasets.rfid import load_rfid
+from gsparc.data.datasets.techtile import raw_of_techtile
+from gsparc.data.errors import DataError
+from gsparc.data.own import Reading, interpret
+from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
+from gsparc.data.tables import is_table
+
+log = logging.getLogger(__name__)
+
+
+class Own(Campaign):
+    """A file of the schema in docs/own-data.md, or a table; suspicious units are warned of.
+
+    Args:
+        file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
+        name: of run directories.
+        columns: of a table, by quantity, where the guess from their heads will not do.
+        stations_file: of a table, a second one that lists the stations.
+        **rest: see `Campaign`.
+    """
+
+    def __init__(
+        self,
+        file: str | Path,
+        name: str = "own",
+        columns: Mapping[str, object] | None = None,
+        stations_file: str | Path | None = None,
+        **rest: Any,
+    ) -> None:
+        super().__init__(file, name, **rest)
+        self.columns, self.stations_file = columns or {}, stations_file
+
+    def raw(self) -> Raw:
+        """The file's arrays, or the table's under the schema's names."""
+        raw, notes = raw_of(self.file, self.columns, self.stations_file)
+        campaign = campaign_of(raw)
+        if campaign is not None:
+            raise DataError(f"{self.file}: this is a file of dataset={campaign}; say dataset={campaign}")
+        for note in notes:
+            log.info("%s: %s", self.file, note)
+        return raw
+
+
+LOADERS: dict[str, Callable[[Path], Raw]] = {
+    "techtile": raw_of_techtile,
+    "powder": raw_of_powder,
+    "ble": raw_of_ble,
+}
+PLANE = 2  # coordinates of places in POWDER's files
+
+
+def campaign_of(raw: Raw) -> str | None:
+    """The choice of conf/dataset that reads a file with these arrays; None where it is of none of them."""
+    held = raw.arrays
+    if {"rx_antenna_position", "csi"} <= set(held):
+        return "techtile"
+    if {"mobile_position", "rssi_db"} <= set(held):
+        flat = held["mobile_position"].ndim == 2 and held["mobile_position"].shape[1] == PLANE
+        return "powder" if flat else "ble"
+    return None
+
+
+def read_any(
+    path: str | Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+) -> Reading:
+    """Read a folder of the RFID release, a file of another campaign, one of one's own, or a table.
+
+    Args:
+        path: folder or file.
+        columns, stations_file: of a table, see `Own`.
+
+    Raises:
+        DataError: it is none of them, or something in it is wrong.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
+            raise DataError(
+                f"{path}: a folder without gateway_info.yml, tx_pos.csv and spectrum/ (the RFID release's "
+                "layout); for measurements of your own give the npz or HDF5 file"
+            )
+        return Reading(load_rfid(path), ())
+    if path.suffix.lower() in NETCDF_SUFFIXES:  # NetCDF, as Techtile's release is
+        return interpret(LOADERS["techtile"](path), path)
+    raw, notes = raw_of(path, columns, stations_file)
+    campaign = campaign_of(raw)
+    if campaign is not None:
+        raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
+    reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+    return Reading(reading.data, (*notes, *reading.notes))
+
+
+def raw_of(
+    path: Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+) -> tuple[Raw, tuple[str, ...]]:
+    """The arrays of a file of the schema, or of a table, and how its columns were understood.
+
+    Raises:
+        DataError: not readable, or columns that nothing can be made of.
+    """
+    if not is_table(path):
+        told = any(value is not None for value in (columns or {}).values())
+        for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
+            raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
+        return read_raw(path), ()
+    from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
+
+    found = understand_table(path, columns or {}, stations_file)
+    return found.raw, found.notes

@@ -1,1 +1,0 @@
-"""Learned positions: a measured uplink to three coordinates, where no user positions were recorded."""
