@@ -10,8 +10,7 @@ import torch
 
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Site
-from gsparc.maps.levels import predicted
-from gsparc.maps.making import CHUNK, ends_of
+from gsparc.maps.making import levels_at
 from gsparc.maps.promise import Promise
 from gsparc.models.method import HasProcess
 from gsparc.models.powers.settings import fit_powers
@@ -126,8 +125,7 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     if own.shape[1] == 6:
         raise DataError(f"{asking.method.name} states no covariance; plan for models of one moving end")
     world = own + asking.site.origin
-    said = asking.predict(**{asking.site.moving_end: world})
-    level, _ = predicted(said, asking.site.kind)
+    level, _ = levels_at(asking, world)
     good = np.isfinite(level)
     rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
     return fit_powers(rows, asking.site, "constant")[0].exact()
@@ -163,10 +161,7 @@ def _scaled(
 ) -> np.ndarray:
     """Expected squared errors of held-out blocks over the process's variance, (S,), within `BETWEEN`."""
     calibration = promise.calibration()
-    spread = np.concatenate([
-        predicted(asking.predict(**ends_of(asking.site, part, other)), asking.site.kind)[1]
-        for part in np.split(places, range(CHUNK, len(places), CHUNK))
-    ])  # fmt: skip
+    spread = levels_at(asking, places, other)[1]
     far = promise.distance(local[:, -promise.known.shape[1] :], number)
     inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
     error = calibration.expected_error(spread, inside, np.full(len(far), number))

@@ -205,16 +205,14 @@ def _asker(
     predictor: Predictor, grid: Grid, other: Sequence[float] | None, report: Callable[[int], None]
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Level and deviation (n, 2) [dB] of cells (n,), in chunks, as many at once as torch has threads."""
-    site, workers = predictor.site, torch.get_num_threads()
 
     def one(cells: np.ndarray) -> np.ndarray:
-        said = predictor.predict(**ends_of(site, grid.places(cells), other))
-        return np.column_stack(predicted(said, site.kind))
+        return np.column_stack(levels_at(predictor, grid.places(cells), other))
 
     def ask(cells: np.ndarray) -> np.ndarray:
         parts = [cells[start : start + CHUNK] for start in range(0, len(cells), CHUNK)]
         found = []
-        pool = ThreadPoolExecutor(workers)
+        pool = ThreadPoolExecutor(torch.get_num_threads())
         try:
             for part, values in zip(parts, pool.map(one, parts), strict=True):
                 found.append(values)
@@ -224,6 +222,18 @@ def _asker(
         return np.concatenate(found) if found else np.zeros((0, 2))
 
     return ask
+
+
+def levels_at(
+    predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
+    parts = [
+        predicted(predictor.predict(**ends_of(predictor.site, part, other)), predictor.site.kind)
+        for part in np.split(places, range(CHUNK, len(places), CHUNK))
+    ]
+    level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return level, spread
 
 
 def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:
