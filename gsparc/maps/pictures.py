@@ -22,6 +22,7 @@ from gsparc.evaluation.from_above import (
     legend_below,
     scale_bar,
 )
+from gsparc.maps.area import Grid
 from gsparc.maps.field_map import REFUSED, FieldMap
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.placing import Placing
@@ -122,25 +123,20 @@ def draw_layer(
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
     axis = axes[0, 0]
-    if plan is not None:
-        draw_plan(axis, plan)
     nothing = np.where(found.refused, 1.0, np.nan)
     grey = ListedColormap(["0.82"])
     axis.imshow(nothing, origin="lower", extent=found.grid.extent, cmap=grey, zorder=1, alpha=0.6)
-    how: dict[str, Any] = {"origin": "lower", "extent": found.grid.extent, "interpolation": "nearest"}
-    how |= {"alpha": 1.0 if plan is None else 0.65, "zorder": 2}
     if layer.words:
         count = len(layer.words)
-        colours = ListedColormap(class_colours(count))
-        drawn = axis.imshow(
-            layer.values, cmap=colours, norm=BoundaryNorm(np.arange(count + 1) - 0.5, count), **how
+        norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
+        drawn = _cells(
+            axis, found.grid, layer.values, plan, cmap=ListedColormap(class_colours(count)), norm=norm
         )
         bar = figure.colorbar(drawn, ax=axis, ticks=np.arange(count), shrink=0.85, pad=0.02)
         bar.ax.set_yticklabels(layer.words)
     else:
-        lowest, highest = layer.range()
-        how |= {"vmin": lowest, "vmax": highest}
-        drawn = axis.imshow(layer.values, cmap=layer.colours, **how)
+        limits = dict(zip(("vmin", "vmax"), layer.range(), strict=True))
+        drawn = _cells(axis, found.grid, layer.values, plan, cmap=layer.colours, **limits)
         ends = "neither" if layer.limits else "both"
         bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends)
     bar.set_label(layer.label)
@@ -164,6 +160,14 @@ def _hatch(axis: Any, found: FieldMap, cells: np.ndarray, why: str) -> None:
         drawn = axis.contourf(found.grid.x, found.grid.y, cells.astype(float), zorder=2.5, **how)
         drawn.set(edgecolor="black", linewidth=0.0)
         axis.fill([], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why)
+
+
+def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **colours: Any) -> Any:
+    """Values (ny, nx) of cells, through which a plan beneath them is seen."""
+    if plan is not None:
+        draw_plan(axis, plan)
+    how = {"origin": "lower", "extent": grid.extent, "interpolation": "nearest", "zorder": 2}
+    return axis.imshow(values, alpha=1.0 if plan is None else 0.65, **how, **colours)
 
 
 def draw_plan(axis: Any, plan: FloorPlan) -> None:
@@ -205,14 +209,9 @@ def draw_plan_picture(
     errors = np.concatenate([found.error_before, found.error_after])
     limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
     for axis, values, title in ((before, found.error_before, "before"), (after, found.error_after, "after")):
-        if plan is not None:
-            draw_plan(axis, plan)
         image = np.full(found.grid.shape, np.nan)
         image[found.grid.inside] = values
-        drawn = axis.imshow(
-            image, origin="lower", extent=found.grid.extent, cmap="cividis", zorder=1,
-            alpha=1 if plan is None else 0.65, **limits,
-        )  # fmt: skip
+        drawn = _cells(axis, found.grid, image, plan, cmap="cividis", **limits)
         bounded(axis, (left, low), (right, high), ylabel="", title=title)
         scale_bar(axis)
     if promise is not None and predictor is not None:

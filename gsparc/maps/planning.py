@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
+from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.covariance import ErrorCovariance, before_measuring, unknown_of
@@ -257,10 +258,7 @@ def _mean_db(error: np.ndarray, wanted: np.ndarray) -> float:
 
 
 def _start(given: Sequence[float]) -> np.ndarray:
-    try:
-        place = np.array([float(value) for value in given])
-    except (TypeError, ValueError):
-        place = np.zeros(0)
-    if len(place) not in (2, 3) or not np.isfinite(place).all():
+    place = finite(given)
+    if place.shape not in ((2,), (3,)):
         raise DataError(f"start={given}: [x,y] in metres is needed")
     return place[:2]

@@ -52,11 +52,8 @@ def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
     rng = np.random.default_rng([seed, 1])
     centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
     half = np.array([36.0, 25.0]) + rng.uniform(-4.0, 4.0, (9, 2))
-    buildings, none, base = (
-        np.stack([centres - half, centres + half], 1),
-        np.zeros(0),
-        np.array([-50.0, 37, 9]),
-    )
+    buildings, none = np.stack([centres - half, centres + half], 1), np.zeros(0)
+    base = np.array([-50.0, 37, 9])
     streets = Streets(buildings, -rng.uniform(0.7, 0.9, 9), np.zeros((0, 3)), none, none, base)
     places = rng.uniform(1.5 * LOWER, 1.5 * UPPER, (max(400, 6 * scatterers), 2))
     places = places[streets.open(places)][:scatterers]

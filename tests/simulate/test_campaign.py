@@ -33,8 +33,7 @@ from gsparc.simulate.report import choice_table, figures, verdict
 from gsparc.simulate.scenes.build import SceneSettings, build
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.shards import ROWS, Shards
-from gsparc.simulate.shoebox import Room, trace
-from gsparc.simulate.shoebox_engine import ShoeboxEngine
+from gsparc.simulate.shoebox import Room, ShoeboxEngine, trace
 from gsparc.simulate.spectrum import SpectrumSettings
 
 SCENE = SceneSettings(

@@ -83,9 +83,8 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
     shown = ""
     if len(viewed.stations) > 1:
         shown = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
-        shown += (
-            "; station=NAME shows another" if len(names) < len(viewed.stations) else ", one after another"
-        )
+        some = len(names) < len(viewed.stations)
+        shown += "; station=NAME shows another" if some else ", one after another"
     said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=shown)]
     title = scene.title if len(names) == 1 else scene.title.removesuffix(f": {names[0]}")
     return recorder.as_html(), _side_panel(replace(scene, title=title), said, legends)
