@@ -28,8 +28,8 @@ from gsparc.simulate.engine import HasTriangles
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
-from gsparc.simulate.scenes.mesh import write_mesh
 from gsparc.simulate.scenes.shipped import shipped
+from gsparc.simulate.scenes.solid import write_mesh
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
 

@@ -119,9 +119,14 @@ def place_next(
     _refuse_unheard(predictor, candidates[0], cells[:1])
     left, right, south, north = grid.extent
     now = map_of(
-        predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
-        threshold_db=threshold_db, promise=promise, dry=dry,
-    )  # fmt: skip
+        predictor,
+        [left, south, right, north],
+        height_m=grid.height,
+        step_m=grid.step,
+        threshold_db=threshold_db,
+        promise=promise,
+        dry=dry,
+    )
     flat = grid.inside.reshape(-1)
     old_power = np.nan_to_num(now.strongest(now.power_db).reshape(-1)[flat], nan=-np.inf)
     old_outage = np.nan_to_num(now.outage.reshape(-1)[flat], nan=1.0)

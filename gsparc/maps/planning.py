@@ -139,13 +139,13 @@ def plan_next(
         unknown = unknown_of(predictor, places, names, promise, other_end)
     begin = None if start is None else _start(start)
     tour = Tour(begin, route_m)
+    first = _expected(unknown, wanted)
     before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
     after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     walk = route or route_m is not None
     order = tour.order() if walk else np.arange(len(chosen))
     picked = places[chosen] if len(chosen) else np.zeros((0, 3))
-    first = _mean_db(before, wanted)
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
         picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
@@ -251,10 +251,6 @@ def greedy(
 
 def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
     return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
-
-
-def _mean_db(error: np.ndarray, wanted: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(error[wanted] ** 2)))
 
 
 def _start(given: Sequence[float]) -> np.ndarray:

@@ -75,12 +75,10 @@ class Session:
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
-        self.made = {  # layers of a map by the names that they are chosen by
-            f"map: {one.name.replace('_', ' ')}": (
-                grid, one.values, Legend(one.label, *one.range(), one.colours)
-            )
-            for grid, one in view.layers
-        }  # fmt: skip
+        self.made: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # layers of a map, as they are chosen
+        for grid, one in view.layers:
+            legend = Legend(one.label, *one.range(), one.colours)
+            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, legend
         self._draw_still()
         first_view(client.camera)
         self._panel()
