@@ -10,25 +10,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 SOURCE = {".py", ".cpp", ".h", ".cu", ".cuh", ".pyi", ".js", ".css", ".html", ".svg", ".sh"}
-BLANK = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENDMARKER,
-}
+BLANK = {getattr(tokenize, name) for name in ("COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER")}
 
 
 def code(text: str) -> int:
     """Lines of Python that hold anything but docstrings and comments."""
     documented: set[int] = set()
     for node in ast.walk(ast.parse(text)):
-        if (
-            isinstance(node, ast.Expr)
-            and isinstance(node.value, ast.Constant)
-            and node.value.value is not None
-        ):
+        alone = node.value if isinstance(node, ast.Expr) else None
+        if isinstance(alone, ast.Constant) and alone.value is not None:
             documented |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     used: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
@@ -19,24 +18,21 @@ PANELS = {
         ("rmse", "rmse [dB], bars of two standard errors"),
     ),
 }  # fmt: skip
-Line = dict[str, str]
 
 
-def slope(lines: Sequence[Line], figure: str) -> float:
+def slope(lines: pd.DataFrame, figure: str) -> float:
     """Of a figure against rows, both as logarithms, least squares from `MANY` rows on; NaN of one point."""
-    points = [(float(one["rows"]), float(one[figure])) for one in lines if float(one["rows"]) >= MANY]
-    if len(points) < 2:
+    many = lines[lines["rows"] >= MANY]
+    if len(many) < 2:
         return float("nan")
-    rows, values = np.log10(np.array(points)).T
-    return float(np.polyfit(rows, values, 1)[0])
+    return float(np.polyfit(np.log10(many["rows"]), np.log10(many[figure]), 1)[0])
 
 
 def draw(tables: Path, pictures: Path) -> None:
     """A picture for each source that was measured."""
     for kind, shown in PANELS.items():
-        lines = _read(tables / f"{kind}.csv")
-        for source in dict.fromkeys(one["source"] for one in lines):
-            own = [one for one in lines if one["source"] == source]
+        path = tables / f"{kind}.csv"
+        for source, own in pd.read_csv(path).groupby("source", sort=False) if path.exists() else ():
             figure, places = panels(9.0, 6.4, 2, 2)
             for place, (quantity, title) in zip(places.flat, shown, strict=True):
                 _curves(place, own, quantity)
@@ -48,19 +44,10 @@ def draw(tables: Path, pictures: Path) -> None:
             save(figure, pictures / f"scale-{source}.png")
 
 
-def _read(path: Path) -> list[Line]:
-    if not path.exists():
-        return []
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def _curves(place: Axes, lines: Sequence[Line], quantity: str) -> None:
+def _curves(place: Axes, lines: pd.DataFrame, quantity: str) -> None:
     """A figure of every method against rows; slopes of seconds stand in the legend."""
-    for name in dict.fromkeys(one["method"] for one in lines):
-        own = sorted((one for one in lines if one["method"] == name), key=lambda one: int(one["rows"]))
-        counts, values = (np.array([float(one[key]) for one in own]) for key in ("rows", quantity))
-        errors = [2 * float(one["rmse_error"]) for one in own] if quantity == "rmse" else None
+    for name, own in lines.sort_values("rows", kind="stable").groupby("method", sort=False):
+        errors = 2 * own["rmse_error"] if quantity == "rmse" else None
         found = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
         label = name if np.isnan(found) else f"{name}, slope {found:.2f}"
-        place.errorbar(counts, values, errors, label=label, capsize=2, **look(name).marked)
+        place.errorbar(own["rows"], own[quantity], errors, label=label, capsize=2, **look(name).marked)

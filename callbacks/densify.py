@@ -11,12 +11,12 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from gsparc.callbacks.events import noted
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 from gsparc.training.processes import largest, total
 from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
+from gsparc.training.tracking import noted
 
 log = logging.getLogger(__name__)
 

@@ -10,9 +10,9 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
-from gsparc.callbacks.events import noted
 from gsparc.data.limits import SHARE, Checked, setting
 from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
+from gsparc.training.tracking import noted
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 @functools.cache
 def kernels() -> Any:
-    """The compiled CPU kernels, or None in an install without a compiler."""
+    """The compiled kernels, with the constants of csrc/layout.h; None in an install without a compiler."""
     try:
         from gsparc.ops import _native
     except ImportError:

@@ -185,14 +185,9 @@ def kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
     return mark
 
 
-def layout() -> Any:
-    """The compiled kernels' module, for the constants of csrc/layout.h that all devices share."""
-    return built.kernels()
-
-
 def strips(height: int) -> int:
     """Strips of an image so many rows high."""
-    return -(-height // layout().STRIP_ROWS)
+    return -(-height // built.kernels().STRIP_ROWS)
 
 
 def empty_like(tensors: Any) -> Any:
@@ -211,7 +206,7 @@ def plan_tensors(
     """Empty tensors of a plan as the CPU lays it out, then of means2d, radii and visible."""
     n = means.shape[0]
     buffers = Buffers(
-        records=means.new_empty(poses, n, layout().RECORD),
+        records=means.new_empty(poses, n, built.kernels().RECORD),
         boxes=means.new_empty(poses, n, 4, dtype=torch.int32),
         order=means.new_empty(poses, n, dtype=torch.int32),
         shown=means.new_empty(poses, dtype=torch.int32),

@@ -54,13 +54,25 @@ def make_plan(
         BackendUnavailable: if the backend was not built or does not serve this device.
     """
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
+    optics = Optics(projection, low_pass, compensate, near, cutoff)
+    return _plan(gaussians, ids, pose, grid, optics, backend)
+
+
+def _plan(
+    gaussians: Gaussians,
+    ids: Tensor | None,
+    pose: Pose,
+    grid: SphereGrid,
+    optics: Optics,
+    backend: str | None,
+) -> Plan:
+    """`make_plan` of Gaussians whose shapes agree."""
     pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
     validation.transforms(gaussians, pose, pose_trained)
-    chosen = backends.choose(backend, means.device)
-    optics = Optics(projection, low_pass, compensate, near, cutoff)
+    chosen = backends.choose(backend, gaussians.means.device)
     with torch.no_grad() if torch.is_grad_enabled() else nullcontext():
         still = Gaussians._make(None if tensor is None else tensor.detach() for tensor in gaussians)
-        poses = validation.poses(pose, means)
+        poses = validation.poses(pose, gaussians.means)
         plan = chosen.make_plan(validation.strongest(still), ids, poses, grid, optics)
     return replace(plan, pose_trained=True) if pose_trained else plan
 
@@ -142,23 +154,13 @@ def rasterize(
     chosen = backends.choose(backend, means.device)
     at_once = getattr(chosen, "rasterize", None)
     given = (means, quats, scales, opacities, extinctions, ids, features, *vars(pose).values())
+    gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
+    optics = Optics(projection, low_pass, compensate, near, cutoff)
     if at_once is not None and unwatched(given):
-        gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
-        optics = Optics(projection, low_pass, compensate, near, cutoff)
         poses = validation.poses(pose, means)
         values = validation.features(features, means, poses)
         return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))
-    plan = make_plan(
-        *(means, quats, scales, opacities, pose, grid),
-        projection=projection,
-        low_pass=low_pass,
-        compensate=compensate,
-        near=near,
-        cutoff=cutoff,
-        extinctions=extinctions,
-        ids=ids,
-        backend=backend,
-    )
+    plan = _plan(gaussians, ids, pose, grid, optics, backend)
     return composite(plan, means, quats, scales, opacities, features, extinctions=extinctions)
 
 

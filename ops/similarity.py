@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import built, calls
-from gsparc.ops.operators import kernel, layout, operator
+from gsparc.ops.operators import kernel, operator
 from gsparc.ops.transforms import beyond_kernels
 
 
@@ -59,7 +59,7 @@ def _cuda(
     slope: bool,
 ) -> tuple[Tensor, Tensor]:
     half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
-    radius, known = len(half) - 1, layout()
+    radius, known = len(half) - 1, built.kernels()
     if radius > known.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
         most = 2 * known.MOST_RADIUS + 1
         raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")

@@ -15,11 +15,11 @@ from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
+from gsparc.commands import simulate_pictures as pictures
 from gsparc.commands.output import run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import open_console
-from gsparc.simulate import pictures
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import Effects
@@ -28,8 +28,8 @@ from gsparc.simulate.engine import HasTriangles
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
-from gsparc.simulate.scenes.mesh import write_mesh
 from gsparc.simulate.scenes.shipped import shipped
+from gsparc.simulate.scenes.solid import write_mesh
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
 

@@ -15,6 +15,7 @@ from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
+from gsparc.data.limits import finite
 from gsparc.data.walls import read_walls
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.maps.field_map import FieldMap
@@ -91,11 +92,8 @@ def view_of(config: DictConfig, settings: dict[str, Any]) -> SiteView:
 def _place(name: str, given: Any) -> np.ndarray | None:
     if given is None:
         return None
-    try:
-        place = np.array([float(value) for value in given])
-    except (TypeError, ValueError):
-        place = np.zeros(0)
-    if place.shape != (3,) or not np.isfinite(place).all():
+    place = finite(given)
+    if place.shape != (3,):
         raise DataError(f"{name}={given}: three finite numbers [m] are needed")
     return place
 

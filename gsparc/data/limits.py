@@ -14,6 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 
 class SettingError(ValueError):
     """A setting that cannot be; the text begins with its name, an equals sign and the value."""
@@ -80,6 +82,15 @@ SHARE = number(0, 1, open_low=True, open_high=True)
 
 def _real(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def finite(given: Any) -> np.ndarray:
+    """Numbers as float64 in the shape in which they were given; (0,) where one of them is not finite."""
+    try:
+        found = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.zeros(0)
+    return found if np.isfinite(found).all() else np.zeros(0)
 
 
 def setting(default: Any, limit: Limit) -> Any:

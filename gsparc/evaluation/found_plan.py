@@ -14,6 +14,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.from_above import bounded, draw_stations, legend_below
 from gsparc.evaluation.site_plan import still_ends
 
 INCHES = 6.5  # longer side of the map
@@ -51,10 +52,9 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
         )
     level = _draw_planes(axis, objects.planes, origin, low, high)
     if len(ends):
-        axis.plot(*ends.T, "k^", markersize=9, markeredgecolor="white", linestyle="", label="ends that stand")
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    axis.ticklabel_format(useOffset=False, style="plain")
-    figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
+        draw_stations(axis, ends, "ends that stand")
+    bounded(axis, low, high)
+    legend_below(figure)
     title = f"{data.site.name}: what the field found"
     figure.suptitle(title if not level else f"{title}\n{level}", fontsize="medium")
     save(figure, path)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
 from gsparc.data.checks.describe import held_out, neighbours, places_of, side_of_squares
@@ -18,13 +17,13 @@ from gsparc.data.checks.outliers import outliers, too_far
 from gsparc.data.checks.plausibility import LinkLevels, wild_of
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.from_above import OUTLINE, annotate, bounded, draw_stations, legend_below
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
 MOST_MARKS = 8  # suspicious places that are named
 INCHES = 6.5  # longer side of the map
 PLAIN = ("receiver", "transmitter")  # in the legend
-OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
 @dataclass(frozen=True)
@@ -126,15 +125,13 @@ def draw_site(
         for one, t in zip(axes[:, 1], jumping, strict=True):
             _draw_level(one, levels, t, [step for u, step in steps if u == t], data.site.level_unit)
     _draw_map(axis, data, found, low, high, jumping)
-    legend = figure.legend(loc="outside lower left", ncols=4, fontsize="small", frameon=False)
+    legend = legend_below(figure, 4)
     mark: Any
     for mark, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
         if text.get_text() in PLAIN:  # whose colours and sizes are those of the first place
             mark.set_array(None)
             mark.set_color("0.4")
             mark.set_sizes([25])
-    engine: Any = figure.get_layout_engine()
-    engine.set(w_pad=0.12, h_pad=0.08)  # axes of equal scales take more than their share
     figure.suptitle(_title(data, found))
     save(figure, path)
 
@@ -197,8 +194,7 @@ def _draw_map(
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}
         axis.scatter(*ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how)
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", **_labels(data))
-    axis.ticklabel_format(useOffset=False, style="plain")
+    bounded(axis, low, high, **_labels(data))
     _draw_stations(axis, data, jumping)
     _draw_suspicious(axis, found, low, high)
 
@@ -215,15 +211,14 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
         return
     what = "transmitter" if site.static_end == "tx" else "receiver"
     label = f"the {what}" if len(place) == 1 else f"{len(place)} stations ({what}s)"
-    how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}
-    axis.plot(*place.T, "k^", label=label, **how)
+    draw_stations(axis, place, label, zorder=2)
     if jumping:
-        axis.plot(*place[list(jumping)].T, "^", color="red", label="its level jumps", **how)
+        draw_stations(axis, place[list(jumping)], "its level jumps", zorder=2, color="red")
     if site.stations is None or len(place) > NAMED:
         return
     for number, (where, name) in enumerate(zip(place, site.stations.name, strict=True)):
         if np.isfinite(where).all():
-            _annotate(axis, name, where, "red" if number in jumping else "black")
+            annotate(axis, name, where, "red" if number in jumping else "black")
 
 
 def _draw_suspicious(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
@@ -240,25 +235,10 @@ def _draw_suspicious(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray)
             *edge.T, c="red", marker="x", s=60, zorder=3, label=f"far outside, at the edge ({len(far)})"
         )
         for row, where in zip(far[:MOST_MARKS], edge, strict=False):
-            _annotate(
-                axis,
-                f"{found.rows[row]} at ({', '.join(f'{v:.4g}' for v in found.place[row])})",
-                where,
-                "red",
-            )
+            at = ", ".join(f"{v:.4g}" for v in found.place[row])
+            annotate(axis, f"{found.rows[row]} at ({at})", where, "red")
     for row in near[:MOST_MARKS]:
-        _annotate(axis, found.rows[row], found.place[row], "red", above=False)
-
-
-def _annotate(axis: Any, text: str, where: np.ndarray, colour: str, above: bool = True) -> None:
-    """Write beside a point: above to its right, or below to its left, where the map does not end there."""
-    low, high = axis.get_xlim()
-    left = where[0] > low + (0.75 if above else 0.25) * (high - low)
-    note = axis.annotate(
-        text, where, xytext=(-7 if left else 7, 5 if above else -12), textcoords="offset points",
-        ha="right" if left else "left", fontsize="small", color=colour, path_effects=OUTLINE, zorder=4,
-    )  # fmt: skip
-    note.set_in_layout(False)
+        annotate(axis, found.rows[row], found.place[row], "red", above=False)
 
 
 def _labels(data: Measurements) -> dict[str, str]:

@@ -13,6 +13,7 @@ from matplotlib.path import Path as Outline
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
+from gsparc.data.limits import finite
 from gsparc.data.schema import Site
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.geojson import read_shapes
@@ -136,11 +137,8 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
 
 
 def _rectangle(area: Any) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        corners = np.array([float(value) for value in area])
-    except (TypeError, ValueError):
-        corners = np.zeros(0)
-    if corners.shape != (4,) or not np.isfinite(corners).all():
+    corners = finite(area)
+    if corners.shape != (4,):
         raise DataError(f"area={_as_text(area)}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
     if np.abs(corners).max() > FARTHEST:
         raise DataError(f"area={_as_text(area)}: {np.abs(corners).max():.3g} is no coordinate in metres")

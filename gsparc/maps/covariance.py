@@ -10,8 +10,7 @@ import torch
 
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Site
-from gsparc.maps.levels import predicted
-from gsparc.maps.making import CHUNK, ends_of
+from gsparc.maps.making import levels_at
 from gsparc.maps.promise import Promise
 from gsparc.models.method import HasProcess
 from gsparc.models.powers.settings import fit_powers
@@ -85,8 +84,14 @@ def unknown_of(
         covariance = posterior(process, local)
         noise = process.kernel.amplitude * process.kernel.noise
         weight = np.ones(len(places))
-        if promise is not None:
-            weight = _scaled(asking, promise, places, local, number, covariance, noise, other_end)
+        if promise is not None:  # expected squared errors of held-out blocks over the process's variance
+            calibration = promise.calibration()
+            spread = levels_at(asking, places, other_end)[1]
+            far = promise.distance(local[:, -promise.known.shape[1] :], number)
+            inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
+            error = calibration.expected_error(spread, inside, np.full(len(far), number))
+            ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
+            weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
         found.append(ErrorCovariance(covariance, noise, weight))
     return found
 
@@ -126,8 +131,7 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     if own.shape[1] == 6:
         raise DataError(f"{asking.method.name} states no covariance; plan for models of one moving end")
     world = own + asking.site.origin
-    said = asking.predict(**{asking.site.moving_end: world})
-    level, _ = predicted(said, asking.site.kind)
+    level, _ = levels_at(asking, world)
     good = np.isfinite(level)
     rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
     return fit_powers(rows, asking.site, "constant")[0].exact()
@@ -149,26 +153,3 @@ def _queries(asking: Predictor, places: np.ndarray, other: Sequence[float] | Non
     if site.static_end == "rx":
         both = {"tx": local, "rx": np.broadcast_to(still, local.shape)}
     return np.hstack([both["tx"], both["rx"]])
-
-
-def _scaled(
-    asking: Predictor,
-    promise: Promise,
-    places: np.ndarray,
-    local: np.ndarray,
-    number: int,
-    posterior: np.ndarray,
-    noise: float,
-    other: Sequence[float] | None,
-) -> np.ndarray:
-    """Expected squared errors of held-out blocks over the process's variance, (S,), within `BETWEEN`."""
-    calibration = promise.calibration()
-    spread = np.concatenate([
-        predicted(asking.predict(**ends_of(asking.site, part, other)), asking.site.kind)[1]
-        for part in np.split(places, range(CHUNK, len(places), CHUNK))
-    ])  # fmt: skip
-    far = promise.distance(local[:, -promise.known.shape[1] :], number)
-    inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
-    error = calibration.expected_error(spread, inside, np.full(len(far), number))
-    ratio = error**2 / (np.maximum(posterior.diagonal(), 0) + noise)
-    return np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)

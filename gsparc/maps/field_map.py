@@ -104,20 +104,14 @@ class FieldMap:
             step = float(x[1] - x[0]) if len(x) > 1 else float(y[1] - y[0]) if len(y) > 1 else 1.0
             grid = Grid(x, y, float(held.pop("height")), step, inside)
             names = tuple(str(name) for name in held.pop("stations"))
-            arrays: dict[str, Any] = {name: held.pop(name) for name in ARRAYS}
-            share, calibrated = float(held.pop("share")), bool(held.pop("calibrated"))
-            threshold = float(held.pop("threshold_db"))
+            facts: dict[str, Any] = {name: held.pop(name) for name in ARRAYS}
+            for name, kind in (("share", float), ("calibrated", bool), ("threshold_db", float)):
+                facts[name] = kind(held.pop(name))
         except FileNotFoundError:
             raise DataError(f"map={path}: no such file; expected map.npz of gsparc map") from None
         except (KeyError, ValueError, OSError, EOFError, BadZipFile):
             raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
-        facts: dict[str, Any] = {
-            "share": share,
-            "calibrated": calibrated,
-            "threshold_db": threshold,
-            "extra": held,
-        }
-        return cls(grid=grid, stations=names, **arrays, **facts)
+        return cls(grid=grid, stations=names, extra=held, **facts)
 
     def figures(self) -> dict[str, float | int | None]:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""

@@ -12,6 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
+from gsparc.data.limits import finite
 
 LEAST_PIXELS = 2.0  # between the reference points: nearer ones tell no scale
 LARGEST = 4000  # pixels of the longer side that are kept
@@ -74,11 +75,8 @@ def read_plan(path: str | Path, points: Sequence[Sequence[float]] | None) -> Flo
 
 
 def _checked(points: Any, path: str | Path) -> np.ndarray:
-    try:
-        pairs = np.array(points, dtype=np.float64)
-    except (TypeError, ValueError):
-        pairs = np.zeros(0)
-    if pairs.shape != (2, 4) or not np.isfinite(pairs).all():
+    pairs = finite(points)
+    if pairs.shape != (2, 4):
         raise DataError(f"plan_points={points}: two points of four numbers are needed; {SHOW}")
     if np.hypot(*(pairs[1, :2] - pairs[0, :2])) < LEAST_PIXELS:
         raise DataError(

@@ -174,11 +174,7 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
 def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.ndarray:
     if len(distance) == 1:
         return width
-    return (
-        IsotonicRegression()
-        .fit(np.arange(len(distance)), width, sample_weight=weight)
-        .predict(np.arange(len(distance)))
-    )
+    return IsotonicRegression().fit_transform(np.arange(len(distance)), width, sample_weight=weight)
 
 
 def held(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, Literal
@@ -88,30 +88,33 @@ def map_of(
     arrays = [np.full((len(names), *grid.shape), np.nan, np.float32) for _ in range(4)]
     stride = _stride(grid, promise, tolerance_db)
     told = 0
-    for layer, name in enumerate(names):
+    numbers = [0 if site.stations is None else site.stations.name.index(name) for name in names]
+    every = np.flatnonzero(grid.inside)
+    for layer, (name, number) in enumerate(zip(names, numbers, strict=True)):
         asking = predictor if site.stations is None else predictor.at(name)
-        number = 0 if site.stations is None else site.stations.name.index(name)
-        report = _reporter(
-            asked, layer, len(names), int(grid.inside.sum()) / stride**2 * (1.3 if stride > 1 else 1)
-        )
-        ask = _asker(asking, grid, other_end, report)
+        expected = len(every) / stride**2 * (1.3 if stride > 1 else 1)
+        ask = _asker(asking, grid, other_end, _reporter(asked, layer, len(names), expected))
         (mean, spread), count = refined(ask, grid.inside, stride, tolerance_db)
         told += count
-        for cells in _chunks(grid, BANDS):
+        for cells in _chunks(every, BANDS):
             level, wide = (values.reshape(-1)[cells].astype(np.float64) for values in (mean, spread))
-            said = _described(
-                level, wide, grid.places(cells), other_end, site, promise, calibration, number, share
-            )
+            if promise is None or calibration is None:
+                half, wrong = norm.ppf((1 + share) / 2) * wide, wide
+            else:
+                far = promise.distance(_local(grid.places(cells), other_end, site), number)
+                own = np.full(len(far), number)
+                half, wrong = calibration.interval(wide, far, own), calibration.expected_error(wide, far, own)
+            level = np.where(np.isfinite(half), level, np.nan)
+            said = level, level - half, level + half, np.where(np.isfinite(level), wrong, np.nan)
             for array, values in zip(arrays, said, strict=True):
                 array[layer].reshape(-1)[cells] = values
     asked(1.0)
-    if told < len(names) * int(grid.inside.sum()):
+    if told < len(names) * len(every):
         notes.append(
-            f"{told} of {len(names) * int(grid.inside.sum())} predictions were made, the others interpolated "
+            f"{told} of {len(names) * len(every)} predictions were made, the others interpolated "
             f"within about {tolerance_db:g} dB"
         )
     power, lower, upper, error = arrays
-    numbers = [0 if site.stations is None else site.stations.name.index(name) for name in names]
     usual, floor = _usual(promise, numbers, noise_db)
     over = _over_stations(power, error, share_of, noise_db, threshold_db, calibration, usual, floor)
     best, chance, ratio, outage = over
@@ -170,10 +173,8 @@ def answering(
     return list(dict.fromkeys(names)), notes
 
 
-def _chunks(grid: Grid, size: int) -> Iterator[np.ndarray]:
-    every = np.flatnonzero(grid.inside)
-    for start in range(0, len(every), size):
-        yield every[start : start + size]
+def _chunks(cells: np.ndarray, size: int) -> list[np.ndarray]:
+    return [cells[start : start + size] for start in range(0, len(cells), size)]
 
 
 def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
@@ -205,16 +206,13 @@ def _asker(
     predictor: Predictor, grid: Grid, other: Sequence[float] | None, report: Callable[[int], None]
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Level and deviation (n, 2) [dB] of cells (n,), in chunks, as many at once as torch has threads."""
-    site, workers = predictor.site, torch.get_num_threads()
 
     def one(cells: np.ndarray) -> np.ndarray:
-        said = predictor.predict(**ends_of(site, grid.places(cells), other))
-        return np.column_stack(predicted(said, site.kind))
+        return np.column_stack(levels_at(predictor, grid.places(cells), other))
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        parts = [cells[start : start + CHUNK] for start in range(0, len(cells), CHUNK)]
-        found = []
-        pool = ThreadPoolExecutor(workers)
+        parts, found = _chunks(cells, CHUNK), []
+        pool = ThreadPoolExecutor(torch.get_num_threads())
         try:
             for part, values in zip(parts, pool.map(one, parts), strict=True):
                 found.append(values)
@@ -224,6 +222,18 @@ def _asker(
         return np.concatenate(found) if found else np.zeros((0, 2))
 
     return ask
+
+
+def levels_at(
+    predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
+    parts = [
+        predicted(predictor.predict(**ends_of(predictor.site, part, other)), predictor.site.kind)
+        for part in np.split(places, range(CHUNK, len(places), CHUNK))
+    ]
+    level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return level, spread
 
 
 def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:
@@ -244,29 +254,12 @@ def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> di
     return {"rx": places, "tx": np.broadcast_to(place, places.shape)}
 
 
-def _described(
-    mean: np.ndarray,
-    spread: np.ndarray,
-    places: np.ndarray,
-    other: Sequence[float] | None,
-    site: Site,
-    promise: Promise | None,
-    calibration: Calibration | None,
-    station: int,
-    share: float,
-) -> tuple[np.ndarray, ...]:
-    """Power, ends of its interval and expected error (n,) [dB]; all NaN where one of them is not known."""
-    if promise is None or calibration is None:
-        half, error = norm.ppf((1 + share) / 2) * spread, spread
-    else:
-        local = places - site.origin
-        if site.static_end is None and other is not None:
-            local = np.hstack([np.broadcast_to(np.asarray(other) - site.origin, local.shape), local])
-        far = promise.distance(local, station)
-        own = np.full(len(far), station)
-        half, error = calibration.interval(spread, far, own), calibration.expected_error(spread, far, own)
-    mean = np.where(np.isfinite(half), mean, np.nan)
-    return mean, mean - half, mean + half, np.where(np.isfinite(mean), error, np.nan)
+def _local(places: np.ndarray, other: Sequence[float] | None, site: Site) -> np.ndarray:
+    """Local places (n, 3), or (n, 6) with the other end before them where both moved [m]."""
+    local = places - site.origin
+    if site.static_end is not None or other is None:
+        return local
+    return np.hstack([np.broadcast_to(np.asarray(other) - site.origin, local.shape), local])
 
 
 def _over_stations(
@@ -324,8 +317,7 @@ def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str
         return {}
     layers = {name: np.full(grid.shape, np.nan, np.float32) for name in ("delay_spread_ns", "direction_deg")}
     told = np.flatnonzero((best >= 0).reshape(-1))
-    for start in range(0, len(told), CHUNK):
-        cells = told[start : start + CHUNK]
+    for cells in _chunks(told, CHUNK):
         try:
             found = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
         except ValueError:  # what was fitted has none

@@ -15,9 +15,10 @@ from matplotlib import colormaps
 from PIL import Image
 
 from gsparc.data.files import whole_file
+from gsparc.evaluation.from_above import MOST_POINTS
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.pictures import MOST_POINTS, Layer, class_colours
+from gsparc.maps.pictures import Layer, class_colours
 
 MOST_CELLS = 600  # along a side: the page shows every n-th cell of larger maps
 LEVELS = 65_534  # of a value; 65535 is no value

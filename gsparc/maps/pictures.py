@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import BoundaryNorm, ListedColormap
-from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 
 from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.from_above import (
+    OUTLINE,
+    annotate,
+    bounded,
+    draw_measured,
+    draw_stations,
+    legend_below,
+    scale_bar,
+)
+from gsparc.maps.area import Grid
 from gsparc.maps.field_map import REFUSED, FieldMap
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.placing import Placing
@@ -23,9 +32,7 @@ from gsparc.prediction.predictor import Predictor
 
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
-MOST_POINTS = 1500  # measured places that are drawn
 UNSURE = "hatched: less likely than not the strongest and above its floor"
-OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
 @dataclass(frozen=True)
@@ -116,45 +123,33 @@ def draw_layer(
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
     axis = axes[0, 0]
-    if plan is not None:
-        draw_plan(axis, plan)
     nothing = np.where(found.refused, 1.0, np.nan)
     grey = ListedColormap(["0.82"])
     axis.imshow(nothing, origin="lower", extent=found.grid.extent, cmap=grey, zorder=1, alpha=0.6)
-    how: dict[str, Any] = {"origin": "lower", "extent": found.grid.extent, "interpolation": "nearest"}
-    how |= {"alpha": 1.0 if plan is None else 0.65, "zorder": 2}
     if layer.words:
         count = len(layer.words)
-        colours = ListedColormap(class_colours(count))
-        drawn = axis.imshow(
-            layer.values, cmap=colours, norm=BoundaryNorm(np.arange(count + 1) - 0.5, count), **how
+        norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
+        drawn = _cells(
+            axis, found.grid, layer.values, plan, cmap=ListedColormap(class_colours(count)), norm=norm
         )
         bar = figure.colorbar(drawn, ax=axis, ticks=np.arange(count), shrink=0.85, pad=0.02)
         bar.ax.set_yticklabels(layer.words)
     else:
-        lowest, highest = layer.range()
-        how |= {"vmin": lowest, "vmax": highest}
-        drawn = axis.imshow(layer.values, cmap=layer.colours, **how)
+        limits = dict(zip(("vmin", "vmax"), layer.range(), strict=True))
+        drawn = _cells(axis, found.grid, layer.values, plan, cmap=layer.colours, **limits)
         ends = "neither" if layer.limits else "both"
         bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends)
     bar.set_label(layer.label)
     if layer.unsure is not None:
         _hatch(axis, found, *layer.unsure)
+    bounded(axis, (left, low), (right, high), title=title)
     draw_places(axis, found)
-    axis.set(
-        xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title
-    )
-    axis.ticklabel_format(useOffset=False, style="plain")
-    scale_bar(axis, right - left)
+    scale_bar(axis)
     if more is not None:
         more(axis)
     if found.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
-    handles, _ = axis.get_legend_handles_labels()
-    if handles:
-        figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
-    engine: Any = figure.get_layout_engine()
-    engine.set(w_pad=0.12, h_pad=0.1)  # axes of equal scales take more than their share
+    legend_below(figure)
     save(figure, path, 110)
 
 
@@ -165,6 +160,14 @@ def _hatch(axis: Any, found: FieldMap, cells: np.ndarray, why: str) -> None:
         drawn = axis.contourf(found.grid.x, found.grid.y, cells.astype(float), zorder=2.5, **how)
         drawn.set(edgecolor="black", linewidth=0.0)
         axis.fill([], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why)
+
+
+def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **colours: Any) -> Any:
+    """Values (ny, nx) of cells, through which a plan beneath them is seen."""
+    if plan is not None:
+        draw_plan(axis, plan)
+    how = {"origin": "lower", "extent": grid.extent, "interpolation": "nearest", "zorder": 2}
+    return axis.imshow(values, alpha=1.0 if plan is None else 0.65, **how, **colours)
 
 
 def draw_plan(axis: Any, plan: FloorPlan) -> None:
@@ -182,25 +185,10 @@ def draw_places(axis: Any, found: FieldMap) -> None:
     known = found.station_place
     inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
     if inside.any():
-        how = {"markersize": 9, "markeredgecolor": "white", "zorder": 4}
-        axis.plot(*known[inside].T, "k^", label="station", **how)
+        draw_stations(axis, known[inside])
     if 1 < len(known) <= NAMED:
         for where, name in zip(known[inside], np.array(found.stations)[inside], strict=True):
-            edge = where[0] > left + 0.75 * (right - left)
-            note = axis.annotate(
-                name, where, xytext=(-7 if edge else 7, 5), textcoords="offset points", fontsize="small",
-                ha="right" if edge else "left", path_effects=OUTLINE, zorder=5,
-            )  # fmt: skip
-            note.set_in_layout(False)
-
-
-def draw_measured(axis: Any, places: np.ndarray) -> None:
-    """Places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
-    if len(places):
-        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
-        size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
-        rim = {"markerfacecolor": "black", "markeredgecolor": "white", "markeredgewidth": 0.2 * size}
-        axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
+            annotate(axis, name, where)
 
 
 def class_colours(count: int) -> np.ndarray:
@@ -221,16 +209,11 @@ def draw_plan_picture(
     errors = np.concatenate([found.error_before, found.error_after])
     limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
     for axis, values, title in ((before, found.error_before, "before"), (after, found.error_after, "after")):
-        if plan is not None:
-            draw_plan(axis, plan)
         image = np.full(found.grid.shape, np.nan)
         image[found.grid.inside] = values
-        drawn = axis.imshow(
-            image, origin="lower", extent=found.grid.extent, cmap="cividis", zorder=1,
-            alpha=1 if plan is None else 0.65, **limits,
-        )  # fmt: skip
-        axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", title=title)
-        scale_bar(axis, right - left)
+        drawn = _cells(axis, found.grid, image, plan, cmap="cividis", **limits)
+        bounded(axis, (left, low), (right, high), ylabel="", title=title)
+        scale_bar(axis)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
         draw_measured(before, places)
@@ -244,8 +227,6 @@ def draw_plan_picture(
     curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
     curve.set_ylim(bottom=0)  # what the walk gains is seen beside what is left
     curve.grid(alpha=0.3)
-    engine: Any = figure.get_layout_engine()
-    engine.set(w_pad=0.12, h_pad=0.1)
     save(figure, path, 100)
 
 
@@ -257,31 +238,9 @@ def draw_placing(found: Placing, path: Path, threshold_db: float, unit: str = "d
     label = label if found.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
     drawn = axis.scatter(*found.places[:, :2].T, c=found.goal, s=60, marker="s", cmap="viridis")
     figure.colorbar(drawn, ax=axis, label=f"{label}, with a station here", shrink=0.85)
-    how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}
-    axis.plot(*found.stations.T, "k^", label="station", **how)
-    axis.plot(*found.places[0, :2], "r*", label="best", markersize=18, markeredgecolor="white", linestyle="")
-    axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    scale_bar(axis, right - left)
-    figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
+    draw_stations(axis, found.stations)
+    draw_stations(axis, found.places[0, :2], "best", marker="*", color="r", markersize=18)
+    bounded(axis, (left, low), (right, high))
+    scale_bar(axis)
+    legend_below(figure)
     save(figure, path, 100)
-
-
-def scale_bar(axis: Any, width: float) -> None:
-    """A bar of a round length, about a fifth of the map wide."""
-    wanted = width / 5
-    decade = 10.0 ** np.floor(np.log10(wanted))
-    length = max(one for one in (1, 2, 5) if one * decade <= wanted) * decade
-    left, right = axis.get_xlim()
-    low, high = axis.get_ylim()
-    x, y = left + 0.04 * (right - left), low + 0.05 * (high - low)
-    axis.plot([x, x + length], [y, y], color="black", linewidth=4, solid_capstyle="butt", zorder=6,
-              path_effects=[withStroke(linewidth=6, foreground="white")])  # fmt: skip
-    said = (
-        f"{length / 1000:g} km"
-        if length >= 1000
-        else f"{length:g} m"
-        if length >= 1
-        else f"{length * 100:g} cm"
-    )
-    axis.annotate(said, (x + length / 2, y), xytext=(0, 5), textcoords="offset points", ha="center",
-                  fontsize="small", path_effects=OUTLINE, zorder=6)  # fmt: skip

@@ -117,9 +117,10 @@ def place_next(
     candidates = _candidates(grid, sites, predictor, height, count)
     cells = grid.places()
     _refuse_unheard(predictor, candidates[0], cells[:1])
+    left, right, south, north = grid.extent
     now = map_of(
         predictor,
-        _box(grid),
+        [left, south, right, north],
         height_m=grid.height,
         step_m=grid.step,
         threshold_db=threshold_db,
@@ -183,11 +184,6 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         every = grid.places()
     kept = every[np.unique(np.linspace(0, len(every) - 1, min(count, len(every))).astype(int))]
     return np.column_stack([kept[:, :2], np.full(len(kept), height)])
-
-
-def _box(grid: Grid) -> list[float]:
-    left, right, low, high = grid.extent
-    return [left, low, right, high]
 
 
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

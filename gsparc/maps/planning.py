@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
+from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.covariance import ErrorCovariance, before_measuring, unknown_of
@@ -138,13 +139,13 @@ def plan_next(
         unknown = unknown_of(predictor, places, names, promise, other_end)
     begin = None if start is None else _start(start)
     tour = Tour(begin, route_m)
+    first = _expected(unknown, wanted)
     before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
     after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     walk = route or route_m is not None
     order = tour.order() if walk else np.arange(len(chosen))
     picked = places[chosen] if len(chosen) else np.zeros((0, 3))
-    first = _mean_db(before, wanted)
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
         picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
@@ -252,15 +253,8 @@ def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
     return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
 
 
-def _mean_db(error: np.ndarray, wanted: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(error[wanted] ** 2)))
-
-
 def _start(given: Sequence[float]) -> np.ndarray:
-    try:
-        place = np.array([float(value) for value in given])
-    except (TypeError, ValueError):
-        place = np.zeros(0)
-    if len(place) not in (2, 3) or not np.isfinite(place).all():
+    place = finite(given)
+    if place.shape not in ((2,), (3,)):
         raise DataError(f"start={given}: [x,y] in metres is needed")
     return place[:2]

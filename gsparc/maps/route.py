@@ -50,39 +50,34 @@ class Tour:
     def _length(self) -> float:
         return self.length_of(self._stops(), self.start)
 
+    def _ends(self, stops: np.ndarray) -> np.ndarray:
+        """Stops (n + 2, 2) with what is before and after them; NaN where there is nothing."""
+        nothing = np.full(2, np.nan)
+        return np.vstack([nothing if self.start is None else self.start, stops, nothing])
+
     def _insertions(self, places: np.ndarray) -> np.ndarray:
         """What each of places (n, 2) adds to the walk before each stop, or at its end: (stops + 1, n) [m]."""
-        stops = self._stops()
-        count = len(stops)
-        added = np.empty((count + 1, len(places)))
-        for at in range(count + 1):
-            before = stops[at - 1] if at > 0 else self.start
-            after = stops[at] if at < count else None
-            one = 0.0 if before is None else np.hypot(*(places - before).T)
-            two = 0.0 if after is None else np.hypot(*(places - after).T)
-            saved = 0.0 if before is None or after is None else float(np.hypot(*(after - before)))
-            added[at] = one + two - saved
-        return added
+        stops = self._ends(self._stops())
+        to = _apart(stops[:, None], places)
+        return to[:-1] + to[1:] - _apart(stops[:-1], stops[1:])[:, None]
 
     def _shorter(self) -> list[int]:
         """The walk after turning stretches round (G. A. Croes, Oper. Res. 6 (1958)) while that helps."""
-        walk = list(self._walk)
+        stops = self._ends(np.array(self._places).reshape(-1, 2))
+        apart = _apart(stops[:, None], stops)
+        walk = [0, *(k + 1 for k in self._walk), len(stops) - 1]  # rows of `stops`
         for _ in range(ROUNDS):
-            stops = np.array([self._places[k] for k in walk]).reshape(-1, 2)
-            changed = False
-            for i in range(len(walk) - 1):
-                before = stops[i - 1] if i else self.start
-                for j in range(i + 1, len(walk)):
-                    after = stops[j + 1] if j + 1 < len(walk) else None
-                    old = new = 0.0
-                    if before is not None:
-                        old, new = old + np.hypot(*(stops[i] - before)), new + np.hypot(*(stops[j] - before))
-                    if after is not None:
-                        old, new = old + np.hypot(*(after - stops[j])), new + np.hypot(*(after - stops[i]))
-                    if new < old - 1e-9:
+            before = list(walk)
+            for i in range(1, len(walk) - 2):
+                for j in range(i + 1, len(walk) - 1):
+                    a, b, c, d = walk[i - 1], walk[i], walk[j], walk[j + 1]
+                    if apart[a, c] + apart[b, d] < apart[a, b] + apart[c, d] - 1e-9:
                         walk[i : j + 1] = walk[i : j + 1][::-1]
-                        stops[i : j + 1] = stops[i : j + 1][::-1].copy()
-                        changed = True
-            if not changed:
+            if walk == before:
                 break
-        return walk
+        return [k - 1 for k in walk[1:-1]]
+
+
+def _apart(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Distances of places (..., 2) [m]; 0 to nothing, which is NaN."""
+    return np.nan_to_num(np.hypot(*np.moveaxis(one - two, -1, 0)))

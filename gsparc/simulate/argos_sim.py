@@ -16,6 +16,7 @@ import yaml
 
 from gsparc.data.datasets import argos
 from gsparc.data.datasets.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
+from gsparc.data.datasets.campaign import made_once, write_split
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.streets import Rays, Streets, trace
@@ -51,11 +52,8 @@ def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
     rng = np.random.default_rng([seed, 1])
     centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
     half = np.array([36.0, 25.0]) + rng.uniform(-4.0, 4.0, (9, 2))
-    buildings, none, base = (
-        np.stack([centres - half, centres + half], 1),
-        np.zeros(0),
-        np.array([-50.0, 37, 9]),
-    )
+    buildings, none = np.stack([centres - half, centres + half], 1), np.zeros(0)
+    base = np.array([-50.0, 37, 9])
     streets = Streets(buildings, -rng.uniform(0.7, 0.9, 9), np.zeros((0, 3)), none, none, base)
     places = rng.uniform(1.5 * LOWER, 1.5 * UPPER, (max(400, 6 * scatterers), 2))
     places = places[streets.open(places)][:scatterers]
@@ -159,31 +157,7 @@ def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets, scatt
         }  # fmt: skip
         text = yaml.safe_dump(description, sort_keys=False)
         (partial / "base-station.yml").write_text(text, encoding="utf-8")
-        order = np.random.default_rng(seed).permutation(count)
-        test = max(round(0.2 * count), 1)
-        for name, rows in (("test", order[:test]), ("train", order[test:])):
-            np.savetxt(partial / f"{name}_index.txt", np.sort(rows), fmt="%d")
-
-
-def ensure_argos_sim(
-    parent: Path, count: int = 4000, seed: int = 0, offsets: bool = True, scatterers: int = SCATTERERS
-) -> Path:
-    """The folder of this stand-in under `parent`, made when it is not there yet.
-
-    Raises:
-        ValueError: fewer than ten users, or less than one scatterer.
-    """
-    if scatterers < 1:
-        raise ValueError(f"dataset.stand_in.scatterers={scatterers}: expected at least 1")
-    if count < 10:
-        raise ValueError(f"dataset.count={count}: expected at least 10 users")
-    name = f"{STAND_IN}-{count}-{seed}{'' if offsets else '-aligned'}"
-    folder = Path(parent) / (name if scatterers == SCATTERERS else f"{name}-{scatterers}")
-    if not folder.is_dir():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        own = Offsets() if offsets else Offsets(0.0, 0.0, 0.0)
-        write_argos_sim(folder, count, seed, own, scatterers)
-    return folder
+        write_split(partial, count, seed)
 
 
 @dataclass(frozen=True)
@@ -205,7 +179,15 @@ class ArgosStandIn:
     root: str | Path = "outputs/stand-ins"
 
     def folder(self) -> Path:
-        """See `ensure_argos_sim`."""
-        return ensure_argos_sim(
-            Path(self.root), int(self.count), int(self.seed), bool(self.offsets), int(self.scatterers)
+        """See `StandIn.folder`."""
+        count, seed, scatterers = int(self.count), int(self.seed), int(self.scatterers)
+        if scatterers < 1:
+            raise ValueError(f"dataset.stand_in.scatterers={scatterers}: expected at least 1")
+        if count < 10:
+            raise ValueError(f"dataset.count={count}: expected at least 10 users")
+        name = f"{STAND_IN}-{count}-{seed}{'' if self.offsets else '-aligned'}"
+        name = name if scatterers == SCATTERERS else f"{name}-{scatterers}"
+        own = Offsets() if self.offsets else Offsets(0.0, 0.0, 0.0)
+        return made_once(
+            Path(self.root) / name, lambda folder: write_argos_sim(folder, count, seed, own, scatterers)
         )

@@ -206,13 +206,11 @@ def decide(
     chosen = _cheapest(sets, holds, full)
     why, table = explain(probe), []
     for name, less in dropped.items():
-        share, nmse, error = probe.shares(less)[reached], probe.nmse(less)[reached], errors[name]
         effect, _, depth = name.partition(" > ")
         kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, name))
-        table.append(EffectRow(
-            name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
-            float(np.median(error)), _p95(error), failures[name], why.get(effect, ""), kept,
-        ))  # fmt: skip
+        share = probe.shares(less)[reached]
+        row = _row(name, share, probe.nmse(less)[reached], errors[name], failures[name], kept)
+        table.append(replace(row, reason=why.get(effect, "")))
     return Choice(chosen, str(deliverable), tuple(table), len(reached))
 
 
@@ -253,10 +251,7 @@ def fewer_rays(
         return None
     enough = failed <= (late if last else early)
     share, nmse = np.abs(probe.shares(traced)[reached]), probe.nmse(traced)[reached]
-    row = EffectRow(
-        f"rays > {samples}", float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
-        float(np.median(error)), _p95(error), failed, "", not enough,
-    )  # fmt: skip
+    row = _row(f"rays > {samples}", share, nmse, error, failed, not enough)
     return replace(choice, table=(*choice.table, row), samples=samples if enough else None)
 
 
@@ -321,6 +316,16 @@ def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effec
         if holds(some):
             found.append(some)
     return min(found, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
+
+
+def _row(
+    name: str, share: np.ndarray, nmse: np.ndarray, error: np.ndarray, failures: int, kept: bool
+) -> EffectRow:
+    """A row of the table, without a reason."""
+    return EffectRow(
+        name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
+        float(np.median(error)), _p95(error), failures, "", kept,
+    )  # fmt: skip
 
 
 def _p95(values: np.ndarray) -> float:

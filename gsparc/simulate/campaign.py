@@ -91,7 +91,7 @@ def simulate(campaign: Campaign, out: Path, shared: bool = False) -> Outcome | N
     choice = None if decision is None else decision.choice
     if decision is not None and decision.as_chosen and row_s and isinstance(asked.effects, AutoSettings):
         choice = replace(decision.choice, row_chosen=row_s)
-        deciding.remember(asked, asked.effects, survey, choice)
+        deciding.Decider(asked, asked.effects, survey).remember(choice)
     laps.append(time.perf_counter())
     mine: list[Outcome] = []
 
@@ -118,7 +118,7 @@ def _choose(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: 
 
     def work(note: str) -> None:
         shards.drop(0)  # of a process that was killed before it noted by which decision it was made
-        decision = deciding.decide(campaign, settings, survey)
+        decision = deciding.Decider(campaign, settings, survey).decide()
         if decision.rows is not None and decision.paths is not None:
             made = shard_arrays(decision.paths, campaign, survey.engine.wavelength)
             shards.put(0, {**made, ROWS: decision.rows, SECONDS: np.array(0.0)})  # they are in the decision's

@@ -7,9 +7,8 @@ import json
 import logging
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -155,172 +154,170 @@ def pays(choice: Choice, rows: int, saved: float) -> bool:
     return rows * choice.row_all * saved > (2 if choice.reused else 1) * choice.compiling
 
 
-def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decision:
-    """Look the decision up, or take it and store it."""
-    begin = time.perf_counter()
-    stored = platform_cache() / "scenes" / f"{_key(campaign, settings, survey)}.json"
-    full = survey.engine.supported(settings.full)
-    probes, held = _groups(survey, settings, campaign.scene.seed)
-    if settings.reuse and stored.exists():
-        choice = Choice.from_dict(json.loads(stored.read_text(encoding="utf-8")))
-        asked = len(probes) + len(held)
-        if not (choice.untried and _may_pay(choice, settings, full, len(survey) - asked, asked)):
-            log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
-            choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
-            return Decision(choice, *_simulated(campaign, choice, full, len(survey)))
-    size = campaign.sampling.part if survey.engine.random else 1
-    traced = Traced(survey, full, np.concatenate([probes, held]), size)
-    choice, changed = _look(campaign, settings, survey, traced, probes), None
-    if choice.effects == full:
-        log.info("auto: every effect is needed")
-    else:
-        log.info("auto: %s; verifying on held-back receivers", choice.effects)
-        choice, changed = _verify(campaign, settings, traced, choice, held)
-        if choice.verdict is not None and not choice.verdict.kept:
-            log.info("auto: held-back receivers refute it; everything is needed")
-            choice = auto.everything(choice, full)
-    if settings.rays < 1 and survey.engine.random:
-        choice, changed = _fewer_rays(campaign, settings, traced, choice, changed, probes, held)
-    choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
-    effects, samples = _simulated(campaign, choice, full, len(survey) - len(traced.rows))
-    choice = replace(choice, seconds=time.perf_counter() - begin)
-    _remember(stored, choice)
-    rows = np.sort(traced.rows)
-    return Decision(choice, effects, samples, changed, rows, traced.paths(rows).under(effects))
+class Decider:
+    """Comes to the effects of one campaign.
 
-
-def _simulated(campaign: Campaign, choice: Choice, full: Effects, rows: int) -> tuple[Effects, int | None]:
-    """Effects and rays of the choice, or everything where that is cheaper for so many rows."""
-    rays = 1.0 if choice.samples is None else choice.samples / campaign.sampling.samples
-    price = auto.price(choice.effects, full, rays)
-    if (choice.effects == full and rays == 1) or pays(choice, rows, 1 - price):
-        return choice.effects, choice.samples
-    log.info("auto: everything is simulated: for %d receivers, compiling anew costs more", rows)
-    return full, None
-
-
-def _may_pay(choice: Choice, settings: AutoSettings, full: Effects, rows: int, asked: int) -> bool:
-    """Whether trying fewer rays on rows that were asked can pay on so many others."""
-    if choice.row_all is None or choice.compiling is None:
-        return False
-    all_, fewer = (auto.price(choice.effects, full, rays) for rays in (1.0, settings.rays))
-    trial = asked * fewer * choice.row_all + choice.compiling
-    return rows * (all_ - fewer) * choice.row_all > TRIAL * trial
-
-
-def remember(campaign: Campaign, settings: AutoSettings, survey: Survey, choice: Choice) -> None:
-    """Store a decision anew, with what rows were measured to cost."""
-    _remember(platform_cache() / "scenes" / f"{_key(campaign, settings, survey)}.json", choice)
-
-
-def _groups(survey: Survey, settings: AutoSettings, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Probes and held-back rows, both spread out, the first of each spread out as well."""
-    wanted = settings.probes + settings.held_back
-    chosen = survey.spread(wanted, seed)
-    share = settings.probes / wanted
-    # Farthest-point order: taking every so many leaves both groups spread out.
-    turn = np.floor(np.arange(1, len(chosen) + 1) * share) > np.floor(np.arange(len(chosen)) * share)
-    return chosen[turn], chosen[~turn]
-
-
-def _look(
-    campaign: Campaign, settings: AutoSettings, survey: Survey, traced: Traced, probes: np.ndarray
-) -> Choice:
-    """The first look and, where it leaves something open, the last."""
-    materials = survey.engine.materials()
-    choice = None
-    for count in (auto.first_look(len(probes)), len(probes)):
-        rows = probes[:count]
-        log.info("auto: %d probes with %s", count, traced.effects)
-
-        def why(probe: Probe, rows: np.ndarray = rows) -> dict[str, str]:
-            return priors.reasons(probe, survey.distances()[rows], materials)
-
-        choice = auto.decide(_probe(campaign, traced, rows), settings, why, last=count == len(probes))
-        if choice is not None:
-            return choice
-    raise AssertionError("the last look decides")
-
-
-def _fewer_rays(
-    campaign: Campaign, settings: AutoSettings, traced: Traced, choice: Choice, changed: Changed | None,
-    probes: np.ndarray, held: np.ndarray,
-) -> tuple[Choice, Changed | None]:  # fmt: skip
-    """Whether a share of the rays is enough: probes, then held-back rows, traced with the choice and those.
-
-    Rays that are fewer are other rays, so that no attribution tells. What was traced so is no row of the
-    file: the same rows are there with all rays.
+    Args:
+        campaign: what is simulated.
+        settings: the requirement.
+        survey: rows, traced with all rays.
     """
-    survey, part = traced.survey, campaign.sampling.part
-    if len(survey) - len(traced.rows) > campaign.sampling.batch:
-        traced.paths(held[: auto.first_look(len(held))])  # rows of the file, which say what one costs
-    choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
-    if not _may_pay(choice, settings, traced.effects, len(survey) - len(traced.rows), len(traced.rows)):
-        return replace(choice, untried=True), changed
-    samples = max(round(settings.rays * campaign.sampling.samples), 1)
-    log.info("auto: probes with %d rays", samples)
-    fewer = Traced(survey.thinned(samples), choice.effects, np.concatenate([probes, held]), part)
-    for count in (auto.first_look(len(probes)), len(probes)):
-        rows, last = probes[:count], count == len(probes)
-        probe = _probe(campaign, traced, rows)
-        found = auto.fewer_rays(choice, settings, probe, fewer.paths(rows), samples, last)
-        if found is not None:
-            break
-    assert found is not None  # the last look decides
-    if found.samples is None:
-        return found, changed
-    verified, errors = _verify(campaign, settings, traced, found, held, fewer)
-    if verified.verdict is not None and not verified.verdict.kept:
-        return replace(auto.without_fewer_rays(found), verdict=choice.verdict), changed
-    return verified, errors
+
+    def __init__(self, campaign: Campaign, settings: AutoSettings, survey: Survey) -> None:
+        self.campaign, self.settings, self.survey = campaign, settings, survey
+        self.full = survey.engine.supported(settings.full)
+        self._stored = platform_cache() / "scenes" / f"{self._key()}.json"
+
+    def decide(self) -> Decision:
+        """Look the decision up, or take it and store it."""
+        begin, (probes, held) = time.perf_counter(), self._groups()
+        asked = len(probes) + len(held)
+        if self.settings.reuse and self._stored.exists():
+            choice = Choice.from_dict(json.loads(self._stored.read_text(encoding="utf-8")))
+            if not (choice.untried and self._may_pay(choice, len(self.survey) - asked, asked)):
+                log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
+                choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
+                return Decision(choice, *self._simulated(choice, len(self.survey)))
+        size = self.campaign.sampling.part if self.survey.engine.random else 1
+        traced = Traced(self.survey, self.full, np.concatenate([probes, held]), size)
+        choice, changed = self._look(traced, probes), None
+        if choice.effects == self.full:
+            log.info("auto: every effect is needed")
+        else:
+            log.info("auto: %s; verifying on held-back receivers", choice.effects)
+            choice, changed = self._verify(traced, choice, held)
+            if choice.verdict is not None and not choice.verdict.kept:
+                log.info("auto: held-back receivers refute it; everything is needed")
+                choice = auto.everything(choice, self.full)
+        if self.settings.rays < 1 and self.survey.engine.random:
+            choice, changed = self._fewer_rays(traced, choice, changed, probes, held)
+        choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
+        effects, samples = self._simulated(choice, len(self.survey) - len(traced.rows))
+        choice = replace(choice, seconds=time.perf_counter() - begin)
+        self.remember(choice)
+        rows = np.sort(traced.rows)
+        return Decision(choice, effects, samples, changed, rows, traced.paths(rows).under(effects))
+
+    def remember(self, choice: Choice) -> None:
+        """Store a decision; anew, with what rows were measured to cost."""
+        with whole_file(self._stored) as partial:
+            partial.write_text(json.dumps(asdict(choice), indent=1), encoding="utf-8")
+
+    def _simulated(self, choice: Choice, rows: int) -> tuple[Effects, int | None]:
+        """Effects and rays of the choice, or everything where that is cheaper for so many rows."""
+        rays = 1.0 if choice.samples is None else choice.samples / self.campaign.sampling.samples
+        price = auto.price(choice.effects, self.full, rays)
+        if (choice.effects == self.full and rays == 1) or pays(choice, rows, 1 - price):
+            return choice.effects, choice.samples
+        log.info("auto: everything is simulated: for %d receivers, compiling anew costs more", rows)
+        return self.full, None
+
+    def _may_pay(self, choice: Choice, rows: int, asked: int) -> bool:
+        """Whether trying fewer rays on rows that were asked can pay on so many others."""
+        if choice.row_all is None or choice.compiling is None:
+            return False
+        all_, fewer = (auto.price(choice.effects, self.full, rays) for rays in (1.0, self.settings.rays))
+        trial = asked * fewer * choice.row_all + choice.compiling
+        return rows * (all_ - fewer) * choice.row_all > TRIAL * trial
+
+    def _groups(self) -> tuple[np.ndarray, np.ndarray]:
+        """Probes and held-back rows, both spread out, the first of each spread out as well."""
+        wanted = self.settings.probes + self.settings.held_back
+        chosen = self.survey.spread(wanted, self.campaign.scene.seed)
+        share = self.settings.probes / wanted
+        # Farthest-point order: taking every so many leaves both groups spread out.
+        turn = np.floor(np.arange(1, len(chosen) + 1) * share) > np.floor(np.arange(len(chosen)) * share)
+        return chosen[turn], chosen[~turn]
+
+    def _look(self, traced: Traced, probes: np.ndarray) -> Choice:
+        """The first look and, where it leaves something open, the last."""
+        materials = self.survey.engine.materials()
+        for rows, last in _looks(probes):
+            log.info("auto: %d probes with %s", len(rows), traced.effects)
+
+            def why(probe: Probe, rows: np.ndarray = rows) -> dict[str, str]:
+                return priors.reasons(probe, self.survey.distances()[rows], materials)
+
+            choice = auto.decide(self._probe(traced, rows), self.settings, why, last)
+            if choice is not None:
+                return choice
+        raise AssertionError("the last look decides")
+
+    def _fewer_rays(
+        self, traced: Traced, choice: Choice, changed: Changed | None, probes: np.ndarray, held: np.ndarray
+    ) -> tuple[Choice, Changed | None]:
+        """Whether a share of the rays is enough: probes, then held-back rows, with the choice and those.
+
+        Rays that are fewer are other rays, so that no attribution tells. What was traced so is no row of the
+        file: the same rows are there with all rays.
+        """
+        survey, sampling = self.survey, self.campaign.sampling
+        if len(survey) - len(traced.rows) > sampling.batch:
+            traced.paths(held[: auto.first_look(len(held))])  # rows of the file, which say what one costs
+        choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
+        if not self._may_pay(choice, len(survey) - len(traced.rows), len(traced.rows)):
+            return replace(choice, untried=True), changed
+        samples = max(round(self.settings.rays * sampling.samples), 1)
+        log.info("auto: probes with %d rays", samples)
+        fewer = Traced(survey.thinned(samples), choice.effects, np.concatenate([probes, held]), sampling.part)
+        for rows, last in _looks(probes):
+            probe = self._probe(traced, rows)
+            found = auto.fewer_rays(choice, self.settings, probe, fewer.paths(rows), samples, last)
+            if found is not None:
+                break
+        assert found is not None  # the last look decides
+        if found.samples is None:
+            return found, changed
+        verified, errors = self._verify(traced, found, held, fewer)
+        if verified.verdict is not None and not verified.verdict.kept:
+            return replace(auto.without_fewer_rays(found), verdict=choice.verdict), changed
+        return verified, errors
+
+    def _verify(
+        self, traced: Traced, choice: Choice, held: np.ndarray, fewer: Traced | None = None
+    ) -> tuple[Choice, Changed]:
+        """On the first half of the held-back rows, and on all where that does not prove the requirement."""
+        settings, required = self.settings, self.settings.required
+        for rows, _ in _looks(held):
+            probe = self._probe(traced, rows)
+            kept = None if fewer is None else fewer.paths(rows)
+            choice = auto.verify(choice, settings, probe, kept)
+            errors = probe.errors(choice.effects if kept is None else kept, required)
+            failed = int((errors[probe.reached] > required.tolerance).sum())
+            heard = int(probe.reached.sum())
+            early, _ = auto.allowed_failures(heard, len(held), settings.quantile, settings.confidence)
+            if failed <= early:
+                break
+        return choice, Changed(rows, errors)
+
+    def _probe(self, traced: Traced, rows: np.ndarray) -> Probe:
+        """Rows traced with everything, and their nearest others where the requirement is about spectra."""
+        campaign, survey, nearest = self.campaign, traced.survey, None
+        if self.settings.required.kind == "spectrum":
+            owner, place = np.divmod(rows, len(survey.places))
+            nearest = traced.paths(owner * len(survey.places) + neighbours(survey.places, place))
+        wavelength, frequency = survey.engine.wavelength, campaign.scene.frequency_hz
+        array = campaign.csi.elements(wavelength)
+        paths = traced.paths(rows)
+        return Probe(paths, traced.effects, frequency, wavelength, array, campaign.spectrum, nearest)
+
+    def _key(self) -> str:
+        """Hash of geometry, materials, transmitters, where receivers are, band, solver and requirement."""
+        campaign, survey, engine = self.campaign, self.survey, self.survey.engine
+        scene = {name: value for name, value in asdict(campaign.scene).items() if name not in OWN}
+        asked = {name: value for name, value in asdict(self.settings).items() if name != "reuse"}
+        about: dict[str, Any] = {
+            "geometry": engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
+            "materials": engine.materials(), "versions": engine.versions(), "scene": scene,
+            "asked": asked, "antennas": [getattr(e, "antenna", None) for e in survey.engines], 
+            "samples": campaign.sampling.samples, "names": survey.names, "inputs": campaign.inputs(),
+        }  # fmt: skip
+        if self.settings.required.kind != "coverage":
+            about |= {"csi": asdict(campaign.csi), "spectrum": asdict(campaign.spectrum)}
+        return hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
-def _verify(
-    campaign: Campaign, settings: AutoSettings, traced: Traced, choice: Choice, held: np.ndarray,
-    fewer: Traced | None = None,
-) -> tuple[Choice, Changed]:  # fmt: skip
-    """On the first half of the held-back rows, and on all where that does not prove the requirement."""
-    for count in (auto.first_look(len(held)), len(held)):
-        probe = _probe(campaign, traced, held[:count])
-        kept = None if fewer is None else fewer.paths(held[:count])
-        choice = auto.verify(choice, settings, probe, kept)
-        errors = probe.errors(choice.effects if kept is None else kept, settings.required)
-        failed = int((errors[probe.reached] > settings.required.tolerance).sum())
-        heard = int(probe.reached.sum())
-        early, _ = auto.allowed_failures(heard, len(held), settings.quantile, settings.confidence)
-        if failed <= early:
-            break
-    return choice, Changed(held[:count], errors)
-
-
-def _probe(campaign: Campaign, traced: Traced, rows: np.ndarray) -> Probe:
-    """Rows traced with everything, and their nearest others where the requirement is about spectra."""
-    survey, nearest = traced.survey, None
-    if isinstance(campaign.effects, AutoSettings) and campaign.effects.required.kind == "spectrum":
-        owner, place = np.divmod(rows, len(survey.places))
-        nearest = traced.paths(owner * len(survey.places) + neighbours(survey.places, place))
-    wavelength = survey.engine.wavelength
-    elements, frequency = campaign.csi.elements(wavelength), campaign.scene.frequency_hz
-    return Probe(
-        traced.paths(rows), traced.effects, frequency, wavelength, elements, campaign.spectrum, nearest
-    )
-
-
-def _key(campaign: Campaign, settings: AutoSettings, survey: Survey) -> str:
-    """Hash of geometry, materials, transmitters, where receivers are, band, solver and requirement."""
-    scene = {name: value for name, value in asdict(campaign.scene).items() if name not in OWN}
-    asked = {name: value for name, value in asdict(settings).items() if name != "reuse"}
-    about: dict[str, Any] = {
-        "geometry": survey.engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
-        "materials": survey.engine.materials(), "versions": survey.engine.versions(), "scene": scene,
-        "asked": asked, "antennas": [getattr(e, "antenna", None) for e in survey.engines], 
-        "samples": campaign.sampling.samples, "names": survey.names, "inputs": campaign.inputs(),
-    }  # fmt: skip
-    if settings.required.kind != "coverage":
-        about |= {"csi": asdict(campaign.csi), "spectrum": asdict(campaign.spectrum)}
-    return hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()[:32]
-
-
-def _remember(stored: Path, choice: Choice) -> None:
-    with whole_file(stored) as partial:
-        partial.write_text(json.dumps(asdict(choice), indent=1), encoding="utf-8")
+def _looks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, bool]]:
+    """The first rows, then all of them; and whether these are all."""
+    for count in (auto.first_look(len(rows)), len(rows)):
+        yield rows[:count], count == len(rows)

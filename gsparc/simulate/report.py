@@ -9,6 +9,8 @@ from rich.table import Table
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
 
+STATED = ("deliverable", "probes", "samples", "untried", "row_all", "row_chosen", "saved", "reused")
+
 
 def choice_table(choice: Choice) -> Table:
     """A row per effect: its share of power, errors without it, its cost, kept or dropped."""
@@ -72,22 +74,7 @@ def figures(outcome: Outcome) -> dict[str, Any]:
         facts |= {f"dataset/{k}": v for k, v in outcome.convergence.attributes().items()}
     choice = outcome.choice
     if choice is not None:
-        facts |= {
-            "auto/decide_s": choice.seconds,
-            **{
-                f"auto/{k}": getattr(choice, k)
-                for k in (
-                    "deliverable",
-                    "probes",
-                    "samples",
-                    "untried",
-                    "row_all",
-                    "row_chosen",
-                    "saved",
-                    "reused",
-                )
-            },
-        }
+        facts |= {"auto/decide_s": choice.seconds, **{f"auto/{k}": getattr(choice, k) for k in STATED}}
         for row in choice.table:
             name = row.effect.replace(" > ", "_over_")
             for k in ("share", "nmse", "nmse_p95", "error_p95", "failures", "kept"):

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
+from gsparc.data.datamodule import DataModule
+from gsparc.data.datasets.campaign import made_once, simulated, write_split
+from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, load_rfid, planar_array
 from gsparc.data.files import whole_folder
-from gsparc.data.schema import LIGHT
+from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
 from gsparc.simulate.shoebox import Room, trace
@@ -75,25 +78,7 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
             f"  orientation: {ORIENTATION.tolist()}  # quaternion, scalar last\n"
         )
         (partial / "gateway_info.yml").write_text(gateway, encoding="utf-8")
-        order = np.random.default_rng(seed).permutation(count)
-        test = max(round(0.2 * count), 1)
-        for name, rows in (("test", order[:test]), ("train", order[test:])):
-            np.savetxt(partial / f"{name}_index.txt", np.sort(rows) + 1, fmt="%05d")
-
-
-def ensure_rfid_sim(parent: Path, count: int = 640, seed: int = 0) -> Path:
-    """The folder of this stand-in under `parent`, made when it is not there yet.
-
-    Raises:
-        ValueError: fewer than two positions.
-    """
-    if count < 2:
-        raise ValueError(f"dataset.count={count}: expected at least 2 tag positions")
-    folder = Path(parent) / f"{STAND_IN}-{count}-{seed}"
-    if not folder.is_dir():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        write_rfid_sim(folder, count, seed)
-    return folder
+        write_split(partial, count, seed, first=1, form="%05d")
 
 
 @dataclass(frozen=True)
@@ -111,5 +96,26 @@ class RFIDStandIn:
     root: str | Path = "outputs/stand-ins"
 
     def folder(self) -> Path:
-        """See `ensure_rfid_sim`."""
-        return ensure_rfid_sim(Path(self.root), int(self.count), int(self.seed))
+        """See `StandIn.folder`."""
+        count, seed = int(self.count), int(self.seed)
+        if count < 2:
+            raise ValueError(f"dataset.count={count}: expected at least 2 tag positions")
+        where = Path(self.root) / f"{STAND_IN}-{count}-{seed}"
+        return made_once(where, lambda folder: write_rfid_sim(folder, count, seed))
+
+
+class RFIDSim(DataModule):
+    """`dataset=rfid_sim`: the stand-in as a dataset of its own, see `RFIDStandIn`.
+
+    Args:
+        name, batch_size: see `DataModule`.
+        stand_in: `count`, `seed` and `root` of the stand-in.
+    """
+
+    def __init__(self, name: str = "rfid_sim", batch_size: int = 16, **stand_in: Any) -> None:
+        super().__init__(name, batch_size)
+        self.stand_in = RFIDStandIn(**stand_in)
+
+    def load(self) -> Measurements:
+        """Simulated when it is not there yet, then read like the release."""
+        return simulated(self.stand_in, "RFID", load_rfid)

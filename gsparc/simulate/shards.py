@@ -127,9 +127,11 @@ def written_by(out: Path, plan: Mapping[str, Any]) -> bool:
     """Whether a dataset's file was made by a plan; False where it is of another kind."""
     try:
         with h5py.File(out) as file:
-            return all(_as_text(file.attrs.get(k)) == v for k, v in _signature(_text(plan)).items())
+            stored = {name: file.attrs.get(name) for name in _signature(_text(plan))}
     except OSError:
         return False
+    known = {name: one.decode() if isinstance(one, bytes) else one for name, one in stored.items()}
+    return known == _signature(_text(plan))
 
 
 def _text(plan: Mapping[str, Any]) -> str:
@@ -138,10 +140,6 @@ def _text(plan: Mapping[str, Any]) -> str:
 
 def _signature(text: str) -> dict[str, str]:
     return {"plan_sha256": hashlib.sha256(text.encode()).hexdigest()}
-
-
-def _as_text(value: Any) -> str | None:
-    return value.decode() if isinstance(value, bytes) else value
 
 
 def _write(path: Path, content: str) -> None:

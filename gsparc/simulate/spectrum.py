@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsparc.ops import SphereGrid
-from gsparc.simulate.paths import ARRAYS, Paths
+from gsparc.simulate.paths import Paths
 
 BLOCK = 64  # receivers at once
 CHOICES = {"kind": ("bartlett", "beam"), "scale": ("amplitude", "power"), "normalisation": ("max", "none")}
@@ -95,7 +95,8 @@ def spectra(
     elements = settings.elements(wavelength)
     bartlett = _Bartlett(settings) if settings.kind == "bartlett" else None
     for start in range(0, len(paths), BLOCK):
-        rows, some = slice(start, start + BLOCK), _rows(above, start, start + BLOCK)
+        rows = slice(start, start + BLOCK)
+        some = above.take(np.arange(len(paths))[rows])
         if bartlett is None:
             images[rows] = _beams(some, settings)
         else:
@@ -107,12 +108,6 @@ def spectra(
     peak = np.where(peak > 0, peak, 1.0).astype(np.float64)
     images /= peak[:, None, None].astype(np.float32)
     return images, peak
-
-
-def _rows(paths: Paths, start: int, stop: int) -> Paths:
-    offsets = paths.offsets[start : stop + 1]
-    arrays = (getattr(paths, name)[offsets[0] : offsets[-1]] for name in ARRAYS)
-    return Paths(offsets - offsets[0], *arrays)
 
 
 class _Bartlett:

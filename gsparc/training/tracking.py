@@ -11,6 +11,7 @@ import numpy as np
 from hydra.utils import instantiate
 
 if TYPE_CHECKING:
+    import lightning.pytorch as L
     from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
 
@@ -82,3 +83,9 @@ def table(loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Sequenc
         elif hasattr(getattr(logger, "experiment", None), "add_text"):
             lines = [heads, ["---"] * len(heads), *rows]
             logger.experiment.add_text(name, "\n".join(f"| {' | '.join(line)} |" for line in lines))
+
+
+def noted(trainer: L.Trainer, module: L.LightningModule, figures: Mapping[str, float]) -> None:
+    """Give the loggers the figures of an event, at the number of steps taken, not the schedule's."""
+    for logger in trainer.loggers:
+        logger.log_metrics(dict(figures), step=module.global_step)

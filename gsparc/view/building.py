@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
 from gsparc.data.schema import Site
-from gsparc.data.site_objects import GaussianCloud, SiteObjects
+from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.levels import MAPPED
@@ -55,7 +56,7 @@ class Given:
     walls: SceneWalls | None = None
 
 
-def extent_of(viewed: Viewed, given: Given) -> np.ndarray:
+def extent_of(viewed: Viewed) -> np.ndarray:
     """World places (n, 3) [m] that a frame is put around: where was measured, and the ends that stand."""
     shown = [viewed.box()]
     shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
@@ -73,11 +74,10 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
         station: whose measurements and Gaussians are drawn.
         measured: of that station.
     """
-    frame = Frame.around(extent_of(viewed, given))
+    frame = Frame.around(extent_of(viewed))
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
-    notes = list(viewed.notes)
     ground = ground_of(viewed, given)
     if given.plan is not None:
         parts.append(plan_sheet(given.plan, ground - BENEATH * extent))
@@ -92,22 +92,21 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
             text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
             parts.append(Mark(f"station {name or ''}".strip(), place, text))
     objects = viewed.asked(station).method.objects()
-    parts += _object_parts(objects, viewed.site, legends, frame)
+    origin = viewed.site.origin
+    parts += [
+        _plane_faces(f"mirror {number}", plane, frame.middle - origin, origin, extent)
+        for number, plane in enumerate(objects.planes)
+    ]
+    parts += [_box_faces(f"box {number}", box) for number, box in enumerate(objects.boxes + origin)]
     cloud = cloud_of(viewed, station, measured)
     if cloud is not None:
         parts += _cloud_parts(cloud, legends, extent)
     hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
-    parts.append(_box_lines(*viewed.box()))
+    parts.append(_box_lines(viewed.box()))
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
-    return Scene(
-        title if station is None else f"{title}: {station}",
-        frame,
-        tuple(parts),
-        ground - 2 * BENEATH * extent,
-        legends,
-        hidden,
-        tuple(notes),
-    )
+    title += "" if station is None else f": {station}"
+    beneath = ground - 2 * BENEATH * extent
+    return Scene(title, frame, tuple(parts), beneath, legends, hidden, viewed.notes)
 
 
 def ground_of(viewed: Viewed, given: Given) -> float:
@@ -175,7 +174,7 @@ def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> 
     if isinstance(method, HasGaussians):
         try:
             found = method.gaussians(*_queries(site, measured))
-            return _moved(found, site.origin)
+            return replace(found, means=found.means + site.origin)
         except ValueError:
             pass  # of this kind are only some of those that it fits
     objects = method.objects()
@@ -185,14 +184,8 @@ def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> 
     quats = np.column_stack([np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)])
     share = 1 - 10 ** (-np.abs(objects.losses) / 20)
     label = "loss through the middle [dB]"
-    found = GaussianCloud(objects.means, objects.scales, quats, share, objects.losses, label)
-    return _moved(found, site.origin)
-
-
-def _moved(cloud: GaussianCloud, by: np.ndarray) -> GaussianCloud:
-    return GaussianCloud(
-        cloud.means + by, cloud.scales, cloud.quats, cloud.opacities, cloud.strengths, cloud.label
-    )
+    means = objects.means + site.origin
+    return GaussianCloud(means, objects.scales, quats, share, objects.losses, label)
 
 
 def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]:
@@ -211,16 +204,6 @@ def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]
     return fixed.expand(len(moving), 3), Pose(moving, turn.expand(len(moving), 3, 3))
 
 
-def _object_parts(objects: SiteObjects, site: Site, legends: dict[str, Legend], frame: Frame) -> list[Part]:
-    parts: list[Part] = []
-    reach = EXTENT / frame.scale
-    for number, plane in enumerate(objects.planes):
-        parts.append(_plane_faces(f"mirror {number}", plane, frame.middle - site.origin, site.origin, reach))
-    for number, box in enumerate(objects.boxes + site.origin):
-        parts.append(_box_faces(f"box {number}", box))
-    return parts
-
-
 def _plane_faces(name: str, plane: np.ndarray, middle: np.ndarray, origin: np.ndarray, reach: float) -> Faces:
     """A square of a mirror plane around the foot of the site's middle."""
     normal = plane[:3] / np.linalg.norm(plane[:3])
@@ -234,10 +217,14 @@ def _plane_faces(name: str, plane: np.ndarray, middle: np.ndarray, origin: np.nd
 
 
 def _box_faces(name: str, box: np.ndarray) -> Faces:
-    corner = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Faces(name, corner, triangles, BOX, 0.35)
+    return Faces(name, _corners(box), triangles, BOX, 0.35)
+
+
+def _corners(box: np.ndarray) -> np.ndarray:
+    """(8, 3) of a box (2, 3), z running first."""
+    return np.array(list(product(*box.T)))
 
 
 def walls_faces(walls: SceneWalls) -> list[Part]:
@@ -260,13 +247,12 @@ def plan_sheet(plan: FloorPlan, height: float) -> Sheet:
     return Sheet("floor plan", corners[0], corners[1] - corners[0], corners[3] - corners[0], plan.image)
 
 
-def _box_lines(low: np.ndarray, high: np.ndarray) -> Lines:
+def _box_lines(box: np.ndarray) -> Lines:
     """Edges of the box in which was measured."""
-    corner = np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-    )
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
-    return Lines("box of measurements", corner[np.array(pairs)], np.full((len(pairs), 3), 150, np.uint8))
+    return Lines(
+        "box of measurements", _corners(box)[np.array(pairs)], np.full((len(pairs), 3), 150, np.uint8)
+    )
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,8 @@ class Obstacles:
 
     def _faces(self, start: np.ndarray, along: np.ndarray) -> np.ndarray:
         """Shares of the line (n,) at which faces are crossed. Moeller and Trumbore 1997, equation 4."""
-        corner, one, two = (
-            self.triangles[:, 0],
-            self.triangles[:, 1] - self.triangles[:, 0],
-            self.triangles[:, 2] - self.triangles[:, 0],
-        )
+        corner = self.triangles[:, 0]
+        one, two = self.triangles[:, 1] - corner, self.triangles[:, 2] - corner
         across = np.cross(along, two)
         determinant = (across * one).sum(1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -59,8 +56,7 @@ class Obstacles:
             share = (turned * two).sum(1) / determinant
             # Half open, so that the edge two triangles of a fan share belongs to one of them.
             hit = (u >= 0) & (v > 0) & (u + v <= 1) & (share > 0) & (share < 1)
-        numbers, first, times = np.unique(self.face[hit], return_index=True, return_counts=True)
-        del numbers
+        _, first, times = np.unique(self.face[hit], return_index=True, return_counts=True)
         return np.asarray(share[hit][first[times % 2 == 1]])  # a fan outside its face is crossed twice
 
     def _boxes(self, start: np.ndarray, along: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ import numpy as np
 
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import logarithmic, panels
-from gsparc.ops import SphereGrid
 from gsparc.view.answer import Answer
 from gsparc.view.reasons import Usual
 from gsparc.view.scene import Legend
@@ -27,9 +26,12 @@ def spectrum_image(spectrum: np.ndarray, least_width: int = 360) -> np.ndarray:
 
 
 def response_db(response: np.ndarray) -> np.ndarray:
-    """Of at most `MOST_LINES` antennas (a, K) [dB], from a channel (A, K)."""
-    chosen = response[np.linspace(0, len(response) - 1, min(len(response), MOST_LINES)).astype(int)]
-    power = np.abs(chosen).astype(np.float64) ** 2
+    """Lines [dB] of a channel (A, K): of at most `MOST_LINES` antennas (a, K); the mean (A,) of one tone."""
+    power = np.abs(response).astype(np.float64) ** 2
+    if power.shape[1] == 1:
+        power = power[:, 0]
+    else:
+        power = power[np.linspace(0, len(power) - 1, min(len(power), MOST_LINES)).astype(int)]
     return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
 
 
@@ -41,20 +43,12 @@ def tones_mhz(site: Site, count: int) -> np.ndarray:
     return np.asarray(known, np.float64) / 1e6
 
 
-def degrees_of(grid: SphereGrid) -> tuple[float, float, float, float]:
-    """Least and largest azimuth and elevation of a grid's pixels [degrees]."""
-    left = grid.first_azimuth - grid.azimuth_step / 2
-    low = grid.first_elevation - grid.elevation_step / 2
-    edges = left, left + grid.width * grid.azimuth_step, low, low + grid.height * grid.elevation_step
-    return tuple(float(edge) for edge in np.degrees(edges))  # type: ignore[return-value]
-
-
 def draw_answer(axis: Any, answer: Answer, site: Site, known: Usual | None, unit: str = "dB") -> None:
     """Into matplotlib axes: a spectrum; a channel over its band, its paths or its antennas; or a power among
     those that were measured, by distance or by how many they are."""
     if answer.spectrum is not None:
         assert site.grid is not None
-        how: dict[str, Any] = {"origin": "lower", "extent": degrees_of(site.grid), "aspect": "auto"}
+        how: dict[str, Any] = {"origin": "lower", "extent": site.grid.edges(), "aspect": "auto"}
         axis.imshow(answer.spectrum, cmap=SPECTRUM.colours, vmin=0, vmax=1, **how)
         axis.grid(False)
         axis.set(xlabel="azimuth at the receiver [°]", ylabel="elevation [°]", title="power by direction")
@@ -69,7 +63,7 @@ def draw_answer(axis: Any, answer: Answer, site: Site, known: Usual | None, unit
         axis.plot(answer.paths.delay_ns, answer.paths.gain_db, "o", ms=4)
         axis.set(xlabel="delay [ns]", ylabel="dB", title="paths", ylim=(bottom, None))
     elif answer.response is not None and len(answer.response) > 1:
-        axis.plot(response_db_of_antennas(answer.response), "o-", ms=3)
+        axis.plot(response_db(answer.response), "o-", ms=3)
         axis.set(xlabel="antenna", ylabel="dB", title="channel over antennas")
     else:
         _draw_level(axis, answer, known, unit)
@@ -97,12 +91,6 @@ def _draw_level(axis: Any, answer: Answer, known: Usual | None, unit: str) -> No
         axis.axvline(answer.level_db, color=RED, label="here")
         axis.set(xlabel=label, ylabel="measured places")
         axis.legend()
-
-
-def response_db_of_antennas(response: np.ndarray) -> np.ndarray:
-    """Mean over tones (A,) [dB] of a channel (A, K)."""
-    power = (np.abs(response).astype(np.float64) ** 2).mean(axis=1)
-    return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
 
 
 def panel_image(answer: Answer, site: Site, known: Usual | None, unit: str = "dB") -> np.ndarray:

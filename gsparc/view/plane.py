@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsparc.maps.area import Grid
-from gsparc.maps.levels import predicted
-from gsparc.maps.making import ends_of
+from gsparc.maps.making import levels_at
 from gsparc.prediction.predictor import Predictor
 from gsparc.view.reasons import Usual
 from gsparc.view.scene import Legend, Sheet
@@ -70,7 +69,7 @@ def refining(
         cells, start = np.flatnonzero(chosen), 0
         while start < len(cells):
             begin, part = time.perf_counter(), cells[start : start + chunk]
-            level.reshape(-1)[part] = _levels(predictor, grid.places(part), other)
+            level.reshape(-1)[part] = levels_at(predictor, grid.places(part), other)[0]
             start += len(part)
             took = time.perf_counter() - begin
             chunk = int(np.clip(chunk * STEP_S / max(took, 1e-6), max(chunk / 2, LEAST), 2 * chunk))
@@ -78,14 +77,6 @@ def refining(
         done |= chosen
         yield Plane(grid, _spread(level, stride, grid), stride)
         stride //= 2
-
-
-def _levels(predictor: Predictor, places: np.ndarray, other: Sequence[float] | None) -> np.ndarray:
-    """Levels (n,) [dB], expected, as answers and `gsparc map` give them."""
-    site = predictor.site
-    ends = ends_of(site, places, other)
-    said = predictor.predict(**{end: np.ascontiguousarray(place) for end, place in ends.items()})
-    return predicted(said, site.kind)[0]
 
 
 def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:

@@ -15,6 +15,7 @@ from gsparc.maps.levels import MAPPED
 from gsparc.maps.pictures import Layer
 from gsparc.view.building import VALUES, Given, Sphere, build, start_place
 from gsparc.view.crossed import Obstacles
+from gsparc.view.plane import Plane, refining
 from gsparc.view.reasons import Surroundings, usual
 from gsparc.view.scene import EXTENT, Legend, Points, Scene
 from gsparc.view.viewed import Measured, Viewed
@@ -121,6 +122,13 @@ class SiteView:
                 other = viewed.data.tx[len(viewed.data) // 2] + viewed.site.origin
             found["tx"] = other if self.other is None else self.other
         return found
+
+    def plane(self, name: str | None, grid: Grid) -> Plane:
+        """Power over all of some cells, the transmitter where it first stands if both ends move."""
+        other = None if self.viewed.site.static_end is not None else self.starts(name)["tx"].tolist()
+        *_, plane = refining(self.viewed.asked(name), grid, other)
+        assert plane is not None
+        return plane
 
 
 def grid_for(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:

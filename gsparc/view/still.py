@@ -17,7 +17,7 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.view.answer import ask
 from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
 from gsparc.view.panel import RED, draw_answer
-from gsparc.view.plane import refining, thinned
+from gsparc.view.plane import thinned
 from gsparc.view.scene import Faces, Legend, Lines, Mark, Points
 from gsparc.view.site_view import SiteView
 from gsparc.view.words import ENDS, headline
@@ -121,10 +121,7 @@ def _plane(axis: Any, view: SiteView, name: str | None, legend: Legend | None) -
     grid = view.grid
     assert grid is not None
     coarse = thinned(grid, CELLS)
-    other = None if view.viewed.site.static_end is not None else view.starts(name)["tx"].tolist()
-    *_, plane = refining(view.viewed.asked(name), coarse, other)
-    assert plane is not None
-    level = plane.level_db
+    level = view.plane(name, coarse).level_db
     legend = legend or Legend.over("", level)
     clear = np.where(np.isfinite(level), 0.75, 0.0)[..., None]
     colours = np.concatenate([legend.of(level) / 255, clear], axis=-1)

@@ -46,7 +46,7 @@ def test_too_many_entries_are_refused_before_allocation(monkeypatch):
 
 def test_room_for_all_that_could_be_breaks():
     """Naive: a slot of gradients for every strip that a Gaussian might touch, a million of them, 16 poses."""
-    naive = 16 * 1_000_000 * operators.strips(GRID.height) * operators.layout().MOMENTS * 4
+    naive = 16 * 1_000_000 * operators.strips(GRID.height) * operators.built.kernels().MOMENTS * 4
     assert naive > operators.MEMORY_BOUND
 
 

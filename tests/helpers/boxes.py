@@ -10,8 +10,7 @@ from shoeboxes import scatter
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.shoebox import Room
-from gsparc.simulate.shoebox_engine import ShoeboxEngine
+from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
 ROOM = Room(np.zeros(3), np.array([6.0, 5.0, 3.0]), np.full(6, -0.5))

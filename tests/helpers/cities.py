@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.data.datasets.argos import load_argos
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.simulate.argos_sim import ensure_argos_sim
+from gsparc.simulate.argos_sim import ArgosStandIn
 
 COUNT = 120
 
@@ -20,7 +20,7 @@ COUNT = 120
 @cache
 def folder() -> Path:
     """Its folder."""
-    return ensure_argos_sim(Path(mkdtemp()), count=COUNT, seed=1)
+    return ArgosStandIn(count=COUNT, seed=1, root=mkdtemp()).folder()
 
 
 def city(antenna: int | str = 0) -> Measurements:

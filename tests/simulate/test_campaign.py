@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from gsparc.commands.check import main as check
+from gsparc.commands.simulate_pictures import effect_shares, floor_plan
 from gsparc.data import blocks, files
 from gsparc.data.datasets.sionna import _heard
 from gsparc.data.errors import DataError
@@ -28,13 +29,11 @@ from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.pictures import effect_shares, floor_plan
 from gsparc.simulate.report import choice_table, figures, verdict
 from gsparc.simulate.scenes.build import SceneSettings, build
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.shards import ROWS, Shards
-from gsparc.simulate.shoebox import Room, trace
-from gsparc.simulate.shoebox_engine import ShoeboxEngine
+from gsparc.simulate.shoebox import Room, ShoeboxEngine, trace
 from gsparc.simulate.spectrum import SpectrumSettings
 
 SCENE = SceneSettings(
@@ -326,7 +325,7 @@ class Rays(ShoeboxEngine):
 def with_rays(monkeypatch, off: float) -> AutoSettings:
     monkeypatch.setattr("gsparc.simulate.scenes.build.ShoeboxEngine", Rays)
     monkeypatch.setattr(Rays, "off", off)
-    monkeypatch.setattr(deciding, "_may_pay", lambda *unused: True)
+    monkeypatch.setattr(deciding.Decider, "_may_pay", lambda *unused: True)
     monkeypatch.setattr(deciding, "pays", lambda *unused: True)
     return AutoSettings(probes=64, held_back=64, full=MIRROR)
 
@@ -363,7 +362,7 @@ def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
 def test_a_decision_that_left_rays_untried_is_taken_anew_where_trying_pays(tmp_path, monkeypatch):
     asked = with_rays(monkeypatch, 1.05)
     with monkeypatch.context() as patch:
-        patch.setattr(deciding, "_may_pay", lambda *unused: False)
+        patch.setattr(deciding.Decider, "_may_pay", lambda *unused: False)
         assert simulate(plan(effects=asked), tmp_path / "few.h5").choice.untried
         assert simulate(plan(effects=asked), tmp_path / "same.h5").choice.reused
     many = simulate(plan(effects=asked, scene=replace(SCENE, num_receivers=200)), tmp_path / "many.h5")

@@ -1,8 +1,7 @@
 import numpy as np
 
 from gsparc.data.walls import area, read_walls
-from gsparc.simulate.scenes.mesh import write_mesh
-from gsparc.simulate.scenes.solid import box
+from gsparc.simulate.scenes.solid import box, write_mesh
 
 
 def test_a_mesh_is_read_back_as_walls(tmp_path):

@@ -8,7 +8,7 @@ from gsparc.data.datasets.rfid import HEIGHT, WAVELENGTH, WIDTH, load_rfid, plan
 from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import bartlett, steering
-from gsparc.simulate.rfid_sim import HAND_BOX, ensure_rfid_sim, hand_moved
+from gsparc.simulate.rfid_sim import HAND_BOX, RFIDStandIn, hand_moved
 
 
 def _digest(folder):
@@ -17,18 +17,18 @@ def _digest(folder):
 
 
 def test_deterministic_by_seed_and_reused(tmp_path):
-    first = ensure_rfid_sim(tmp_path / "a", count=20, seed=3)
-    other = ensure_rfid_sim(tmp_path / "b", count=20, seed=3)
+    first = RFIDStandIn(20, 3, tmp_path / "a").folder()
+    other = RFIDStandIn(20, 3, tmp_path / "b").folder()
     assert _digest(first) == _digest(other)
-    assert _digest(first) != _digest(ensure_rfid_sim(tmp_path / "a", count=20, seed=4))
+    assert _digest(first) != _digest(RFIDStandIn(20, 4, tmp_path / "a").folder())
     stamp = (first / "tx_pos.csv").stat().st_mtime_ns
-    assert ensure_rfid_sim(tmp_path / "a", count=20, seed=3) == first
+    assert RFIDStandIn(20, 3, tmp_path / "a").folder() == first
     assert (first / "tx_pos.csv").stat().st_mtime_ns == stamp
     assert [p.name for p in (tmp_path / "b").iterdir()] == ["rfid-sim-20-3"]
 
 
 def test_never_passes_for_the_release(tmp_path):
-    data = load_rfid(ensure_rfid_sim(tmp_path, count=20, seed=0))
+    data = load_rfid(RFIDStandIn(20, 0, tmp_path).folder())
     assert data.site.name == "rfid-sim" and data.site.stand_in == "rfid"
     assert data.target.max(axis=(1, 2)).min() == 255
     assert [len(part) for part in data.release_split] == [16, 4]
@@ -43,7 +43,7 @@ def test_hand_moves_like_the_real_one():
 
 
 def test_tags_sit_on_bright_pixels_like_the_real_ones(tmp_path):
-    data = load_rfid(ensure_rfid_sim(tmp_path, count=60, seed=0))
+    data = load_rfid(RFIDStandIn(60, 0, tmp_path).folder())
     elevation, azimuth = boresight_degrees(data)
     assert elevation.min() > 75 and elevation.max() < 81
     pixel = data.target[np.arange(60), np.round(elevation).astype(int), np.round(azimuth).astype(int) % 360]

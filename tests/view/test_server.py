@@ -33,7 +33,7 @@ from websockets.sync.client import connect  # noqa: E402
 from gsparc.view.newest import Newest  # noqa: E402
 from gsparc.view.server.page import page  # noqa: E402
 from gsparc.view.server.serve import Server  # noqa: E402
-from gsparc.view.server.session import Session  # noqa: E402
+from gsparc.view.server.session import CLOUD, Session  # noqa: E402
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
     drag(session, "tx", low + 0.2 * (high - low))
     settle(session)
     assert (session.nodes["sphere"].colors != before).any() and (session.picture.image != panel).any()
-    session._gaussians_changed("ellipsoids")
+    session._shown(CLOUD, "ellipsoids")
     assert session.nodes["splats"].visible and not session.nodes["gaussians"].visible
 
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from gsparc.data.assemble import FARTHEST, bad_positions
 from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.datamodule import DataModule
@@ -120,6 +122,21 @@ def simulated(stand_in: StandIn, called: str, read: Callable[[Path], Measurement
     layout = f"{called.lower()}-sim: SIMULATED data in the layout of the {called} release"
     log.warning("%s, at %s", layout, folder)
     return read(folder)
+
+
+def made_once(folder: Path, write: Callable[[Path], None]) -> Path:
+    """The folder, written when it is not there yet."""
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        write(folder)
+    return folder
+
+
+def write_split(folder: Path, count: int, seed: int, first: int = 0, form: str = "%d") -> None:
+    """The rows' numbers from `first` on, a random fifth of them for testing, in a text file each."""
+    order, test = np.random.default_rng(seed).permutation(count) + first, max(round(0.2 * count), 1)
+    for name, rows in (("test", order[:test]), ("train", order[test:])):
+        np.savetxt(folder / f"{name}_index.txt", np.sort(rows), fmt=form)
 
 
 REAL, COMPLEX, FLAGS, TEXT, LABELS = "iuf", "c", "biuf", "US", "USiu"  # kinds of NumPy's dtypes

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.peers.deformation import perceptron
+from gsparc.models.peers.trained import perceptron
 from gsparc.models.uplink.interface import UplinkMethod, rms
 from gsparc.training.context import FitContext, FitReport
 

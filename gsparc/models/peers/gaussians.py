@@ -1,17 +1,19 @@
-"""Gaussians of a peer: their start, how they are rendered, and what they are for a picture."""
+"""Gaussians of a peer: their start, what changes them, how they are rendered, what they are for a picture."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
 from gsparc.field.model import FULL_SPHERE_ROWS
-from gsparc.models.peers.network import Network, Scene
-from gsparc.models.peers.trained import TrainedPeer
+from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
 
 MARGIN = 2.0  # [m] around the moving end's box
@@ -35,6 +37,23 @@ class GaussianPeer(TrainedPeer):
             network.emitted(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx) for i in range(len(tx))
         ]
         return network.cloud(torch.stack(emitted).square().mean(0).sqrt())
+
+
+@dataclass(eq=False, kw_only=True)
+class DeformedPeer(GaussianPeer):
+    """Spectra of Gaussians that a network changes with the query.
+
+    Args:
+        count: Gaussians.
+        width, depth, octaves: of the deforming network.
+        others: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
+    count: int = 500
+    width: int = 64
+    depth: int = 3
+    octaves: int = 5
 
 
 class GaussianNetwork(Network):
@@ -89,3 +108,30 @@ def render_each(
         for i, (*one, feature) in enumerate(zip(*geometry, features, strict=True))
     ]
     return torch.stack(images)
+
+
+class Deformation(nn.Module):
+    """(place of a Gaussian, query) -> changes of its attributes; zero before training.
+
+    Args:
+        places: (2, 3) [m], box that the Gaussians start in.
+        queries: (2, 3) [m], box of the moving end.
+        outputs: numbers per Gaussian.
+        settings: `width` and `depth` of the network, `octaves` of the Fourier features of both inputs.
+    """
+
+    def __init__(self, places: Tensor, queries: Tensor, outputs: int, settings: DeformedPeer) -> None:
+        super().__init__()
+        width, encoding = settings.width, EncodingSettings("fourier", settings.octaves)
+        self.place, self.query = PositionEncoding(encoding, places), PositionEncoding(encoding, queries)
+        # The first layer is linear: its two halves are added instead of writing every pair of inputs out.
+        self.by_place = nn.Linear(self.place.width, width)
+        self.by_query = nn.Linear(self.query.width, width)
+        self.rest = perceptron(width, outputs, width, settings.depth - 1)
+        for parameter in self.rest[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, places: Tensor, queries: Tensor) -> Tensor:
+        """places (N, 3) [m], queries (B, 3) [m] -> (B, N, outputs)."""
+        hidden = self.by_place(self.place(places)) + self.by_query(self.query(queries)).unsqueeze(1)
+        return self.rest(torch.relu(hidden))

@@ -30,8 +30,7 @@ from gsparc.models.peers.gaussians import (
     gaussians_of,
     rendering_of,
 )
-from gsparc.models.peers.network import Network, Scene
-from gsparc.models.peers.radiance import fourier_legendre, terms
+from gsparc.models.peers.trained import Network, Scene
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
 
 TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
@@ -66,9 +65,9 @@ class ComplexGaussians(GaussianNetwork):
     """N Gaussians, each with K complex coefficients."""
 
     def __init__(self, scene: Scene, settings: GSRF) -> None:
-        super().__init__()
+        super().__init__(scene, settings.count)
         count, self.degree, self.order = settings.count, settings.degree, settings.order
-        self.scene, self.count, self.fourier_weight = scene, count, settings.fourier_weight
+        self.fourier_weight = settings.fourier_weight
         self.ssim_weight = settings.ssim_weight / (1 - settings.fourier_weight)  # of what the base counts
         self.field = gaussians_of(scene, count)
         self.grid, self.options = rendering_of(scene)
@@ -138,3 +137,26 @@ class ComplexGaussians(GaussianNetwork):
 def _magnitude(image: Tensor) -> Tensor:
     """(B, 2, H, W) -> (B, H, W)."""
     return (image.square().sum(1) + TINY).sqrt()
+
+
+def terms(degree: int, order: int) -> int:
+    """Number of terms of `fourier_legendre`."""
+    return (degree + 1) * (2 * order + 1)
+
+
+def fourier_legendre(directions: Tensor, degree: int, order: int) -> Tensor:
+    """P_l(cos theta) times 1, cos(m phi), sin(m phi): unit vectors (..., 3) -> (..., terms).
+
+    With complex coefficients these span the same functions as P_l(cos theta) exp(j m phi), |m| <= `order`,
+    l <= `degree`; theta is measured from z.
+    """
+    x, y, z = directions.unbind(-1)
+    legendre = [torch.ones_like(z), z]
+    for n in range(1, degree):  # Bonnet's recursion
+        legendre.append(((2 * n + 1) * z * legendre[n] - n * legendre[n - 1]) / (n + 1))
+    azimuth = torch.atan2(y, x)
+    waves = [torch.ones_like(azimuth)]
+    for m in range(1, order + 1):
+        waves += [torch.cos(m * azimuth), torch.sin(m * azimuth)]
+    series = torch.stack(legendre[: degree + 1], -1).unsqueeze(-1) * torch.stack(waves, -1).unsqueeze(-2)
+    return series.flatten(-2)

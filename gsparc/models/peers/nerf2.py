@@ -23,9 +23,7 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.models.peers.deformation import perceptron
-from gsparc.models.peers.network import Network, Scene
-from gsparc.models.peers.trained import TrainedPeer
+from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Pose
 
 REFERENCE = 0.025  # [m] at which a signal has unit gain: 1/d without its constant
@@ -67,9 +65,9 @@ class MarchedField(Network):
     directions: Tensor
 
     def __init__(self, scene: Scene, settings: NeRF2) -> None:
-        super().__init__()
+        super().__init__(scene)
         assert scene.site.grid is not None
-        self.scene, self.samples, self.rays = scene, settings.samples, settings.rays
+        self.samples, self.rays = settings.samples, settings.rays
         self.far = 1.5 * scene.reach if settings.far_m is None else settings.far_m
         centre = scene.box.mean(0) if scene.receiver is None else scene.receiver.position
         around = torch.stack([centre - self.far, centre + self.far])

@@ -20,8 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Kind
-from gsparc.models.peers.network import Network, Scene
-from gsparc.models.peers.trained import TrainedPeer
+from gsparc.models.peers.trained import Network, Scene, TrainedPeer
 from gsparc.ops import Pose
 from gsparc.physics.array_response import bartlett, normalised, steering
 from gsparc.physics.waves import LIGHT
@@ -63,8 +62,7 @@ class Radiators(Network):
     steering: Tensor | None
 
     def __init__(self, scene: Scene, count: int) -> None:
-        super().__init__()
-        self.scene, self.count = scene, count
+        super().__init__(scene, count)
         spectrum = scene.site.kind == "spectrum"
         antennas, tones = (len(scene.site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
         low, high = scene.box[0] - MARGIN, scene.box[1] + MARGIN

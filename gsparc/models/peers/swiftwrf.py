@@ -21,11 +21,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
-from gsparc.models.peers.deformation import Deformation
-from gsparc.models.peers.gaussians import GaussianNetwork, GaussianPeer, render_each
-from gsparc.models.peers.network import Network, Scene
+from gsparc.models.peers.gaussians import Deformation, DeformedPeer, GaussianNetwork, render_each
+from gsparc.models.peers.trained import Network, Scene
 from gsparc.ops import Cutoff, Pose, SphereGrid
 
 CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
@@ -36,28 +34,18 @@ SHIFT = 0.1  # [rad] per unit of the network's output
 
 
 @dataclass(eq=False, kw_only=True)
-class SwiftWRF(GaussianPeer):
-    """Spectra.
+class SwiftWRF(DeformedPeer):
+    """Spectra; settings as of `DeformedPeer`."""
 
-    Args:
-        count: Gaussians.
-        width, depth, octaves: of the deforming network.
-        others: see `TrainedPeer`.
-    """
-
-    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
     rates: ClassVar[dict[str, float]] = {
         "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
     }  # fmt: skip
     name: str = "swiftwrf"
     count: int = 300
-    width: int = 64
-    depth: int = 3
-    octaves: int = 5
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
-        return PlanarGaussians(scene, self.count, self.width, self.depth, self.octaves)
+        return PlanarGaussians(scene, self)
 
 
 class PlanarGaussians(GaussianNetwork):
@@ -67,10 +55,10 @@ class PlanarGaussians(GaussianNetwork):
     axes: Tensor
     frames: Tensor
 
-    def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
-        super().__init__()
+    def __init__(self, scene: Scene, settings: DeformedPeer) -> None:
+        super().__init__(scene, settings.count)
         assert scene.site.grid is not None
-        self.scene, self.count, self.grid = scene, count, scene.site.grid
+        self.grid, count = scene.site.grid, settings.count
         base, axes = lattice(self.grid, count)
         self.register_buffer("base", base)
         self.register_buffer("axes", axes)
@@ -81,7 +69,7 @@ class PlanarGaussians(GaussianNetwork):
         self.angles = nn.Parameter(torch.zeros(count))
         self.strengths = nn.Parameter(torch.full((count,), 0.2))
         sphere = torch.tensor([[-1.0] * 3, [1.0] * 3])
-        self.deformation = Deformation(sphere, scene.box, sum(CHANGES), width, depth, octaves)
+        self.deformation = Deformation(sphere, scene.box, sum(CHANGES), settings)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W)."""

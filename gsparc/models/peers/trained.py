@@ -1,4 +1,4 @@
-"""Base of peers trained by gradient: training loop under a time budget, stored state."""
+"""Peers trained by gradient: what a network knows of a scene, training under a time budget, stored state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, pairwise
 from typing import Any, ClassVar
 
 import lightning.pytorch as L
@@ -15,18 +15,84 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.datamodule import order
-from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.schema import Batch, Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
-from gsparc.models.peers.network import Network, Scene
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.losses import channel_loss, spectrum_loss
 from gsparc.training.time_budget import TimeBudget
 
 DEFAULT_BUDGET_S = 60.0
 FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
 WARMUP = 0.02  # share of the training over which rates rise
 QUERY_CHUNK = 32  # bounds the memory of one prediction call
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a network may know of a site before it is trained.
+
+    Attributes:
+        site: the fixed facts.
+        shape: of one target: (H, W), (antennas, subcarriers) or (1,).
+        receiver: pose of the static receiver; None when it moves.
+        transmitter: (3,) [m], the static transmitter; None when it moves.
+        box: (2, 3) float32 [m], lower and upper corner of the moving end's training positions.
+    """
+
+    site: Site
+    shape: tuple[int, ...]
+    receiver: Pose | None
+    transmitter: Tensor | None
+    box: Tensor
+
+    @property
+    def reach(self) -> float:
+        """Extent of the scene [m]: from the static end to the far side of the box."""
+        low, high = self.box
+        still = self.receiver.position if self.receiver is not None else self.transmitter
+        middle = (low + high) / 2
+        apart = 0.0 if still is None else float((still - middle).norm())
+        return max(apart + float((high - low).norm()) / 2, 1.0)
+
+
+class Network(nn.Module):
+    """Positions in, targets out: called with tx (B, 3) [m] and one shared or B receiver poses.
+
+    Args:
+        scene: what is known of the site.
+        count: Gaussians, or virtual transmitters.
+    """
+
+    ssim_weight = 0.2  # share of the loss of spectra
+
+    def __init__(self, scene: Scene, count: int = 0) -> None:
+        super().__init__()
+        self.scene, self.count = scene, count
+
+    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Training loss () of a batch; `draw` for whatever is drawn at random."""
+        prediction = self(batch.tx, batch.rx)
+        if prediction.is_complex():
+            return channel_loss(prediction, batch.target, batch.mask).mean()
+        if batch.mask is not None:
+            prediction = torch.where(batch.mask, prediction, batch.target)
+        return spectrum_loss(prediction, batch.target, self.ssim_weight).mean()
+
+    @torch.no_grad()
+    def answer(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The prediction at inference, which may keep state between calls."""
+        return self(tx, rx)
+
+
+def perceptron(
+    inner: int, outer: int, width: int, depth: int, activation: type[nn.Module] = nn.ReLU
+) -> nn.Sequential:
+    """`depth` hidden layers of `width`."""
+    sizes = [inner, *[width] * depth]
+    layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), activation())]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outer))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -157,8 +223,8 @@ class TrainedPeer(Method):
         return {
             "shape": list(scene.shape),
             "receiver": None if receiver is None else [receiver.position, receiver.rotation],
-            **{"transmitter": scene.transmitter, "box": scene.box},
-            **{"found": self.found, "network": network.state_dict(), "steps": self.steps},
+            **{"transmitter": scene.transmitter, "box": scene.box, "found": self.found},
+            **{"network": network.state_dict(), "steps": self.steps},
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:

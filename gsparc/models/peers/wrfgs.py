@@ -16,17 +16,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Kind
-from gsparc.models.peers.deformation import Deformation
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
+    Deformation,
+    DeformedPeer,
     GaussianNetwork,
-    GaussianPeer,
     gaussians_of,
     render_each,
     rendering_of,
 )
-from gsparc.models.peers.network import Network, Scene
+from gsparc.models.peers.trained import Network, Scene
 from gsparc.ops import Pose
 
 CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
@@ -34,39 +33,27 @@ SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
 
 
 @dataclass(eq=False, kw_only=True)
-class WRFGSPlus(GaussianPeer):
-    """Spectra.
+class WRFGSPlus(DeformedPeer):
+    """Spectra; settings as of `DeformedPeer`."""
 
-    Args:
-        count: Gaussians.
-        width, depth, octaves: of the deforming network.
-        others: see `TrainedPeer`.
-    """
-
-    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
     rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
     name: str = "wrfgs"
-    count: int = 500
-    width: int = 64
-    depth: int = 3
-    octaves: int = 5
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
-        return DeformedGaussians(scene, self.count, self.width, self.depth, self.octaves)
+        return DeformedGaussians(scene, self)
 
 
 class DeformedGaussians(GaussianNetwork):
     """Static Gaussians and the network that deforms them."""
 
-    def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
-        super().__init__()
-        self.scene, self.count = scene, count
+    def __init__(self, scene: Scene, settings: DeformedPeer) -> None:
+        super().__init__(scene, settings.count)
         self.grid, self.options = rendering_of(scene)
-        self.field = gaussians_of(scene, count)
-        self.signals = nn.Parameter(torch.zeros(count))
+        self.field = gaussians_of(scene, self.count)
+        self.signals = nn.Parameter(torch.zeros(self.count))
         places = torch.stack(self.field.means.detach().aminmax(dim=0))
-        self.deformation = Deformation(places, scene.box, sum(CHANGES), width, depth, octaves)
+        self.deformation = Deformation(places, scene.box, sum(CHANGES), settings)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W)."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.instantiate import known_keys
+from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.engine import Engine
 from gsparc.simulate.raytracer import RayTracer, Sampling
@@ -21,8 +22,7 @@ from gsparc.simulate.scenes.placement import clear_of
 from gsparc.simulate.scenes.receivers import layout, receivers
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna, Transmitter, stations
-from gsparc.simulate.shoebox import Room
-from gsparc.simulate.shoebox_engine import ShoeboxEngine
+from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ class SceneSettings:
             raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
         if self.transmitters is not None and not self.transmitters:
             raise ValueError("scene.transmitters: an empty list; expected a transmitter or more")
-        if self.transmitter_m is not None and not _three(self.transmitter_m):
+        if self.transmitter_m is not None and finite(self.transmitter_m).shape != (3,):
             raise ValueError(f"scene.transmitter_m={self.transmitter_m}: expected three finite numbers [m]")
         if self.over not in OVER:
             raise ValueError(f"scene.over={self.over}: expected one of {', '.join(OVER)}")
@@ -323,11 +323,3 @@ class _Around:
         if self._over == "ground":
             free &= self._tracer.surface(points[:, :2])[1]
         return free & self._tracer.under_open_sky(points) if self.open_sky else free
-
-
-def _three(values: Sequence[float]) -> bool:
-    try:
-        found = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        return False
-    return found.shape == (3,) and bool(np.isfinite(found).all())

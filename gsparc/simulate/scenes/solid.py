@@ -1,11 +1,16 @@
-"""Boxes and sheets of a scene built in code: triangles with an ITU material."""
+"""Boxes and sheets of a scene built in code: triangles with an ITU material; triangles as a file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from gsparc.data.files import whole_file
+
+MILLIMETRES = 3  # digits of a corner in a file
 
 
 @dataclass(frozen=True)
@@ -47,3 +52,15 @@ def box(name: str, material: str, lower: ArrayLike, upper: ArrayLike, turn: floa
     ])  # fmt: skip
     vertices = (low + high) / 2 + offset
     return Solid(name, material, vertices, faces, np.stack([vertices.min(0), vertices.max(0)]))
+
+
+def write_mesh(triangles: np.ndarray, path: Path) -> None:
+    """Write triangles (n, 3, 3) [m], world, as Wavefront OBJ, whole or not at all; equal corners are one.
+
+    `init=scene` and other programs read it.
+    """
+    corners, which = np.unique(np.round(triangles.reshape(-1, 3), MILLIMETRES), axis=0, return_inverse=True)
+    vertices = [f"v {x:.3f} {y:.3f} {z:.3f}" for x, y, z in corners]
+    faces = [f"f {a} {b} {c}" for a, b, c in which.reshape(-1, 3) + 1]
+    with whole_file(path) as partial:
+        partial.write_text("\n".join([*vertices, *faces, ""]), encoding="utf-8")

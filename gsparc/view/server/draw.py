@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -24,15 +25,9 @@ def draw(api: Any, frame: Frame, part: Part, visible: bool = True) -> Any:
             point_shape="circle", precision="float32", point_shading="flat", visible=visible,
         )  # fmt: skip
     if isinstance(part, Lines):
-        colours = np.repeat(part.colours[:, None], 2, axis=1)
-        return api.add_line_segments(
-            name,
-            frame.drawn(part.segments),
-            colours,
-            thickness=THICKNESS,
-            thickness_units="screen",
-            visible=visible,
-        )
+        places, colours = frame.drawn(part.segments), np.repeat(part.colours[:, None], 2, axis=1)
+        how = {"thickness": THICKNESS, "thickness_units": "screen", "visible": visible}
+        return api.add_line_segments(name, places, colours, **how)
     if isinstance(part, Splats):
         return api.add_gaussian_splats(
             name, frame.drawn(part.means), np.float32(part.covariances * frame.scale**2), part.colours,
@@ -51,6 +46,13 @@ def draw(api: Any, frame: Frame, part: Part, visible: bool = True) -> Any:
     if part.text:
         api.add_label(f"{name}/name", part.text, position=(0.0, 0.0, 0.02 * EXTENT), anchor="bottom-center")
     return ball
+
+
+def draw_scene(api: Any, scene: Scene, before: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything that is not hidden at first, in place of the nodes `before`; returns the nodes by name."""
+    for node in before.values():
+        node.remove()
+    return {part.name: draw(api, scene.frame, part) for part in scene.parts if part.name not in scene.hidden}
 
 
 def path_of(name: str) -> str:

@@ -14,10 +14,10 @@ import viser
 from gsparc.view.answer import Answer, ask
 from gsparc.view.building import PATHS, SPHERE, rays_of
 from gsparc.view.panel import panel_image
-from gsparc.view.plane import refining, sheet
+from gsparc.view.plane import sheet
 from gsparc.view.reasons import Usual
 from gsparc.view.scene import EXTENT, Legend, Part, Points, Scene, Sheet
-from gsparc.view.server.draw import draw, first_view, floor
+from gsparc.view.server.draw import draw, draw_scene, first_view, floor
 from gsparc.view.site_view import SiteView, walk
 from gsparc.view.words import ENDS, headline, legend_html
 
@@ -69,9 +69,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
         for place in walk(view, name, steps // len(names)):
             answer = ask(viewed.asked(name), {**view.starts(name), moving: place})
             dot.position = scene.frame.drawn(place)
-            label.text = (
-                headline(answer, view.unit) if len(names) == 1 else f"{name}: {headline(answer, view.unit)}"
-            )
+            label.text = (f"{name}: " if len(names) > 1 else "") + headline(answer, view.unit)
             parts: list[Part] = list(rays_of(answer, extent) or ())
             legends += [PATHS] if parts else []
             if sphere is not None and answer.spectrum is not None and "rx" in answer.ends:
@@ -85,9 +83,8 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
     shown = ""
     if len(viewed.stations) > 1:
         shown = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
-        shown += (
-            "; station=NAME shows another" if len(names) < len(viewed.stations) else ", one after another"
-        )
+        some = len(names) < len(viewed.stations)
+        shown += "; station=NAME shows another" if some else ", one after another"
     said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=shown)]
     title = scene.title if len(names) == 1 else scene.title.removesuffix(f": {names[0]}")
     return recorder.as_html(), _side_panel(replace(scene, title=title), said, legends)
@@ -97,15 +94,12 @@ def _still(
     api: Any, view: SiteView, name: str | None, before: dict[str, Any]
 ) -> tuple[dict[str, Any], list[Legend]]:
     """Draw what stands still of a station in place of the nodes `before`; its nodes, and their colours."""
-    for node in before.values():
-        node.remove()
     one = view.station(name)
     scene = one.scene
-    nodes = {part.name: draw(api, scene.frame, part) for part in scene.parts if part.name not in scene.hidden}
+    nodes = draw_scene(api, scene, before)
     legends = [legend for part, legend in scene.legends.items() if part not in scene.hidden]
     if view.grid is not None:
-        *_, plane = refining(view.viewed.asked(name), view.grid, _other(view))
-        assert plane is not None
+        plane = view.plane(name, view.grid)
         legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
         legends.append(legend)
         level = sheet("plane", view.grid, plane.level_db, legend, one.dot / 2)
@@ -113,12 +107,6 @@ def _still(
     if len(view.viewed.stations) > 1:
         legends = [replace(legend, label=f"{name}: {legend.label}") for legend in legends]
     return nodes, legends
-
-
-def _other(view: SiteView) -> list[float] | None:
-    if view.viewed.site.static_end is not None:
-        return None
-    return [float(value) for value in view.starts(None)["tx"]]
 
 
 def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.ndarray, extent: float) -> Sheet:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
+from gsparc.maps.area import Grid
 from gsparc.view.answer import Answer, ask
 from gsparc.view.building import (
     ERRORS,
@@ -25,18 +27,19 @@ from gsparc.view.building import (
     rays_of,
 )
 from gsparc.view.newest import Newest
-from gsparc.view.panel import degrees_of, response_db, response_db_of_antennas, spectrum_image, tones_mhz
+from gsparc.view.panel import response_db, spectrum_image, tones_mhz
 from gsparc.view.plane import Plane, beyond_distance, lifted, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
 from gsparc.view.reasons import reasons
 from gsparc.view.scene import EXTENT, Legend, Points
-from gsparc.view.server.draw import draw, first_view, floor
+from gsparc.view.server.draw import draw, draw_scene, first_view, floor
 from gsparc.view.site_view import SiteView
 from gsparc.view.words import ENDS, answer_markdown, legend_html
 
 PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothing"
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
 PLANE = "plane"
+CLOUD = {"points": GAUSSIANS, "ellipsoids": SPLATS}
 PADDING = (12, 8, 0, 0)  # of plots: else their highest number is cut [pixels]
 KEPT = 50  # times that a median is taken of
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -45,11 +48,6 @@ DOTS = (
     {"width": 0, "stroke": COLOURS[1], "points": {"show": True, "size": 10, "fill": COLOURS[1]}},
 )
 LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
-
-
-def map_name(layer: str) -> str:
-    """Of a layer that `gsparc map` made, to choose it by."""
-    return f"map: {layer.replace('_', ' ')}"
 
 
 class Session:
@@ -77,6 +75,10 @@ class Session:
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
+        self.made: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # layers of a map, as they are chosen
+        for grid, one in view.layers:
+            legend = Legend(one.label, *one.range(), one.colours)
+            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, legend
         self._draw_still()
         first_view(client.camera)
         self._panel()
@@ -94,20 +96,11 @@ class Session:
     def _draw_still(self) -> None:
         api = self.client.scene
         api.set_up_direction("+z")
-        for node in self.nodes.values():
-            node.remove()
-        self.nodes = {
-            part.name: draw(api, self.scene.frame, part)
-            for part in self.scene.parts
-            if part.name not in self.scene.hidden
-        }
+        self.nodes = draw_scene(api, self.scene, self.nodes)
         self.cell = floor(api, self.scene)
         if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
-            around, black = (
-                self.scene.frame.middle + self.sphere.offsets,
-                np.zeros((len(self.sphere.rows), 3)),
-            )
-            dots = Points(SPHERE, around, black.astype(np.uint8), self.sphere.size)
+            around = self.scene.frame.middle + self.sphere.offsets
+            dots = Points(SPHERE, around, np.zeros(around.shape, np.uint8), self.sphere.size)
             self.nodes[SPHERE] = draw(api, self.scene.frame, dots)
 
     def _add_gizmos(self) -> None:
@@ -135,12 +128,11 @@ class Session:
             choice.on_update(lambda event: self._station_changed(event.target.value))
         self.said = gui.add_markdown("asking ...")
         self.picture: Any = None
-        self.curve: Any = None
-        self.delay_curve: Any = None
+        self.curves: dict[str, Any] = {}
         self.vectors = {}
         for end, place in self.places.items():
             vector = gui.add_vector3(f"{ENDS[end]} [m]", tuple(np.round(place, 3)), step=0.01)
-            self._on(vector, self._typed(end))
+            self._on(vector, partial(self._move, end))
             self.vectors[end] = vector
         row = [FIRST_PLACE] + ([WEAKEST] if self.view.grid is not None else [])
         buttons = gui.add_button_group("go to", row)
@@ -166,21 +158,18 @@ class Session:
         with gui.add_folder("Shown"):
             has = {name: self.scene.part(name) is not None for name in (VALUES, ERRORS, GAUSSIANS)}
             if has[VALUES]:
-                choices = ("values", *(("errors",) if has[ERRORS] else ()), NOTHING)
-                self.points = gui.add_dropdown("measured points", choices, initial_value="values")
-                self._on(self.points, self._points_changed)
+                points = {"values": VALUES, **({"errors": ERRORS} if has[ERRORS] else {})}
+                chosen = gui.add_dropdown("measured points", (*points, NOTHING), initial_value="values")
+                self._on(chosen, partial(self._shown, points))
             if has[GAUSSIANS]:
-                self.gaussians = gui.add_dropdown("Gaussians", ("points", "ellipsoids", NOTHING))
-                self._on(self.gaussians, self._gaussians_changed)
+                self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._shown, CLOUD))
                 button = gui.add_button("download Gaussians as PLY")
                 button.on_click(lambda _: self._download())
             self.chosen: Any = None
-            if self.view.grid is not None or self.view.layers:
+            if self.view.grid is not None or self.made:
                 known = self.one.about.usual
                 far = (BEYOND,) if known is not None and np.isfinite(known.at_one) else ()
-                names = ((PREDICTED, *far) if self.view.grid is not None else ()) + tuple(
-                    map_name(layer.name) for _, layer in self.view.layers
-                )
+                names = (*((PREDICTED, *far) if self.view.grid is not None else ()), *self.made)
                 self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
                 self._on(self.chosen, lambda value: self.want_plane())
                 self.progress = gui.add_markdown("")
@@ -222,14 +211,8 @@ class Session:
 
         return moved
 
-    def _typed(self, end: str) -> Any:
-        def typed(value: Any) -> None:
-            self._move(end, np.asarray(value, np.float64))
-
-        return typed
-
-    def _move(self, end: str, place: np.ndarray) -> None:
-        self.places[end] = place
+    def _move(self, end: str, given: ArrayLike) -> None:
+        self.places[end] = place = np.asarray(given, np.float64)
         self.gizmos[end].position = self.scene.frame.drawn(place)
         self._moved(end)
 
@@ -251,14 +234,10 @@ class Session:
                 place = found
         self._move(moving, place)
 
-    def _points_changed(self, value: str) -> None:
-        self._seen(VALUES, value == "values")
-        self._seen(ERRORS, value == "errors")
-        self._legends()
-
-    def _gaussians_changed(self, value: str) -> None:
-        self._seen(GAUSSIANS, value == "points")
-        self._seen(SPLATS, value == "ellipsoids")
+    def _shown(self, parts: Mapping[str, str], choice: str) -> None:
+        """Of parts, by the words to choose them by, show the one that was chosen alone."""
+        for word, name in parts.items():
+            self._seen(name, word == choice)
         self._legends()
 
     def _seen(self, name: str, visible: bool) -> None:
@@ -362,7 +341,7 @@ class Session:
     def _show_spectrum(self, spectrum: np.ndarray, receiver: np.ndarray | None) -> None:
         image = spectrum_image(spectrum)
         if self.picture is None:
-            left, right, low, high = degrees_of(self.site.grid)  # type: ignore[arg-type]
+            left, right, low, high = self.site.grid.edges()  # type: ignore[union-attr]
             label = (
                 f"power by direction at the receiver: azimuth {round(left)} to {round(right)}° to the "
                 f"right, elevation {round(low)} to {round(high)}° upwards"
@@ -377,19 +356,14 @@ class Session:
     def _show_response(self, response: np.ndarray) -> None:
         if response.size == 1:
             return
+        lines = np.atleast_2d(response_db(response))
         if response.shape[1] > 1:
-            lines, x = response_db(response), tones_mhz(self.site, response.shape[1])
-            title = "channel [dB] by frequency [MHz]"
+            x, title = tones_mhz(self.site, response.shape[1]), "channel [dB] by frequency [MHz]"
             if len(lines) > 1:
                 title += f", {len(lines)} of {len(response)} antennas"
         else:
-            lines, x = response_db_of_antennas(response)[None], np.arange(len(response))
-            title = "channel [dB] by antenna"
-        data = (np.asarray(x, np.float64), *(np.asarray(line, np.float64) for line in lines))
-        if self.curve is None:
-            self.curve = self._plot(data, title, LINES, self._after())
-        else:
-            self.curve.data = data
+            x, title = np.arange(len(response), dtype=np.float64), "channel [dB] by antenna"
+        self._curve("channel", (x, *lines), title, LINES)
 
     def _show_rays(self, answer: Answer) -> None:
         rays = rays_of(answer, self.view.extent(self.station))
@@ -403,10 +377,14 @@ class Session:
             return
         order = np.argsort(answer.paths.delay_ns)
         data = (answer.paths.delay_ns[order], answer.paths.gain_db[order])
-        if self.delay_curve is None:
-            self.delay_curve = self._plot(data, "paths: gain [dB] by delay [ns]", DOTS, self._after())
+        self._curve("delays", data, "paths: gain [dB] by delay [ns]", DOTS)
+
+    def _curve(self, name: str, data: tuple[np.ndarray, ...], title: str, looks: Any) -> None:
+        """A plot below what is said, made when there is first something to draw."""
+        if name in self.curves:
+            self.curves[name].data = data
         else:
-            self.delay_curve.data = data
+            self.curves[name] = self._plot(data, title, looks, self._after())
 
     def _plot(self, data: Any, title: str, looks: Any, order: float | None = None) -> Any:
         series = ({}, *looks[: len(data) - 1])
@@ -416,23 +394,14 @@ class Session:
         )  # fmt: skip
 
     def _after(self) -> float:
-        return float(self.said.order) + 0.1 + 0.1 * (self.curve is not None)
+        return float(self.said.order) + 0.1 + 0.1 * len(self.curves)
 
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
-        made = next(((grid, layer) for grid, layer in self.view.layers if map_name(layer.name) == name), None)
         self.power = None
-        if made is not None:
-            grid, layer = made
-            self._lay(
-                sheet(
-                    PLANE,
-                    grid,
-                    layer.values,
-                    Legend(layer.label, *layer.range(), layer.colours),
-                    self.one.dot / 2,
-                )
-            )
+        if name in self.made:
+            grid, *_ = self.made[name]
+            self._lay(*self.made[name])
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
         elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
             yield from self._predicted_plane(name == BEYOND)
@@ -457,12 +426,10 @@ class Session:
                 most = max(3 * known.spread_db, 1.0)
                 label = "power more than distance alone explains [dB]"
                 legend = legend or Legend(label, -most, most, "PuOr")
-            first, legend = (
-                self.power is None,
-                legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db),
-            )
+            first = self.power is None
+            legend = legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db)
             self.plane, self.power = plane, legend
-            self._lay(sheet(PLANE, grid, plane.level_db, legend, self.one.dot / 2))
+            self._lay(grid, plane.level_db, legend)
             if first:
                 self._legends()
             asked = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
@@ -476,7 +443,8 @@ class Session:
         """World place (3,) [m] of the other end than the plane's."""
         return self.places["tx"] if self.site.static_end is None else self.view.viewed.still(self.station)
 
-    def _lay(self, part: Any) -> None:
+    def _lay(self, grid: Grid, values: np.ndarray, legend: Legend) -> None:
+        part = sheet(PLANE, grid, values, legend, self.one.dot / 2)
         self.nodes[PLANE] = draw(self.client.scene, self.scene.frame, part)
 
     def _legends(self) -> None:
@@ -485,9 +453,5 @@ class Session:
         shown += [PATHS] if RAYS in self.nodes else []
         shown += [self.power] if PLANE in self.nodes and self.power is not None else []
         name = NOTHING if self.chosen is None else self.chosen.value
-        shown += [
-            Legend(one.label, *one.range(), one.colours)
-            for _, one in self.view.layers
-            if map_name(one.name) == name
-        ]
+        shown += [self.made[name][2]] if name in self.made else []
         self.legend.content = legend_html(shown, self.scene.parts)

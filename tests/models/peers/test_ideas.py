@@ -11,8 +11,8 @@ from scipy.special import eval_legendre
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.models.baselines.kriging import fit_variogram
-from gsparc.models.peers.directions import virtual_transmitters
-from gsparc.models.peers.radiance import fourier_legendre, terms
+from gsparc.models.peers.gsrf import fourier_legendre, terms
+from gsparc.models.peers.newrf import virtual_transmitters
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.training.context import FitContext

@@ -1,0 +1,82 @@
+"""A site from above, as all plans draw it: equal scales, walls, stations, measured places, a scale bar."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike
+
+MOST_POINTS = 1500  # measured places that are drawn
+MOST_WALLS = 50_000
+OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
+
+
+def bounded(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
+    """Equal scales from corner (2,) to corner (2,) [m], in plain numbers; "x [m]" unless labels say more."""
+    labels = {"xlabel": "x [m]", "ylabel": "y [m]"} | labels
+    across, up = np.transpose([low, high])
+    axis.set(xlim=across, ylim=up, aspect="equal", **labels)
+    axis.ticklabel_format(useOffset=False, style="plain")
+    axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share
+
+
+def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", **how: Any) -> None:
+    """Marks at places (n, 2) [m], black unless `how` says another colour."""
+    marks = {"marker": "^", "color": "k", "markersize": 9, "markeredgecolor": "white", "linestyle": ""}
+    axis.plot(*places.T, label=label, **{**marks, "zorder": 4, **how})
+
+
+def draw_measured(axis: Any, places: np.ndarray) -> None:
+    """Places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
+    if len(places):
+        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
+        rim = {"markerfacecolor": "black", "markeredgecolor": "white", "markeredgewidth": 0.2 * size}
+        axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
+
+
+def draw_walls(axis: Any, triangles: np.ndarray) -> None:
+    """Upright triangles (n, 3, 3) [m] as lines; at most `MOST_WALLS`, the longest."""
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    upright = triangles[np.abs(normal[:, 2]) < 0.1 * np.linalg.norm(normal, axis=1).clip(1e-12)][:, :, :2]
+    ends = np.stack([upright, np.roll(upright, -1, axis=1)], axis=2)  # three sides of each
+    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
+    longest = ends[np.arange(len(ends)), length.argmax(1)]
+    kept = np.argsort(-length.max(1, initial=0))[:MOST_WALLS]
+    axis.add_collection(LineCollection(longest[kept], colors="0.45", linewidths=0.5, zorder=0))
+
+
+def annotate(axis: Any, text: str, where: np.ndarray, colour: str = "black", above: bool = True) -> None:
+    """Write beside a point: above to its right, or below to its left, where the map does not end there."""
+    low, high = axis.get_xlim()
+    left = where[0] > low + (0.75 if above else 0.25) * (high - low)
+    note = axis.annotate(
+        text, where, xytext=(-7 if left else 7, 5 if above else -12), textcoords="offset points",
+        ha="right" if left else "left", fontsize="small", color=colour, path_effects=OUTLINE, zorder=5,
+    )  # fmt: skip
+    note.set_in_layout(False)
+
+
+def scale_bar(axis: Any) -> None:
+    """A bar of a round length, about a fifth of the map wide."""
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    decade = 10.0 ** np.floor(np.log10((right - left) / 5))
+    length = max(one for one in (1, 2, 5) if one * decade <= (right - left) / 5) * decade
+    x, y = left + 0.04 * (right - left), low + 0.05 * (high - low)
+    axis.plot([x, x + length], [y, y], color="black", linewidth=4, solid_capstyle="butt", zorder=6,
+              path_effects=[withStroke(linewidth=6, foreground="white")])  # fmt: skip
+    unit, metres = next(
+        one for one in (("km", 1000), ("m", 1), ("cm", 0.01)) if length >= one[1] or one[1] < 1
+    )
+    axis.annotate(f"{length / metres:g} {unit}", (x + length / 2, y), xytext=(0, 5), ha="center",
+                  textcoords="offset points", fontsize="small", path_effects=OUTLINE, zorder=6)  # fmt: skip
+
+
+def legend_below(figure: Any, columns: int = 3) -> Any:
+    """What marks are, beneath the map; returns the legend, None where nothing has a label."""
+    if not any(axis.get_legend_handles_labels()[0] for axis in figure.axes):
+        return None
+    return figure.legend(loc="outside lower left", ncols=columns, fontsize="small", frameon=False)
