@@ -120,8 +120,8 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
     few = heard.thinned(min(LEARNED_EACH, max(LEARNED_ON // len(heard.stations), 1)), seed)
     views = {number: _view(few.of(number), trend) for number in few.stations}
     at = torch.from_numpy(np.unique(few.places[:, :3], axis=0)[:: max(1, len(few.places) // 4_000)])
-    distance = apart(at, at).numpy()
-    middle = float(np.median(distance)) or 1.0
+    far = apart(at, at).numpy()
+    middle = float(np.median(far)) or 1.0
 
     def density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
         distance, columns, values = views[number]
@@ -131,7 +131,7 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
         return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
 
     start = replace(START, lengths=(START.lengths[0] * middle, START.lengths[1] * middle)).parameters()
-    best, _ = walked(objective, [start], bounds_of(2, distance), LOOKS, SETTLED)
+    best, _ = walked(objective, [start], bounds_of(2, far), LOOKS, SETTLED)
     logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
