@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -40,16 +40,16 @@ class Rows:
     decibels: np.ndarray
     silent: np.ndarray
 
-    def at(self, chosen: np.ndarray) -> Rows:
+    def at(self, chosen: np.ndarray) -> Self:
         """The rows `chosen`."""
-        return Rows(self.places[chosen], self.decibels[chosen], self.silent[chosen])
+        return type(self)(*(part[chosen] for part in vars(self).values()))
 
     @property
-    def loud(self) -> Rows:
+    def loud(self) -> Self:
         """Those that were heard."""
         return self.at(np.flatnonzero(~self.silent))
 
-    def drawn(self, most: int, seed: int) -> Rows:
+    def drawn(self, most: int, seed: int) -> Self:
         """At most so many, in their order; at least half of them were heard where as many were."""
         return self.at(draw(self.silent, most, seed))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +13,13 @@ from gsparc.models.powers import waves
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.likelihood import Covariance, left_out_losses
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.law import fit_site_law
-from gsparc.models.powers.together.learning import _ends, left_out_loss, start
-from gsparc.models.powers.together.prior import grid
-from gsparc.models.powers.together.rows import heard_rows
+from gsparc.models.powers.together.learning import Own
+from gsparc.models.powers.together.rows import link_rows
+from gsparc.models.powers.together.terms import Terms
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
+from gsparc.processes.prior import Prior
+from gsparc.processes.trend import Law, Trend
 
 TWO = Kernel((1.2, 6.0), (0.4, 0.6), 0.08, 20.0)
 Arrays = dict[str, np.ndarray]
@@ -77,26 +77,17 @@ def _together(quiet: bool) -> Arrays:
     data = _stations(quiet)
     known = np.arange(len(data) - 20)
     places = np.array(data.site.stations.position, np.float64)
-    every = heard_rows(data, known, places)
-    law = fit_site_law(every)
-    prior = start(every, law, len(places), 0)
-    ends = torch.from_numpy(np.concatenate([every.moving, every.still]))
-    shared = replace(
-        prior,
-        departures=torch.linspace(-0.2, 0.2, prior.departures.numel()).double().view_as(prior.departures),
-        log_length=torch.tensor(math.log(6.0)).double(), log_shared=torch.tensor(1.0).double(),
-        log_cloud=torch.tensor(-1.0).double(), bend_db=5.0,
-        inducing=torch.from_numpy(np.unique(every.moving, axis=0)[::3]),
-        blockers=grid(ends.amin(0), ends.amax(0), 16),
-    )  # fmt: skip
-    field = JointPowerField(data.site, places, shared, shared, 1.3)
+    about = Trend(0.0, Law(-32.0, 2.7, 1.0, 6.0, None), 1.2, 0.7)
+    own = Own(Prior(TWO, about), {2: Prior(Kernel((2.0, 9.0), (0.3, 0.7), 0.1, 12.0), about)})
+    terms = Terms.over(link_rows(data, known, places), about, 6.0, 15, 0)
+    terms = replace(terms, place_db=1.6, shadow_db=0.6)
+    field = JointPowerField(data.site, places, own, terms, terms, 1.3)
     field.condition(data, known)
     batch, left = data.batch(np.arange(len(data) - 20, len(data))), field.left_out()
-    loss = left_out_loss(shared, _ends(shared, every))
     far = batch.tx + torch.tensor([2.0, 1.0, 0.5])
     moved = field(far, Pose(batch.rx.position + torch.tensor([1.0, 0, 0]), batch.rx.rotation))
     return _seen(field.answer(batch)) | {
-        "left_out": left.mean.numpy(), "left_variance": left.variance.numpy(), "loss": loss.numpy(),
+        "left_out": left.mean.numpy(), "left_variance": left.variance.numpy(),
         "losses": field.loss(data.batch(np.arange(30))).numpy(), "unheard": moved.mean.numpy(),
         "unheard_variance": moved.variance.numpy(),
     }  # fmt: skip

@@ -1,8 +1,8 @@
 """The field of powers of many ends: a law, Gaussians and a place term of the site, a process of each end.
 
-Stations that were heard answer by their own process about the site's law; shared terms stand beside it where
-groups of places that were left out say so. A station that was never heard is answered by what the site
-shares, as strong as stations that were left out want it. Either end may be the station.
+Stations that were heard answer by their own process about what the site shares: its law, and further terms
+where groups of places that were left out say so. A station that was never heard is answered by the shared
+terms, as strong as stations that were left out want them. Either end may be the station.
 """
 
 from __future__ import annotations
@@ -18,31 +18,26 @@ from torch import Tensor
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.per_station import SAME_PLACE_M
-from gsparc.models.powers.groups import Gain, compared, folds, groups
-from gsparc.models.powers.together import posterior as joint
-from gsparc.models.powers.together.law import fit_site_law
-from gsparc.models.powers.together.learning import learn_ends, learn_shared, start, with_inducing
-from gsparc.models.powers.together.posterior import NEVER, given, restored_posterior
-from gsparc.models.powers.together.prior import Prior, restored_prior
-from gsparc.models.powers.together.rows import Heard, heard_rows, is_together, places_of, thinned
-from gsparc.models.powers.together.unheard import for_unheard
+from gsparc.models.powers.groups import Gain
+from gsparc.models.powers.together.learning import Own, gain_of_places, learn_own, learn_strength
+from gsparc.models.powers.together.rows import LinkRows, link_rows, places_of
+from gsparc.models.powers.together.terms import LAW_DB, TALL, Terms
 from gsparc.models.target_rows import TINY_POWER, entry_variance, from_real
 from gsparc.ops import Pose
+from gsparc.processes.factor import Factor
+from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import REACH
+from gsparc.processes.prior import Prior
+from gsparc.processes.shared import Shared
 from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.training.time_budget import TimeBudget
 
+NEVER = -1  # in place of a station's number: one that was never heard
 QUERIES = 512  # at a time: memory
 MOST_EACH = 6_000  # rows of a station
 MEMORY = 3e9  # bytes of all stations' factors
-LEARNED_ON = 6_000  # rows of all stations, for settings that all have alike
-LEARNED_EACH = 500
-ENDS_FROM = 400  # rows that a station needs for settings of its own
-ENDS_ON = 700
 PLACES = 600  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
-COMPARED_EACH = 400  # the same, for asking whether shared terms pay where stations were heard
-FOLDS = 5
 SURER = 2.0  # with few rows of each station the others say more than with all of them
 
 
@@ -52,10 +47,11 @@ class JointPowerField(ConditionalField):
     Args:
         site: of powers, with several stations.
         places: (T, 3) float64 of the stations [m].
-        heard: the prior of stations that have rows.
-        unheard: that of all others.
+        own: of the stations' own processes.
+        heard: shared terms for stations that have rows.
+        unheard: those for all others.
         inflation: of their variances.
-        seed: of rows and places drawn.
+        seed: of rows drawn.
     """
 
     kind = "joint_powers"
@@ -65,24 +61,25 @@ class JointPowerField(ConditionalField):
         self,
         site: Site,
         places: np.ndarray,
-        heard: Prior,
-        unheard: Prior,
+        own: Own,
+        heard: Terms,
+        unheard: Terms,
         inflation: float = 1.0,
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.site, self.places, self.seed = site, places, seed
+        self.site, self.places, self.own, self.seed = site, places, own, seed
         self.heard, self.unheard, self.inflation = heard, unheard, inflation
-        self.posterior: joint.Posterior | None = None
-        self.elsewhere: joint.Posterior | None = None
+        self.posterior: Shared | None = None
+        self.elsewhere: Shared | None = None
+        self.whole = 1.0  # variance of what was measured, of all stations [dB^2]
+        self.rows: dict[int, Tensor] = {}  # of what was heard of each station
         self._reach: tuple[cKDTree, float] | None = None  # of what is known, made when it is asked
-        self.rows: dict[int, np.ndarray] = {}
-        self.decibels: dict[int, np.ndarray] = {}
 
     @property
     def count(self) -> int:
         """Gaussians in the way to stations that were heard."""
-        return len(self.heard.blockers)
+        return self.heard.count
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -91,13 +88,12 @@ class JointPowerField(ConditionalField):
 
     def objects(self) -> SiteObjects:
         """Gaussians that all stations are seen through, else those that stations never heard would be."""
-        for posterior in (one for one in (self.posterior, self.elsewhere) if one is not None):
-            means, scales, turns = (part.numpy() for part in vars(posterior.prior.blockers).values())
-            if len(means):
-                first = len(posterior.prior.inducing)
-                deviation = math.exp(0.5 * posterior.prior.log_cloud.item())
-                losses = -deviation * posterior.mean[first : first + len(means)].numpy()
-                return SiteObjects.of(gaussians=(means, np.exp(scales), turns, losses))
+        for terms, posterior in ((self.heard, self.posterior), (self.unheard, self.elsewhere)):
+            if posterior is not None and terms.count:
+                means = terms.cells.numpy()
+                scales = terms.width * np.array([1, 1, TALL]) * np.ones_like(means)
+                losses = -terms.shadow_db * posterior.mean[len(LAW_DB) : len(LAW_DB) + terms.count].numpy()
+                return SiteObjects.of(gaussians=(means, scales, np.zeros(len(means)), losses))
         return SiteObjects.of()
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
@@ -108,16 +104,15 @@ class JointPowerField(ConditionalField):
         """
         if not len(rows):
             raise ValueError("a field of powers needs at least one row")
-        every = heard_rows(data, rows, self.places)
-        used = thinned(every, most_each(len(every.stations)), self.seed)
-        (self.posterior, _, kept), self._reach = given(used, self.heard), None
-        loud = [used.at(own[~used.silent[own]]) for own in kept]
-        self.rows = {int(used.station[own[0]]): part.rows for own, part in zip(kept, loud, strict=True)}
-        self.decibels = {
-            int(used.station[own[0]]): part.decibels for own, part in zip(kept, loud, strict=True)
-        }
-        few = thinned(every, UNHEARD_EACH, self.seed)
-        self.elsewhere = given(few, self.unheard)[0].shared_alone()
+        every = link_rows(data, rows, self.places)
+        used = every.thinned(most_each(len(every.stations)), self.seed)
+        few = used.thinned(UNHEARD_EACH, self.seed)
+        self.posterior, self._reach = self.own.given(used, self.heard, self.seed), None
+        elsewhere = self.own.given(few, self.unheard, self.seed)
+        self.elsewhere = Shared({}, self.own.never, self.unheard.columns, (elsewhere.factor, elsewhere.mean))
+        loud = used if used.silent.all() else used.loud
+        self.whole = max(float(loud.decibels.var()), self.own.variance)
+        self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
 
     @torch.no_grad()
     def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
@@ -132,17 +127,14 @@ class JointPowerField(ConditionalField):
             ValueError: before `condition`.
         """
         posterior, elsewhere = self._conditioned()
-        moving, still, number = self._asked(tx, rx, station)
-        parts = torch.zeros(4, len(moving), dtype=torch.float64)
+        places, number = self._asked(tx, rx, station)
+        mean, spread, share, explained = torch.zeros(4, len(places), dtype=torch.float64)
         for one in number.unique().tolist():
-            known = one in posterior.ends
+            of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
             for chosen in torch.nonzero(number == one)[:, 0].split(QUERIES):
-                of = posterior if known else elsewhere
-                said = torch.stack(of.answer(moving[chosen], still[chosen], one if known else NEVER))
-                said[1] *= 1.0 if known else self.inflation
-                parts[:, chosen] = said
-        mean, spread, share, explained = parts
-        share = (share + self._by_law(moving)).clamp_max(1.0)
+                mean[chosen], left, explained[chosen] = of.answer(places[chosen], one)
+                spread[chosen], share[chosen] = inflation * left, left / self.whole
+        share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
         power = self._power(mean)
         variance = entry_variance(spread.float(), power, "rssi")
         return Posterior(power, variance, self._power(explained) if self.count else None, share.float())
@@ -159,15 +151,14 @@ class JointPowerField(ConditionalField):
             used = batch.mask.flatten(1).all(1)
         if not used.any():
             return losses
-        moving, still, number = self._asked(batch.tx, batch.rx, batch.station)
-        decibels = 10 * batch.target.flatten(1)[:, 0].double().clamp_min(TINY_POWER).log10()
-        order = torch.nonzero(used)[:, 0].numpy()
-        ends = moving.numpy()[order], still.numpy()[order], number.numpy()[order]
-        rows = Heard(*ends, decibels.numpy()[order], ~used.numpy()[order], order)
-        posterior, _, kept = given(rows, self.heard)
-        for own, (error, variance) in zip(kept, posterior.left_out().values(), strict=True):
+        places, number = (part[used].numpy() for part in self._asked(batch.tx, batch.rx, batch.station))
+        decibels = 10 * batch.target.flatten(1)[used, 0].double().clamp_min(TINY_POWER).log10().numpy()
+        rows = LinkRows(places, decibels, np.zeros(len(places), bool), number, used.nonzero()[:, 0].numpy())
+        posterior = self.own.given(rows, self.heard, self.seed)
+        for one in rows.stations:
+            error, variance = posterior.left_out(one)
             density = 0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi))
-            losses[torch.from_numpy(rows.rows[own])] = density
+            losses[torch.from_numpy(rows.of(one).index)] = density
         return losses
 
     def left_out(self) -> LeftOutRows:
@@ -177,61 +168,64 @@ class JointPowerField(ConditionalField):
             ValueError: before `condition`.
         """
         posterior, _ = self._conditioned()
-        rows, means, spreads = [], [], []
-        for number, (error, variance) in posterior.left_out().items():
-            rows.append(self.rows[number])
-            means.append(torch.from_numpy(self.decibels[number]) - error)
-            spreads.append(variance)
+        means, spreads = [], []
+        for number, process in posterior.processes.items():
+            error, variance = posterior.left_out(number)
+            loud = process.extra == 0
+            means.append((process.values()[:, 0] - error)[loud])
+            spreads.append(variance[loud])
         mean = self._power(torch.cat(means))
-        return LeftOutRows(
-            np.concatenate(rows), mean, entry_variance(torch.cat(spreads).float(), mean, "rssi")
-        )
+        variance = entry_variance(torch.cat(spreads).float(), mean, "rssi")
+        return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), mean, variance)
 
     def state(self) -> dict[str, Any]:
         """See `ConditionalField`."""
+        heard = {str(number): prior.state() for number, prior in self.own.heard.items()}
         state: dict[str, Any] = {
-            "places": torch.from_numpy(self.places), "heard": self.heard.state(),
-            "unheard": self.unheard.state(), "inflation": self.inflation, "seed": self.seed,
-            "rows": {str(number): torch.from_numpy(rows) for number, rows in self.rows.items()},
-            "decibels": {str(number): torch.from_numpy(part) for number, part in self.decibels.items()},
+            "places": torch.from_numpy(self.places), "never": self.own.never.state(), "own": heard,
+            "heard": self.heard.state(), "unheard": self.unheard.state(), "inflation": self.inflation,
+            "seed": self.seed, "whole": self.whole,
+            "rows": {str(number): rows for number, rows in self.rows.items()},
         }  # fmt: skip
         if self.posterior is not None and self.elsewhere is not None:
-            state |= {"posterior": self.posterior.state(), "elsewhere": self.elsewhere.state()}
+            state["processes"] = {str(n): one.state() for n, one in self.posterior.processes.items()}
+            for name, one in (("posterior", self.posterior), ("elsewhere", self.elsewhere)):
+                state[name] = {"lower": one.factor.lower, "mean": one.mean}
         return state
 
-    def _conditioned(self) -> tuple[joint.Posterior, joint.Posterior]:
+    def _conditioned(self) -> tuple[Shared, Shared]:
         if self.posterior is None or self.elsewhere is None:
             raise ValueError("a field of powers: condition it first")
         return self.posterior, self.elsewhere
 
-    def _asked(self, tx: Tensor, rx: Pose, station: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Places (B, 3), (B, 3) of the moving end and the station, float64 [m], and its number (B,)."""
+    def _asked(self, tx: Tensor, rx: Pose, station: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""
         sender = tx.cpu().double()
         receiver = rx.position.reshape(-1, 3).expand(len(tx), 3).cpu().double()
         moving, still = (sender, receiver) if self.site.static_end == "rx" else (receiver, sender)
         table = torch.from_numpy(self.places)
         if station is not None:
             number = station.cpu().long()
-            return moving, torch.where(number[:, None] >= 0, table[number.clamp_min(0)], still), number
+            still = torch.where(number[:, None] >= 0, table[number.clamp_min(0)], still)
+            return torch.cat([moving, still], 1), number
         number = self._standing(still)
         turned = (number < 0) & (self._standing(moving) >= 0)  # asked the other way round
-        moving, still = (
-            torch.where(turned[:, None], one, other) for one, other in ((still, moving), (moving, still))
-        )
-        return moving, still, self._standing(still)
+        here, there = torch.cat([moving, still], 1), torch.cat([still, moving], 1)
+        places = torch.where(turned[:, None], there, here)
+        return places, self._standing(places[:, 3:])
 
     def _by_law(self, moving: Tensor) -> Tensor:
         """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.
 
         Its slope says nothing of places far from all data.
         """
-        posterior, _ = self._conditioned()
         if self._reach is None:
-            known = torch.cat([end.moving for end in posterior.ends.values()]).numpy()
+            posterior, _ = self._conditioned()
+            known = torch.cat([one.rows[:, :3] for one in posterior.processes.values()]).numpy()
             self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), 1e-9)
         tree, reach = self._reach
         far = torch.from_numpy(tree.query(moving.numpy())[0])
-        law = max(1 - float(posterior.prior.variance(NEVER)) / posterior.whole, 0.0)
+        law = max(1 - self.own.variance / self.whole, 0.0)
         return law * (1 - (-(far / reach).square()).exp())
 
     def _standing(self, places: Tensor) -> Tensor:
@@ -271,44 +265,33 @@ def initialise(
     """
     if data.site.kind != "rssi":
         raise ValueError(f"a field of powers needs received powers (rssi), not {data.site.kind}")
-    if not is_together(data.site):
+    if data.site.stations is None or len(data.site.stations) < 2:
         raise ValueError("a field of powers of many ends needs several stations")
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     places, notes = places_of(data, rows)
-    every = heard_rows(data, rows, places)
-    count = len(every.stations)
-    law = fit_site_law(every)
-    few = thinned(every, min(LEARNED_EACH, max(LEARNED_ON // count, 1)), seed)
-    prior = start(few, law, len(places), seed)
-    said = [
-        f"{count} stations in one model, law of exponent {law.exponent:.3g} +- {law.exponents:.2g}, "
-        f"levels +- {law.levels_db:.2g} dB"
-    ]
-    most, largest = most_each(count), int(np.bincount(every.station).max())
+    every = link_rows(data, rows, places)
+    own, said = learn_own(every, seed, budget)
+    most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
     if largest > most:
         said.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-    prior, _ = learn_shared(prior, few, budget=budget)
-    if max(np.bincount(every.station)) >= ENDS_FROM and not (budget and budget.over(0.5)):
-        many = thinned(every, ENDS_ON, seed)
-        enough = np.flatnonzero(np.bincount(many.station, minlength=len(places)) >= ENDS_FROM)
-        own = many.at(np.flatnonzero(np.isin(many.station, enough)))
-        prior = learn_ends(prior, own, budget=budget)
-        said.append(f"settings of their own for {len(enough)} stations")
-    field = JointPowerField(data.site, places, prior, prior, 1.0, seed)
+    assert own.never.trend is not None
+    plain = Terms.over(every, own.never.trend, 1.0, 0, seed)
+    field = JointPowerField(data.site, places, own, plain, plain, 1.0, seed)
     if not shared:
         return field, (*notes, *said)
-    unheard = for_unheard(every, prior, sure, seed, budget)
-    field.inflation = unheard.inflation
-    if unheard.gain is None:
+    strength = learn_strength(every, own, sure, seed, budget)
+    field.inflation = strength.inflation
+    if strength.gain is None:
         said.append("no shared terms: too few stations to leave some out")
         return field, (*notes, *said)
-    said.append("stations left out, after one constant: " + _gain_text(unheard.gain, "shared terms"))
-    strong = unheard.prior
-    if not strong.columns:
+    said.append("stations left out, after one constant: " + _gain_text(strength.gain, "shared terms"))
+    if not strength.terms.there:
         return field, (*notes, *said)
-    field.unheard = with_inducing(strong, every, PLACES, seed) if len(strong.inducing) else strong
-    at_places = None if budget and budget.over(0.8) else gain_of_places(every, prior, strong, seed)
+    field.unheard = strength.terms.known_at(every, PLACES if strength.terms.place_db else 0, seed)
+    at_places = None
+    if budget is None or not budget.over(0.8):
+        at_places = gain_of_places(every, own, plain, strength.terms, seed)
     if at_places is None:
         said.append("no time to try shared terms on groups of places that are left out")
     else:
@@ -316,37 +299,6 @@ def initialise(
         if at_places.exceeds(SURER * sure):
             field.heard = field.unheard
     return field, (*notes, *said)
-
-
-def gain_of_places(rows: Heard, without: Prior, strong: Prior, seed: int) -> Gain | None:
-    """What shared terms gain at squares of floor that are left out for all stations."""
-    few = thinned(rows, COMPARED_EACH, seed)
-    group = groups(few.moving)
-    errors: list[list[np.ndarray]] = [[], []]
-    told = []
-    for part in folds(group, FOLDS, seed):
-        rest = np.setdiff1d(np.arange(len(group)), part)
-        asked = part[~few.silent[part]]
-        if not len(asked) or few.silent[rest].all():
-            continue
-        told.append(group[asked])
-        for prior, errors_of in zip((without, strong), errors, strict=True):
-            errors_of.append(_errors(few.at(rest), few.at(asked), prior))
-    if not told:
-        return None
-    other, one = (np.concatenate(part) ** 2 for part in errors)
-    return compared(one, other, np.concatenate(told))
-
-
-def _errors(known: Heard, asked: Heard, prior: Prior) -> np.ndarray:
-    """Of predictions at rows asked (n,) [dB]."""
-    posterior, _, _ = given(known, prior)
-    found = np.zeros(len(asked.rows))
-    for number in asked.stations:
-        own = np.flatnonzero(asked.station == number)
-        ends = torch.from_numpy(asked.moving[own]), torch.from_numpy(asked.still[own])
-        found[own] = posterior.mean_of(*ends, number).numpy() - asked.decibels[own]
-    return found
 
 
 def _gain_text(gain: Gain, what: str) -> str:
@@ -359,13 +311,18 @@ def _gain_text(gain: Gain, what: str) -> str:
 
 def restored(site: Site, state: dict[str, Any]) -> JointPowerField:
     """The field whose `state()` this was."""
-    heard, unheard = restored_prior(state["heard"]), restored_prior(state["unheard"])
+    never = Prior.read(state["never"])
+    assert never.trend is not None
+    own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
+    heard, unheard = (Terms(never.trend, **state[name]) for name in ("heard", "unheard"))
     field = JointPowerField(
-        site, state["places"].numpy(), heard, unheard, float(state["inflation"]), int(state["seed"])
+        site, state["places"].numpy(), own, heard, unheard, float(state["inflation"]), int(state["seed"])
     )
-    field.rows = {int(number): rows.numpy() for number, rows in state["rows"].items()}
-    field.decibels = {int(number): part.numpy() for number, part in state["decibels"].items()}
-    if "posterior" in state:
-        field.posterior = restored_posterior(state["posterior"])
-        field.elsewhere = restored_posterior(state["elsewhere"])
+    field.rows = {int(number): rows for number, rows in state["rows"].items()}
+    field.whole = float(state["whole"])
+    if "processes" in state:
+        processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
+        weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
+        field.posterior = Shared(processes, never, heard.columns, weights[0])
+        field.elsewhere = Shared({}, never, unheard.columns, weights[1])
     return field

@@ -1,181 +1,257 @@
-"""Settings of largest leave-one-out likelihood, pooled over ends."""
+"""Settings of stations' own processes by rows left out, and of what all share by stations left out.
+
+Where a station was heard its own process takes most of what shared terms could say, so the likelihood of its
+rows hardly tells how strong they are. Each station by turns is predicted from the others instead.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
-from gsparc.models.powers.extinction import Blockers
-from gsparc.models.powers.together.law import SiteLaw
-from gsparc.models.powers.together.posterior import End, Factored, left_out_of, weights_of
-from gsparc.models.powers.together.prior import LENGTHS, OWN, Prior
-from gsparc.models.powers.together.rows import Heard
-from gsparc.processes.factor import NotPositiveDefiniteError
-from gsparc.processes.worker import stop_when_late
+from gsparc.models.baselines.distance_law import fit_law
+from gsparc.models.powers.groups import Gain, compared, folds, groups
+from gsparc.models.powers.together.rows import LinkRows
+from gsparc.models.powers.together.terms import Terms
+from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
+from gsparc.processes.kernel import Kernel, apart, bounds_of
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import conditioned
+from gsparc.processes.prior import Prior
+from gsparc.processes.shared import Block, Shared, deviation_of, left_out_whole
+from gsparc.processes.trend import Trend
 from gsparc.training.time_budget import TimeBudget
 
-LOOKS = 40
-STARTS = (0.1, 1.0)  # lengths, of the median distance between places
-PARTS = (0.35, 0.35, 0.2)  # of the variance, at first: of these lengths, and of the noise
-SPANS = (1e-3, 3.0)  # bounds of a length, of that distance
-SCALES = 0.5  # deviation of the logarithm of an end's variances
-DEPARTS = 0.7  # deviation of the logarithm of each of an end's settings
-VARIANCES_DB2 = (1e-4, 1e4)
-FLAT = 1e-6  # a step that gains less, per row [nats], is the last
-BAD = 1e12  # in place of a likelihood where no Cholesky factor exists
+LOOKS, SETTLED = 40, 1e-6
+START = Kernel((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
+ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
+SLOPE_DB = 2.0  # a decade: deviation of a station's slope
+FITTED_ON = 500  # rows of each station, for the law
+LEARNED_ON, LEARNED_EACH = 6_000, 500  # rows of all stations, and of each, for settings that all have alike
+ENDS_FROM, ENDS_ON = 400, 700  # rows that a station needs for settings of its own, and has them from
+LEAST_STATIONS = 3  # to leave some out
+TRIED_ON, TRIED_EACH = 3_600, 300  # rows of all stations, and of each, for the strength of shared terms
+TRIED_PLACES = 300  # that the shared process is known at
+LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
+PLACE, SHADOW = (0.0, 0.03, 0.1, 0.2), (0.0, 0.02, 0.06, 0.15)  # variances, of a station's own
+WIDEST = 4.0  # factor that variances are corrected by at most
+COMPARED_EACH, FOLDS = 400, 5  # rows of each station and folds of left-out places
 
 
-def start(rows: Heard, law: SiteLaw, stations: int, seed: int) -> Prior:
-    """A prior to learn from, without shared terms: its lengths and variances follow from the rows."""
-    places = np.unique(rows.moving, axis=0)
-    drawn = np.random.default_rng(seed).permutation(len(places))
-    few = torch.from_numpy(places[np.sort(drawn[:400])])
-    apart = torch.pdist(few)
-    middle = float(apart.median()) if len(apart) else 1.0
-    loud = ~rows.silent if not rows.silent.all() else rows.silent
-    moving, still = torch.from_numpy(rows.moving[loud]), torch.from_numpy(rows.still[loud])
-    values = torch.from_numpy(rows.decibels[loud]) - law.mean(law.decades(moving, still))
-    station = rows.station[loud]
-    for number in np.unique(station):  # levels aside
-        values[station == number] -= values[station == number].mean()
-    whole = max(float(values.square().mean()), 1e-2)
-    own = [math.log(max(share * middle, 1e-3)) for share in STARTS]
-    own += [math.log(share * whole) for share in PARTS]
-    return Prior(
-        law,
-        torch.tensor(own, dtype=torch.float64),
-        torch.zeros(stations, OWN, dtype=torch.float64),
-        torch.zeros((), dtype=torch.float64),
-        torch.zeros((), dtype=torch.float64),
-        torch.zeros((), dtype=torch.float64),
-        torch.zeros(0, 3, dtype=torch.float64),
-        Blockers.none(),
-    )
+@dataclass(frozen=True)
+class WithTerms(Trend):
+    """A trend with what all stations share among its uncertain terms, in units of `unit` [dB]."""
+
+    shared: Callable[[Tensor], Tensor] = torch.zeros_like
+    unit: float = 1.0
+
+    def terms(self, places: Tensor) -> Tensor:
+        """See `Trend`."""
+        return torch.cat([super().terms(places), self.shared(places) / self.unit], 1)
 
 
-def with_inducing(prior: Prior, rows: Heard, most: int, seed: int) -> Prior:
-    """The same with the shared process known at so many places of rows, drawn evenly."""
-    places = np.unique(rows.moving, axis=0)
-    drawn = np.random.default_rng(seed).permutation(len(places))[:most]
-    return replace(prior, inducing=torch.from_numpy(places[np.sort(drawn)]))
+@dataclass(frozen=True)
+class Own:
+    """Priors of stations' own processes.
 
-
-def learn_shared(
-    prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget | None = None
-) -> tuple[Prior, float]:
-    """Settings that all ends have alike, but for a scale of each one's variances; the density per row [nats].
-
-    Rows where nothing was heard are left aside.
+    Attributes:
+        never: of a station that was never heard.
+        heard: by station.
     """
-    ends = _ends(prior, rows)
-    count = sum(len(end.values) for end in ends)
-    by_end = torch.tensor([0.0] * LENGTHS + [1.0] * (OWN - LENGTHS), dtype=torch.float64)
-    first = {"own": prior.own, "scales": prior.departures[:, -1]}
 
-    def at(values: dict[str, Tensor]) -> Prior:
-        scales = values["scales"][:, None] * by_end
-        return replace(prior, own=values["own"], departures=scales)
+    never: Prior
+    heard: Mapping[int, Prior]
 
-    def loss(values: dict[str, Tensor]) -> Tensor:
-        price = 0.5 * (values["scales"] / SCALES).square().sum()
-        return (left_out_loss(at(values), ends) + price) / count
+    def prior(self, number: int) -> Prior:
+        """That of a station."""
+        return self.heard.get(number, self.never)
 
-    best, value = _walk(loss, first, _bounds(first, rows), looks, budget)
-    return at(best), -value
-
-
-def learn_ends(prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget | None = None) -> Prior:
-    """Settings of each end by itself, as its own rows want them away from all ends'."""
-    departures = prior.departures.clone()
-    low, high = np.array(_bounds({"own": prior.own}, rows)["own"]).T
-    for end in _ends(prior, rows):
-        number = end.station
-
-        def loss(values: dict[str, Tensor], end: End = end, number: int = number) -> Tensor:
-            apart = values["own"] - prior.own
-            now = replace(
-                prior.without(),
-                departures=departures.index_put((torch.tensor([number]),), apart),
+    def given(self, rows: LinkRows, terms: Terms, seed: int) -> Shared:
+        """What rows say; pseudo-values of silent ones follow from their own station's."""
+        found = {}
+        for number in rows.stations:
+            prior, part = self.prior(number), rows.of(number)
+            places, values, extra = (
+                torch.from_numpy(part.places),
+                torch.from_numpy(part.decibels)[:, None],
+                None,
             )
-            price = 0.5 * (apart / DEPARTS).square().sum()
-            return (left_out_loss(now, [end]) + price) / len(end.values)
+            if part.silent.any():
+                wide = WithTerms(**vars(_trend(prior)), shared=terms.columns, unit=deviation_of(prior))
+                known = conditioned(part, wide, _kernel(prior), seed)[0].posterior
+                assert isinstance(known, Exact)
+                places, values, extra = known.rows, known.values(), known.extra
+            found[number] = Exact.of(prior, places, values, extra)
+        return Shared(found, self.never, terms.columns)
 
-        first = {"own": prior.settings_of(number)}
-        best, _ = _walk(loss, first, {"own": list(zip(low, high, strict=True))}, looks, budget)
-        departures[number] = best["own"] - prior.own
-    return replace(prior, departures=departures)
-
-
-def _walk(
-    loss: Callable[[dict[str, Tensor]], Tensor],
-    first: dict[str, Tensor],
-    bounds: dict[str, list[tuple[float, float]]],
-    looks: int,
-    budget: TimeBudget | None,
-) -> tuple[dict[str, Tensor], float]:
-    """Where `loss` is least, walked to from `first`, and its value there."""
-    sizes = [value.numel() for value in first.values()]
-
-    def named(values: Tensor) -> dict[str, Tensor]:
-        parts = zip(first.items(), values.split(sizes), strict=True)
-        return {name: part.reshape(value.shape) for (name, value), part in parts}
-
-    def objective(at: np.ndarray) -> tuple[float, np.ndarray]:
-        x = torch.from_numpy(at).requires_grad_()
-        try:
-            value = loss(named(x))
-        except NotPositiveDefiniteError:  # in float64: as bad as it gets
-            return BAD, np.zeros_like(at)
-        (slope,) = torch.autograd.grad(value, x)
-        return float(value.detach()), slope.numpy()
-
-    def stop(_: np.ndarray) -> None:
-        stop_when_late()
-        if budget is not None and budget.over():
-            raise StopIteration
-
-    limits = [limit for name in first for limit in bounds[name]]
-    low, high = np.array(limits).T
-    begin = np.clip(torch.cat([value.reshape(-1) for value in first.values()]).numpy(), low, high)
-    found = minimize(
-        objective, begin, jac=True, method="L-BFGS-B", bounds=limits, callback=stop,
-        options={"maxfun": looks, "ftol": FLAT},
-    )  # fmt: skip
-    return named(torch.from_numpy(found.x)), float(found.fun)
+    @property
+    def variance(self) -> float:
+        """Of a never heard station's process and noise [dB^2]."""
+        return self.never.kernel.amplitude * (1 + self.never.kernel.noise)
 
 
-def _ends(prior: Prior, rows: Heard) -> list[End]:
-    loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
-    return [End.of(loud, number, prior) for number in loud.stations]
+def _kernel(prior: Prior) -> Kernel:
+    assert isinstance(prior.kernel, Kernel)
+    return prior.kernel
 
 
-def left_out_loss(prior: Prior, ends: list[End]) -> Tensor:
-    """Negative log density () [nats] of all rows, each given all others, with autograd."""
-    factored = [Factored.of(end, prior) for end in ends]
-    shared, mean = weights_of(factored)
-    total = prior.own.new_zeros(())
-    for one in factored:
-        error, variance = left_out_of(one, shared, mean)
-        total = total + 0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi)).sum()
-    return total
+def _trend(prior: Prior) -> Trend:
+    assert prior.trend is not None
+    return prior.trend
 
 
-def _bounds(first: dict[str, Tensor], rows: Heard) -> dict[str, list[tuple[float, float]]]:
-    """Of settings by their names."""
-    few = torch.from_numpy(np.unique(rows.moving, axis=0)[:: max(1, len(rows.rows) // 4_000)])
-    apart = torch.pdist(few)
-    middle = max(float(apart.median()), 1e-3) if len(apart) else 1.0
-    length = (math.log(SPANS[0] * middle), math.log(SPANS[1] * middle))
-    variance = (math.log(VARIANCES_DB2[0]), math.log(VARIANCES_DB2[1]))
-    found: dict[str, list[tuple[float, float]]] = {}
-    for name, value in first.items():
-        found[name] = [(-2.0, 2.0) if name == "scales" else variance] * value.numel()
-    if "own" in found:
-        found["own"][:LENGTHS] = [length] * LENGTHS
-    return found
+def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tuple[Own, list[str]]:
+    """The law and settings of own processes, and what must be said of them."""
+    few = rows.thinned(FITTED_ON, seed)
+    law = fit_law(few, None)
+    residual = few.decibels - law.mean(torch.from_numpy(few.places)).numpy()
+    residuals = [residual[few.station == number] for number in few.stations]
+    levels, typical = np.array([[part.mean(), part.std()] for part in residuals]).T
+    law = replace(law, level=law.level + float(np.median(levels)))  # that of one station may be far off
+    trend = Trend.about(law, torch.from_numpy(few.places))
+    trend = replace(trend, spread=max(float(np.median(typical)), 0.1) / SLOPE_DB)
+    heard = rows if rows.silent.all() else rows.loud
+    few = heard.thinned(min(LEARNED_EACH, max(LEARNED_ON // len(heard.stations), 1)), seed)
+    views = {number: _view(few.of(number), trend) for number in few.stations}
+    at = torch.from_numpy(np.unique(few.places[:, :3], axis=0)[:: max(1, len(few.places) // 4_000)])
+    far = apart(at, at).numpy()
+    middle = float(np.median(far)) or 1.0
+
+    def density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        distance, columns, values = views[number]
+        return LeftOutDensity.apply(gram_of(at, distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
+
+    def objective(at: Tensor) -> Tensor:
+        return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
+
+    start = replace(START, lengths=(START.lengths[0] * middle, START.lengths[1] * middle)).parameters()
+    best, _ = walked(objective, [start], bounds_of(2, far), LOOKS, SETTLED)
+    logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
+    count = np.array([len(values) for _, _, values in views.values()])
+    mean = float((count * logs).sum() / count.sum())
+    logs = (count * logs + ALIKE * mean) / (count + ALIKE)
+    kernel = Kernel.of(best, math.exp(mean))
+    found = {
+        number: Prior(replace(kernel, amplitude=math.exp(log)), trend)
+        for number, log in zip(views, logs, strict=True)
+    }
+    alone = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
+    alone = [] if budget is not None and budget.over(0.5) else alone
+    for number in alone:
+        distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
+        bounds = bounds_of(2, distance.numpy())
+        _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
+        found[number] = Prior(own, trend)
+    by = f"law of exponent {law.exponent:.3g}, levels +- {levels.std():.2g} dB"
+    said = [f"{len(levels)} stations in one model, {by}"]
+    if alone:
+        said.append(f"settings of their own for {len(alone)} stations")
+    return Own(Prior(kernel, trend), found), said
+
+
+def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
+    """Distances (n, n) [m], uncertain terms (n, Q) and values less the mean (n, 1) [dB]."""
+    places = torch.from_numpy(rows.places)
+    values = torch.from_numpy(rows.decibels) - trend.mean(places)
+    return apart(places, places), trend.terms(places), values[:, None]
+
+
+@dataclass(frozen=True)
+class Strength:
+    """Shared terms for stations that were never heard.
+
+    Attributes:
+        terms: as strong as left-out stations want them; possibly of the law alone.
+        inflation: of variances, as left-out stations ask for.
+        gain: of shared terms at left-out stations, each after one constant; None if not tried.
+    """
+
+    terms: Terms
+    inflation: float = 1.0
+    gain: Gain | None = None
+
+
+def learn_strength(
+    rows: LinkRows, own: Own, sure: float, seed: int, budget: TimeBudget | None = None
+) -> Strength:
+    """The strengths of least squared error at left-out stations, each after one constant.
+
+    Args:
+        rows: of all stations.
+        own: of the stations' own processes.
+        sure: standard errors that the gain over none must exceed.
+        seed: of rows and places drawn.
+        budget: no further length is tried when it is over.
+    """
+    loud = rows if rows.silent.all() else rows.loud
+    few = loud.thinned(min(TRIED_EACH, max(TRIED_ON // len(loud.stations), 1)), seed)
+    short = min(_kernel(own.never).lengths)
+    terms = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
+    if len(few.stations) < LEAST_STATIONS:
+        return Strength(terms)
+    processes = own.given(few, terms, seed).processes
+    bare, none, best = terms, _left_out(_blocks(processes, terms), terms), None
+    for length in LENGTHS:
+        if best is not None and budget is not None and budget.over():
+            break
+        terms = replace(bare, length=length * short)
+        blocks = _blocks(processes, terms)
+        for place, shadow in product(PLACE, SHADOW):
+            if best is not None and not place and length != LENGTHS[0]:
+                continue  # without the shared process its length means nothing
+            deviations = [math.sqrt(share * own.variance) for share in (place, shadow)]
+            strong = replace(terms, place_db=deviations[0], shadow_db=deviations[1])
+            found = _left_out(blocks, strong)
+            if best is None or (found[0] ** 2).mean() < (best[1][0] ** 2).mean():
+                best = strong, found
+    assert best is not None
+    gain = compared(best[1][0] ** 2, none[0] ** 2, none[2])
+    terms, found = best if gain.exceeds(sure) else (bare, none)
+    return Strength(terms, min(max(found[1], 1 / WIDEST), WIDEST), gain)
+
+
+def _blocks(processes: Mapping[int, Exact], terms: Terms) -> list[Block]:
+    return [Block.of(process, terms.units(process.rows)) for process in processes.values()]
+
+
+def _left_out(blocks: list[Block], terms: Terms) -> tuple[np.ndarray, float, np.ndarray]:
+    """Errors (n,) [dB] of what was heard of stations left out, after a constant of each, and their stations.
+
+    Between them the mean square of errors without that constant over their predicted variances.
+    """
+    scale, errors, ratios = terms.scale(), [], []
+    for error, variance in left_out_whole([block.scaled(scale) for block in blocks]):
+        ratios.append(float((error.square() / variance).mean()))
+        errors.append((error - error.mean()).numpy())
+    station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])
+    return np.concatenate(errors), float(np.mean(ratios)), station
+
+
+def gain_of_places(rows: LinkRows, own: Own, plain: Terms, strong: Terms, seed: int) -> Gain | None:
+    """What shared terms gain at squares of floor that are left out for all stations."""
+    few = rows.thinned(COMPARED_EACH, seed)
+    group = groups(few.places)
+    errors: list[list[np.ndarray]] = [[], []]
+    told = []
+    for part in folds(group, FOLDS, seed):
+        rest, part = few.at(np.setdiff1d(np.arange(len(group)), part)), part[~few.silent[part]]
+        if not len(part) or rest.silent.all():
+            continue
+        part = part[np.argsort(few.station[part], kind="stable")]
+        told.append(group[part])
+        for terms, found in zip((plain, strong), errors, strict=True):
+            posterior = own.given(rest, terms, seed)
+            for number in few.at(part).stations:
+                asked = few.at(part).of(number)
+                said, _, _ = posterior.answer(torch.from_numpy(asked.places), number)
+                found.append(said.numpy() - asked.decibels)
+    if not told:
+        return None
+    other, one = (np.concatenate(part) ** 2 for part in errors)
+    return compared(one, other, np.concatenate(told))

@@ -21,15 +21,16 @@ from gsparc.models.gsparc import Gsparc, plan
 from gsparc.models.per_station import for_links
 from gsparc.models.powers.together import field as together
 from gsparc.models.powers.together.field import JointPowerField, initialise, most_each, restored
-from gsparc.models.powers.together.law import SiteLaw, fit_site_law
-from gsparc.models.powers.together.learning import learn_shared, left_out_loss, start
-from gsparc.models.powers.together.posterior import End, given
-from gsparc.models.powers.together.prior import Prior, grid
-from gsparc.models.powers.together.rows import heard_rows, places_of, thinned
-from gsparc.models.powers.together.unheard import for_unheard
+from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
+from gsparc.models.powers.together.rows import link_rows, places_of
+from gsparc.models.powers.together.terms import Terms
 from gsparc.models.registry import method_class
 from gsparc.models.terms import EffectSettings
 from gsparc.ops import Pose
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.prior import Prior
+from gsparc.processes.shared import left_out_whole
+from gsparc.processes.trend import Law, Trend
 from gsparc.training.context import FitContext
 
 POSTS = np.array([[0.0, 0, 6], [60, 5, 6], [5, 55, 6], [50, 60, 6], [30, -5, 6], [-5, 30, 6]])
@@ -57,35 +58,30 @@ def smooth(places: np.ndarray, length: float, rng: np.random.Generator, count: i
     return np.cos(phases) @ rng.normal(size=(200, count)) / 10
 
 
-def prior_of(data: Measurements) -> Prior:
+def prior_of(data: Measurements) -> tuple[Own, Terms]:
     """Invented settings with every term."""
-    law = SiteLaw(-60.0, 2.5, 2.0, 1.5, 5.0, 0.4)
-    places = torch.from_numpy(data.moving[::40])
-    low, high = torch.tensor([-10.0, -10, 0]).double(), torch.tensor([70.0, 70, 6]).double()
-    departures = torch.zeros(len(data.site.stations), 5, dtype=torch.float64)
-    departures[1] = 0.3
-    own = torch.tensor([4.0, 20.0, 5.0, 9.0, 1.5]).double().log()
-    one = torch.tensor(2.0).double().log()
-    return Prior(law, own, departures, one * 3, one * 2, one, places, grid(low, high, 16), 3.0)
+    trend = Trend(0.0, Law(36.0, 2.5, 2.0, 6.0, None), 1.5, 0.8)
+    never = Prior(Kernel((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
+    own = Own(never, {1: Prior(Kernel((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
+    terms = Terms.over(rows_of(data), trend, 8.0, 30, 0)
+    return own, replace(terms, place_db=2.7, shadow_db=1.4)
 
 
 def rows_of(data: Measurements, rows: np.ndarray | None = None):
     rows = np.arange(len(data)) if rows is None else rows
-    return heard_rows(data, rows, places_of(data, rows)[0])
+    return link_rows(data, rows, places_of(data, rows)[0])
 
 
-def dense(rows, prior: Prior) -> tuple[np.ndarray, np.ndarray]:
+def dense(rows, own: Own, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
     """Covariance (n, n) of rows with noise, and values (n,) less the law, by what the prior says of pairs."""
-    moving, still = torch.from_numpy(rows.moving), torch.from_numpy(rows.still)
-    decades = prior.law.decades(moving, still)
-    columns, lacks = prior.shared(moving, decades, prior.shadows(moving, still))
-    total = columns @ columns.T + torch.diag(lacks)
+    places = torch.from_numpy(rows.places)
+    columns = terms.columns(places)
+    total = columns @ columns.T
     for number in rows.stations:
-        own = np.flatnonzero(rows.station == number)
-        terms = prior.law.terms(decades[own])
-        block = prior.process(number, moving[own], moving[own]) + terms @ terms.T
-        total[np.ix_(own, own)] += block + prior.noise(number) * torch.eye(len(own))
-    return total.numpy(), rows.decibels - prior.law.mean(decades).numpy()
+        at, prior = np.flatnonzero(rows.station == number), own.prior(number)
+        block = prior.between(places[at], places[at]) + prior.kernel.noise * torch.eye(len(at))
+        total[np.ix_(at, at)] += prior.kernel.amplitude * block
+    return total.numpy(), rows.decibels - terms.trend.mean(places).numpy()
 
 
 def db(power: torch.Tensor) -> np.ndarray:
@@ -98,48 +94,63 @@ def spread_db(found) -> np.ndarray:
 
 def test_it_is_the_dense_process():
     data = town(40)
-    prior, every = prior_of(data), rows_of(data)
+    (own, terms), every = prior_of(data), rows_of(data)
     known, asked = every.at(np.arange(0, 200)), every.at(np.arange(200, 240))
-    posterior, _, _ = given(known, prior)
-    gram, values = dense(every, prior)
-    inner = np.linalg.solve(gram[:200, :200], np.c_[values[:200], gram[:200, 200:]])
-    mean = gram[200:, :200] @ inner[:, 0]
-    variance = gram[200:, 200:].diagonal() - (gram[200:, :200] * inner[:, 1:].T).sum(1)
+    known = known.at(np.flatnonzero(known.station != 4))  # never heard
+    posterior, count = own.given(known, terms, 0), len(known.index)
+    gram, values = dense(joined(known, asked), own, terms)
+    inner = np.linalg.solve(gram[:count, :count], np.c_[values[:count], gram[:count, count:]])
+    mean = gram[count:, :count] @ inner[:, 0]
+    variance = gram[count:, count:].diagonal() - (gram[count:, :count] * inner[:, 1:].T).sum(1)
     for number in asked.stations:
-        own = np.flatnonzero(asked.station == number)
-        ends = torch.from_numpy(asked.moving[own]), torch.from_numpy(asked.still[own])
-        said = posterior.answer(*ends, number)
-        law = asked.decibels[own] - values[200:][own]
-        assert np.allclose(said[0].numpy(), law + mean[own], atol=1e-8)
-        assert np.allclose(said[1].numpy(), variance[own], atol=1e-8)
-        assert np.allclose(posterior.mean_of(*ends, number).numpy(), said[0].numpy())
+        at = np.flatnonzero(asked.station == number)
+        said = posterior.answer(torch.from_numpy(asked.places[at]), number)
+        law = asked.decibels[at] - values[count:][at]
+        assert np.allclose(said[0].numpy(), law + mean[at], atol=1e-8)
+        assert np.allclose(said[1].numpy(), variance[at], atol=1e-8)
 
 
-def test_left_out_rows_and_the_likelihood():
+def joined(*parts):
+    """Rows of all parts as one."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return type(parts[0])(*map(np.concatenate, columns))
+
+
+def test_rows_and_stations_left_out():
     data = town(25)
-    prior, every = prior_of(data), rows_of(data)
-    gram, values = dense(every, prior)
+    (own, terms), every = prior_of(data), rows_of(data)
+    gram, values = dense(every, own, terms)
     inverse = np.linalg.inv(gram)
     error, variance = inverse @ values / inverse.diagonal(), 1 / inverse.diagonal()
-    posterior, _, kept = given(every, prior)
-    for own, found in zip(kept, posterior.left_out().values(), strict=True):
-        assert np.allclose(found[0].numpy(), error[own]) and np.allclose(found[1].numpy(), variance[own])
-    ends = [End.of(every, number, prior) for number in every.stations]
-    told = 0.5 * (error**2 / variance + np.log(2 * np.pi * variance)).sum()
-    assert np.isclose(float(left_out_loss(prior, ends)), told)
+    posterior = own.given(every, terms, 0)
+    whole = left_out_whole([posterior.block(number) for number in every.stations])
+    for number, of_station in zip(every.stations, whole, strict=True):
+        at = np.flatnonzero(every.station == number)
+        found = posterior.left_out(number)
+        assert np.allclose(found[0].numpy(), error[at]) and np.allclose(found[1].numpy(), variance[at])
+        rest = np.setdiff1d(np.arange(len(gram)), at)
+        told = np.linalg.solve(gram[np.ix_(rest, rest)], np.c_[values[rest], gram[np.ix_(rest, at)]])
+        mean = gram[np.ix_(at, rest)] @ told[:, 0]
+        spread = gram[at, at] - (gram[np.ix_(at, rest)] * told[:, 1:].T).sum(1)
+        assert np.allclose(of_station[0].numpy(), values[at] - mean)
+        assert np.allclose(of_station[1].numpy(), spread)
 
 
 def test_the_law_of_a_site():
-    law = fit_site_law(rows_of(town(90, 0.0)))
-    assert abs(law.exponent - 3) < 0.7 and 2 < law.levels_db < 9, law
+    own, notes = learn_own(rows_of(town(90, 0.0)), 0)
+    law = own.never.trend.law
+    assert abs(law.exponent - 3) < 0.7 and "6 stations in one model" in notes[0], law
 
 
 def test_settings_become_likelier():
-    rows = rows_of(town())
-    begin = start(rows, fit_site_law(rows), 6, 0)
-    ends = [End.of(rows, number, begin) for number in rows.stations]
-    _, density = learn_shared(begin, rows)
-    assert density > -float(left_out_loss(begin, ends)) / len(rows.rows) + 0.01
+    rows, densities = rows_of(town()), []
+    learned, _ = learn_own(rows, 0)
+    begin = Own(replace(learned.never, kernel=Kernel((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {})
+    for own in (begin, learned):
+        posterior = own.given(rows, prior_of(town())[1], 0)
+        found = [posterior.left_out(number) for number in rows.stations]
+        densities.append(sum(float((e.square() / v + v.log()).sum()) for e, v in found) / len(rows.index))
+    assert densities[1] < densities[0] - 0.01
 
 
 @pytest.fixture(scope="module")
@@ -155,12 +166,13 @@ def learned():
 
 def test_what_all_hear_alike_is_found(learned):
     data, fold, field, notes = learned
-    assert field.unheard.columns, notes
+    assert field.unheard.there, notes
     batch = data.batch(fold.test)
     error = db(field(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
     found = field(batch.tx, batch.rx, batch.station)
     assert np.mean(np.abs(error) < 1.645 * spread_db(found)) > 0.8
-    bare = JointPowerField(data.site, field.places, field.heard.without(), field.heard)
+    plain = replace(field.heard, place_db=0.0, shadow_db=0.0)
+    bare = JointPowerField(data.site, field.places, field.own, plain, plain)
     bare.condition(data, fold.train)
     plain = db(bare(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
     assert np.mean(error**2) < 1.02 * np.mean(plain**2), notes
@@ -176,8 +188,7 @@ def test_a_station_never_heard_gains_from_the_others():
     error = db(found.mean) - db(asked.target)
     places = torch.from_numpy(data.moving[asked.index.numpy()])
     still = torch.from_numpy(POSTS[3] - data.site.origin).expand(len(places), 3)
-    law = field.heard.law
-    by_law = law.mean(law.decades(places, still)).numpy() - db(asked.target)
+    by_law = field.heard.trend.mean(torch.cat([places, still], 1)).numpy() - db(asked.target)
     assert error.std() < 0.85 * by_law.std(), notes
     assert np.mean(np.abs(error) < 2.6 * spread_db(found)) > 0.8
     assert spread_db(found).min() > 2  # its level is not known
@@ -212,10 +223,10 @@ def test_silent_rows_say_that_powers_are_low():
     silent = replace(
         data, target=np.where(quiet[:, None], level, data.target), mask=~quiet[:, None], censored=quiet
     )
-    prior, rows = prior_of(data), np.arange(len(data))
+    (own, terms), rows = prior_of(data), np.arange(len(data))
     errors = []
     for used in (rows, rows[~quiet]):
-        field = JointPowerField(data.site, places_of(data, rows)[0], prior, prior)
+        field = JointPowerField(data.site, places_of(data, rows)[0], own, terms, terms)
         field.condition(silent, used)
         batch = data.batch(np.flatnonzero(quiet))
         errors.append(np.mean((db(field(batch.tx, batch.rx, batch.station).mean) - db(batch.target)) ** 2))
@@ -237,9 +248,9 @@ def test_a_station_whose_place_nobody_gave():
 
 
 def test_rows_are_thinned_at_places_that_stations_share():
-    few = thinned(rows_of(town()), 20, 0)
+    few = rows_of(town()).thinned(20, 0)
     assert np.array_equal(np.bincount(few.station), [20] * 6)
-    assert len(np.unique(few.moving, axis=0)) == 20
+    assert len(np.unique(few.places[:, :3], axis=0)) == 20
     assert most_each(1) == together.MOST_EACH and 3_500 < most_each(12) < together.MOST_EACH
 
 
@@ -252,8 +263,8 @@ def test_what_it_refuses():
     with pytest.raises(ValueError, match="stations=each"):
         plan(EffectSettings(), InitSettings(name="scene", file="walls.yaml"), data, 0)
     with pytest.raises(ValueError, match="condition it first"):
-        prior = prior_of(data)
-        JointPowerField(data.site, POSTS, prior, prior).left_out()
+        own, terms = prior_of(data)
+        JointPowerField(data.site, POSTS, own, terms, terms).left_out()
 
 
 def test_gsparc_learns_stations_together(tmp_path):
@@ -309,9 +320,9 @@ def test_halls_gain_over_a_process_of_each_sensor():
 
 def test_the_error_of_a_gain_is_that_of_stations():
     every = rows_of(town())
-    prior, _ = learn_shared(start(every, fit_site_law(every), 6, 0), every)
+    own, _ = learn_own(every, 0)
     turned = every.at(np.argsort(every.station, kind="stable"))
-    one, other = (for_unheard(rows, prior, 1.0, 0).gain for rows in (every, turned))
+    one, other = (learn_strength(rows, own, 1.0, 0).gain for rows in (every, turned))
     assert one is not None and other is not None
     assert np.isclose(one.squares, other.squares, rtol=0.3) and np.isclose(one.error, other.error, rtol=0.5)
     assert one.error > 0.05 * one.squares

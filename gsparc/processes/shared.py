@@ -1,0 +1,143 @@
+"""Several processes that share terms: a factor of each, and one of the weights of what they share.
+
+The covariance is a block for each process plus columns of all: with K = L L^T of a block and V = L^-1 C of
+its columns, the weights' precision is I + sum V^T V (M. A. Woodbury, "Inverting modified matrices", 1950).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import left_out
+from gsparc.processes.posterior import Exact
+from gsparc.processes.prior import Prior
+
+
+@dataclass(frozen=True)
+class Block:
+    """One process of n rows of values (n, 1), whitened by its own covariance.
+
+    Attributes:
+        process: without the shared terms.
+        columns: (n, P) V.
+        values: (n,) less their mean.
+    """
+
+    process: Exact
+    columns: Tensor
+    values: Tensor
+
+    @classmethod
+    def of(cls, process: Exact, columns: Tensor) -> Block:
+        """With shared columns (n, P), in units of the values, at its rows."""
+        deviation = deviation_of(process.prior)
+        values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
+        return cls(process, process.factor.whitened(columns) / deviation, values)
+
+    @cached_property
+    def gram(self) -> Tensor:
+        """(P, P) that it adds to the precision of the weights."""
+        return self.columns.T @ self.columns
+
+    def scaled(self, scale: Tensor) -> Block:
+        """With columns times `scale` (P,); those of 0 go."""
+        used = scale.nonzero()[:, 0]
+        found = Block(self.process, self.columns[:, used] * scale[used], self.values)
+        found.__dict__["gram"] = scale[used, None] * self.gram[used[:, None], used] * scale[used]
+        return found
+
+
+class Shared:
+    """What the rows of several processes say of shared terms, and so of each other.
+
+    Args:
+        processes: by number, of one value each; possibly none, of which rows were heard before.
+        never: prior of a process without rows.
+        columns: of places (n, D), (n, P) of the shared terms for unit normal weights, P at least 1.
+        weights: factor of the precision (P, P) of the weights, and their mean (P,); None: of all processes.
+    """
+
+    def __init__(
+        self,
+        processes: Mapping[int, Exact],
+        never: Prior,
+        columns: Callable[[Tensor], Tensor],
+        weights: tuple[Factor, Tensor] | None = None,
+    ) -> None:
+        self.processes, self.never, self.columns = processes, never, columns
+        self._blocks: dict[int, Block] = {}
+        self.factor, self.mean = weights or weights_of([self.block(number) for number in processes])
+
+    def block(self, number: int) -> Block:
+        """That of one process, factored when it is asked for."""
+        if number not in self._blocks:
+            process = self.processes[number]
+            self._blocks[number] = Block.of(process, self.columns(process.rows))
+        return self._blocks[number]
+
+    @torch.no_grad()
+    def answer(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, variance of a measurement, and the mean without the process's own part, each (B,).
+
+        Args:
+            queries: (B, D) float64.
+            number: of the process; one that is not there has no rows.
+        """
+        block = self.block(number) if number in self.processes else None
+        prior = self.never if block is None else block.process.prior
+        columns = self.columns(queries)
+        explained = mean = prior.mean(queries)[:, 0] + columns @ self.mean
+        left = prior.kernel.amplitude * prior.variance(prior.columns(queries))
+        if block is not None:
+            cross = deviation_of(prior) * prior.between(queries, block.process.rows)
+            white = block.process.factor.whitened(cross.T).T
+            mean = mean + white @ (block.values - block.columns @ self.mean)
+            left = (left - white.square().sum(1)).clamp_min(0.0)
+            columns = columns - white @ block.columns
+        return mean, left + self.factor.whitened(columns.T).square().sum(0), explained
+
+    @torch.no_grad()
+    def left_out(self, number: int) -> tuple[Tensor, Tensor]:
+        """Errors (n,) of a process's rows, each predicted from all others, and their variances (n,)."""
+        block = self.block(number)
+        root = block.process.factor.root / deviation_of(block.process.prior)
+        known = self.factor.whitened((root.T @ block.columns).T).square().sum(0)
+        rest = block.values - block.columns @ self.mean
+        return left_out(root.square().sum(0) - known, root.T @ rest)
+
+
+def deviation_of(prior: Prior) -> float:
+    """Of a process [units of its values]."""
+    return math.sqrt(prior.kernel.amplitude)
+
+
+def weights_of(blocks: list[Block]) -> tuple[Factor, Tensor]:
+    """Factor of the precision (P, P) of the shared weights, and their mean (P,)."""
+    size = blocks[0].columns.shape[1]
+    precision = sum((block.gram for block in blocks), torch.eye(size, dtype=torch.float64))
+    factor = Factor.of(precision, "raise")
+    right = torch.stack([block.columns.T @ block.values for block in blocks]).sum(0)
+    return factor, factor.solved(right[:, None])[:, 0]
+
+
+def left_out_whole(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
+    """Of each process, errors (n,) of all its rows predicted from the other processes, and their variances.
+
+    With C the covariance of the weights the inverse of a block is `L^-T (1 - V C V^T) L^-1`.
+    """
+    factor, mean = weights_of(blocks)
+    found = []
+    for block in blocks:
+        known = factor.whitened(block.columns.T)
+        lower = block.process.factor.lower * deviation_of(block.process.prior)
+        inner = Factor.of(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
+        error = inner.solved((block.values - block.columns @ mean)[:, None])[:, 0]
+        found.append((lower @ error, inner.whitened(lower.T).square().sum(0)))
+    return found
