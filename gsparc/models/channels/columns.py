@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import LIGHT, Measurements, Site
+from gsparc.models.image_sources.run_factors import aligning, run_quadratic
 from gsparc.ops import Pose
+from gsparc.processes.factor import Factor
 
 NOBODY = -1  # in place of a station's number: none of them
 SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
@@ -217,15 +219,27 @@ def ends_of(groups: tuple[Group, ...]) -> int:
     return len({group.slot.station for group in groups})
 
 
-def of_runs(factors: Tensor, groups: tuple[Group, ...]) -> Tensor:
-    """Factors of runs (runs,) as they may be: of several ends that share them, phases alone.
+def run_factors_of(groups: tuple[Group, ...], factors: list[Factor], runs: int) -> Tensor:
+    """Factors of runs (runs,) complex128, as measured over the largest one's, by the groups' covariances.
 
-    What a run has changed beside its phase is each end's own, and would be taken for a level of all.
+    Of several ends that share them phases alone: what a run has changed beside its phase is each end's own,
+    and would be taken for a level of all.
     """
-    return factors / factors.abs() if ends_of(groups) > 1 else factors
+    if runs == 1:
+        return torch.ones(1, dtype=torch.complex128)
+    quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
+    for group, factor in zip(groups, factors, strict=True):
+        run, level = group.run.numpy(), float(group.target.abs().square().mean())
+        own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, 1e-300)
+        quadratic[: len(own), : len(own)] += own
+        size += np.bincount(run, minlength=runs) * group.target.shape[1]
+    heard, found = size > 0, np.ones(runs, np.complex128)
+    found[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
+    measured = torch.from_numpy(found)
+    return measured / measured.abs() if ends_of(groups) > 1 else measured
 
 
-def thinned(groups: tuple[Group, ...], columns: int, rows: int) -> tuple[Group, ...]:
+def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
     """At most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.
@@ -235,7 +249,7 @@ def thinned(groups: tuple[Group, ...], columns: int, rows: int) -> tuple[Group, 
     for number in chosen:
         group = groups[number]
         if len(group) > rows:
-            kept = np.sort(np.random.default_rng(0).permutation(len(group))[:rows])
+            kept = np.sort(np.random.default_rng(0).permutation(len(group))[: int(rows)])
             group = group.take(torch.from_numpy(kept))
         found.append(group)
     return tuple(found)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group, Slot
-from gsparc.models.channels.covariance import Shape, Values, direct_wave, image_waves, prior
+from gsparc.models.channels.covariance import Shape, Values, prior, waves_of
 from gsparc.physics.mirror_planes import images
 
 
@@ -64,9 +64,7 @@ def _waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Te
     end = slot.end + values.offset
     placed = torch.cat([end[None], images(end, values.planes, shape.sequences)])
     away = torch.linalg.vector_norm(placed - shape.middle, dim=-1)
-    mirrors = image_waves(shape, values, slot, places)
-    power = [shape.of("direct", values.power), shape.of("source", values.power)]
-    return torch.cat([direct_wave(shape, values, slot, places)[None], mirrors]), torch.cat(power), away
+    return waves_of(shape, values, slot, places), shape.gains(values.power)[0], away
 
 
 def _away(shape: Shape, values: Values, slot: Slot) -> Tensor:

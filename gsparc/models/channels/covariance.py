@@ -91,6 +91,11 @@ class Shape:
     def _parts(self) -> dict[str, slice]:
         return {name: slice(self.names.index(name), max(self.where(name)) + 1) for name in self.names}
 
+    def gains(self, power: Tensor) -> list[Tensor]:
+        """Powers (W,) of the fixed gains of all `waves_of`, and of those that vary."""
+        named = ("direct", "source"), ("direct_smooth", "source_smooth")
+        return [torch.cat([self.of(name, power) for name in names]) for names in named]
+
     def state(self) -> dict[str, Any]:
         """What it is made of."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
@@ -193,10 +198,10 @@ def directional(shape: Shape, values: Values, slots: Sequence[Slot]) -> Tensor:
     if not len(values.towards) or not len(power):
         return power[None]
     ends = torch.stack([slot.end for slot in slots]) + values.offset
-    return power * (ways(shape, ends, len(values.towards)) @ values.towards).exp()
+    return power * (angle_knot_weights(shape, ends, len(values.towards)) @ values.towards).exp()
 
 
-def ways(shape: Shape, ends: Tensor, knots: int) -> Tensor:
+def angle_knot_weights(shape: Shape, ends: Tensor, knots: int) -> Tensor:
     """Weights (T, M, J) of J knots in the angle, evenly from 0 to pi, between directions and ends (T, 3).
 
     Directions of a half sphere stand for their mirror images as well: the nearer one counts.
@@ -222,42 +227,43 @@ def directions(
     return directed((wavenumber * distance).square(), along, concentration)
 
 
+def waves_of(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+    """(W, n) complex128: the direct wave where there is one, then those of all images."""
+    mirrored_waves = image_waves(shape, values, slot, places)
+    if not shape.direct:
+        return mirrored_waves
+    return torch.cat([direct_wave(shape, values, slot, places)[None], mirrored_waves])
+
+
 def explained(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
     """The images' share (n, m) of the covariance."""
-    distance = apart(a, b)
-    before, after = image_waves(shape, values, slot, a), image_waves(shape, values, slot, b)
-    fixed, varying = shape.of("source", values.power), shape.of("source_smooth", values.power)
-    return _mixed(before, after, fixed) * smooth(distance, shape.reach) + _mixed(
-        before, after, varying
-    ) * smooth(distance, values.gain)
+    return _of_waves(shape, values, slot, a, b, int(shape.direct))
 
 
 def specular(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
     """Covariance (n, m) of all but the diffuse field."""
+    found = _of_waves(shape, values, slot, a, b, 0)
+    if not shape.constant:
+        return found
+    return found + shape.of("constant", values.power)[0] * smooth(apart(a, b), shape.reach)
+
+
+def _of_waves(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor, first: int) -> Tensor:
+    """Covariance (n, m) of the waves from number `first` on."""
     distance = apart(a, b)
-    found = torch.zeros(len(a), len(b), dtype=torch.complex128)
-    if shape.constant:
-        found = found + shape.of("constant", values.power)[0] * smooth(distance, shape.reach)
-    if shape.direct:
-        before, after = (direct_wave(shape, values, slot, places) for places in (a, b))
-        gains = shape.of("direct", values.power)[0] * smooth(distance, shape.reach)
-        gains = gains + shape.of("direct_smooth", values.power)[0] * smooth(distance, values.gain)
-        found = found + before[:, None] * after.conj()[None] * gains
-    return found + explained(shape, values, slot, a, b) if shape.count else found
+    before, after = (waves_of(shape, values, slot, places)[first:] for places in (a, b))
+    if not len(before):
+        return torch.zeros(len(a), len(b), dtype=torch.complex128)
+    fixed, varying = ((before.T * power[first:]) @ after.conj() for power in shape.gains(values.power))
+    return fixed * smooth(distance, shape.reach) + varying * smooth(distance, values.gain)
 
 
 def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
     """Variance (n,) of the signal."""
-    power = values.power
-    found = shape.of("isotropic", power)[0] + directional(shape, values, [slot])[0].sum()
-    found = found + shape.of("constant", power).sum()
-    if shape.direct:
-        level = direct_wave(shape, values, slot, places).abs().square()
-        found = found + level * (shape.of("direct", power) + shape.of("direct_smooth", power))
-    if shape.count:
-        level = image_waves(shape, values, slot, places).abs().square()
-        found = found + (shape.of("source", power) + shape.of("source_smooth", power)) @ level
-    return found.expand(len(places))
+    found = shape.of("isotropic", values.power)[0] + directional(shape, values, [slot])[0].sum()
+    found = found + shape.of("constant", values.power).sum()
+    level = waves_of(shape, values, slot, places).abs().square()
+    return (found + torch.stack(shape.gains(values.power)).sum(0) @ level).expand(len(places))
 
 
 def disturbance(shape: Shape, values: Values, group: Group) -> Tensor:
@@ -276,7 +282,3 @@ def temporal(length: Tensor | float, group: Group) -> tuple[Tensor, Tensor]:
     waves = plain(group.places, group.places, group.slot.wavenumber, length)
     fast, slow = (torch.exp(-between / rows) * same for rows in (FAST_ROWS, DRIFT_ROWS))
     return fast, slow * (DRIFT_FIELD * waves + 1 - DRIFT_FIELD)
-
-
-def _mixed(before: Tensor, after: Tensor, power: Tensor) -> Tensor:
-    return (before.T * power) @ after.conj()

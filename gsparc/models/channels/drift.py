@@ -14,7 +14,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from gsparc.models.channels.columns import Group
+from gsparc.models.channels.columns import Group, thinned
 from gsparc.models.channels.covariance import Shape, Values, diffuse_fields, specular, temporal
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.left_out import groups_of
@@ -27,11 +27,10 @@ SHARES = (0.3, 0.3, 1.0)  # of the white noise, where noise, fast and drift star
 LOWEST = 1e-5  # of the white noise
 
 
-def stretches(groups: tuple[Group, ...]) -> tuple[Group, ...]:
+def contiguous_rows(groups: tuple[Group, ...]) -> tuple[Group, ...]:
     """At most `COLUMNS` groups, of `STRETCH` rows that follow each other."""
     found = []
-    for number in np.unique(np.linspace(0, len(groups) - 1, min(COLUMNS, len(groups))).round().astype(int)):
-        group = groups[number]
+    for group in thinned(groups, COLUMNS):
         order = torch.argsort(group.order, stable=True)
         start = max(len(order) - STRETCH, 0) // 2
         found.append(group.take(order[start : start + STRETCH]))
@@ -44,7 +43,7 @@ def with_drift(
     """The shape and values with correlated noise, and what evidence gains on `groups` [nats].
 
     Args:
-        groups: see `stretches`.
+        groups: see `contiguous_rows`.
         signals: covariances (n, n) of theirs, see `signals_of`.
         shape, values: without correlated noise.
     """

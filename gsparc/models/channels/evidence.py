@@ -20,14 +20,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.covariance import (
-    Shape,
-    Values,
-    direct_wave,
-    directions,
-    image_waves,
-    ways,
-)
+from gsparc.models.channels.covariance import Shape, Values, angle_knot_weights, directions, waves_of
 from gsparc.models.channels.kernels import envelope, plain, smooth
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
@@ -44,7 +37,6 @@ WEAK = 1e-3  # pull of every log power to where it started, which holds those th
 TILTED = 0.5  # pull of logarithms of factors towards ends to 0: a prior of standard deviation 1
 STEPS = 30
 SETTLED = 1e-6  # relative change of the objective at which steps end
-NOTHING = torch.zeros(0, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -86,7 +78,7 @@ class Compressed:
         basis: (n, r) float64 of orthonormal columns.
         room: (1 + M, r, r) complex128, the isotropic field and those of directions.
         terms: of leakage, direct wave and images, in the order of `Shape.names`.
-        ways: (M, J), see `covariance.ways`; J is 0 where directions are of the room alone.
+        ways: (M, J), see `covariance.angle_knot_weights`; J is 0 where directions are of the room alone.
         target: (r, D) complex128.
         rest: sum of squares outside the basis.
     """
@@ -160,7 +152,7 @@ def compressed(
         terms = tuple(map(Term.of, _factors(group, shape, values, basis, fixed, varying)))
         bins = torch.zeros(len(shape.angles), 0, dtype=torch.float64)
         if len(values.towards):
-            bins = ways(shape, (group.slot.end + values.offset)[None], len(values.towards))[0]
+            bins = angle_knot_weights(shape, (group.slot.end + values.offset)[None], len(values.towards))[0]
         found.append(Compressed(group, basis, room, terms, bins, target, max(rest, 0.0)))
     return tuple(found)
 
@@ -203,14 +195,11 @@ def _roots(group: Group, length: float) -> Tensor:
 def _factors(
     group: Group, shape: Shape, values: Values, basis: Tensor, fixed: Tensor, varying: Tensor
 ) -> tuple[Tensor, ...]:
-    wide, slot, places = basis.T.to(torch.complex128), group.slot, group.places
+    wide = basis.T.to(torch.complex128)
     found = [wide @ fixed.to(torch.complex128)] if shape.constant else []
-    if shape.direct:
-        wave = direct_wave(shape, values, slot, places)[:, None]
-        found += [wide @ (wave * fixed), wide @ (wave * varying)]
-    waves = image_waves(shape, values, slot, places)[:, :, None]
-    found += [wide @ (wave * fixed) for wave in waves]
-    found += [wide @ (wave * varying) for wave in waves]
+    waves = waves_of(shape, values, group.slot, group.places)[:, :, None]
+    for part in waves.split([int(shape.direct), shape.count]):
+        found += [wide @ (wave * root) for root in (fixed, varying) for wave in part]
     return tuple(found)
 
 
@@ -260,34 +249,23 @@ def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
     return found * power
 
 
-def evidence(parts: tuple[Compressed, ...], power: Tensor, towards: Tensor = NOTHING) -> float:
+def evidence(parts: tuple[Compressed, ...], values: Values) -> float:
     """Negative log marginal likelihood of all groups [nats]."""
-    return sum(solved(part, part.own(power, towards)).nll for part in parts)
+    return sum(solved(part, part.own(values.power, values.towards)).nll for part in parts)
 
 
 def fit_powers(
-    parts: tuple[Compressed, ...], shape: Shape, start: Tensor, shrinkage: float, steps: int = STEPS
-) -> tuple[Tensor, float]:
-    """As `fit_all`, of ends whose directions are those of the room."""
-    power, _, nll = fit_all(parts, shape, start, NOTHING, shrinkage, steps)
-    return power, nll
-
-
-def fit_all(
-    parts: tuple[Compressed, ...],
-    shape: Shape,
-    start: Tensor,
-    towards: Tensor,
-    shrinkage: float,
-    steps: int = STEPS,
-) -> tuple[Tensor, Tensor, float]:
-    """Powers (P,) and `Values.towards` (J,) of largest evidence, its negative logarithm without the priors.
+    parts: tuple[Compressed, ...], shape: Shape, values: Values, shrinkage: float, steps: int = STEPS
+) -> tuple[Values, float]:
+    """With powers and `Values.towards` of largest evidence, its negative logarithm without the priors.
 
     Args:
-        start: (P,) powers.
-        towards: (J,) to start from.
+        parts, shape: of the groups.
+        values: to start from.
         shrinkage: rows that an inverse Gamma prior of directions' powers about their mean counts for.
+        steps: of L-BFGS at most.
     """
+    start, towards = values.power, values.towards
     count = len(start)
     begin = torch.cat([start.log().clamp(LOWEST, HIGHEST), towards])
     angles = shape.where("direction")
@@ -326,7 +304,8 @@ def fit_all(
         callback=stop_when_late,
     )
     power, towards = torch.from_numpy(found.x[:count]).exp(), torch.from_numpy(found.x[count:])
-    return power, towards, evidence(parts, power, towards)
+    fitted = replace(values, power=power, towards=towards)
+    return fitted, evidence(parts, fitted)
 
 
 def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
-from gsparc.models.channels.columns import Group, Slot, asked, gather, of_runs, static_place
+from gsparc.models.channels.columns import Group, Slot, asked, gather, run_factors_of, static_place
 from gsparc.models.channels.common import Common
 from gsparc.models.channels.covariance import (
     Shape,
@@ -26,7 +26,7 @@ from gsparc.models.channels.covariance import (
     prior,
     specular,
 )
-from gsparc.models.image_sources.run_factors import RunFactors, aligning, run_quadratic
+from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.ops import Pose
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
@@ -204,9 +204,7 @@ class ChannelField(ConditionalField):
         shape, values = self.shape, self.values
         all_factors = [Factor.of(covariance) for covariance in _covariances(groups, shape, values)]
         if factors is None:
-            factors = torch.ones(len(runs), dtype=torch.complex128)
-            if len(runs) > 1:
-                factors = of_runs(_factors(groups, all_factors, len(runs)), groups)
+            factors = run_factors_of(groups, all_factors, len(runs))
         self.runs = RunFactors(runs, factors)
         found, noise = [], float(shape.of("noise", values.power))
         for group, factor in zip(groups, all_factors, strict=True):
@@ -427,21 +425,6 @@ def _read(state: dict[str, Any]) -> Slot:
 def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:
     """Entries (n, D) of a slot, of `rows` of (B, A, K)."""
     return whole[rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(rows), -1)
-
-
-def _factors(groups: tuple[Group, ...], solved: list[Factor], runs: int) -> Tensor:
-    """Factors of runs (runs,), as measured over the largest one's."""
-    quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
-    for group, factor in zip(groups, solved, strict=True):
-        inverse, run = factor.inverse.numpy(), group.run.numpy()
-        level = float(group.target.abs().square().mean())
-        own = run_quadratic(inverse, group.target.numpy(), run) / max(level, 1e-300)
-        quadratic[: len(own), : len(own)] += own
-        size += np.bincount(run, minlength=runs) * group.target.shape[1]
-    heard = size > 0
-    factors = np.ones(runs, np.complex128)
-    factors[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
-    return torch.from_numpy(factors)
 
 
 def _parts(group: Group) -> dict[str, Any]:

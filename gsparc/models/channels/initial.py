@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
-from gsparc.models.channels.columns import Group, ends_of, gather, of_runs, thinned
+from gsparc.models.channels.columns import Group, ends_of, gather, run_factors_of, thinned
 from gsparc.models.channels.complex_gp import CHOSEN_ON, LENGTHS, NOISES
 from gsparc.models.channels.covariance import BEYOND, Shape, Values, disturbance
 from gsparc.models.channels.evidence import (
@@ -27,7 +27,6 @@ from gsparc.models.channels.evidence import (
     compressed,
     compressible,
     evidence,
-    fit_all,
     fit_powers,
     left_out_cells,
     normalised,
@@ -39,7 +38,6 @@ from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.offset import best_offset
 from gsparc.models.channels.settings import ChannelSettings
 from gsparc.models.haste import factor_s
-from gsparc.models.image_sources.run_factors import aligning, run_quadratic
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.worker import Ended, ended_by
@@ -155,29 +153,15 @@ def _grid_point(
     groups: tuple[Group, ...], kernels: list[Tensor], noise: float, runs: int
 ) -> tuple[float, Tensor]:
     """Negative log likelihood with profiled scales, and factors of runs as measured."""
-    solved, total, size = [], np.zeros((runs, runs), np.complex128), np.zeros(runs)
-    for group, kernel in zip(groups, kernels, strict=True):
-        covariance = kernel.clone()
-        covariance.diagonal().add_(noise)
-        solved.append(Factor.of(covariance))
-        if runs > 1:
-            level = float(group.target.abs().square().mean())
-            run = group.run.numpy()
-            own = run_quadratic(solved[-1].inverse.numpy(), group.target.numpy(), run)
-            total[: len(own), : len(own)] += own / max(level, 1e-300)
-            size += np.bincount(run, minlength=runs) * group.target.shape[1]
-    factors = np.ones(runs, np.complex128)
-    heard = size > 0
-    if runs > 1:
-        factors[heard] = aligning(total[np.ix_(heard, heard)], size[heard])
-    turn, nll = of_runs(torch.from_numpy(factors), groups), 0.0
+    solved = [Factor.of(kernel + noise * torch.eye(len(kernel), dtype=kernel.dtype)) for kernel in kernels]
+    factors, nll = run_factors_of(groups, solved, runs), 0.0
     for group, factor in zip(groups, solved, strict=True):
-        target = group.target * turn[group.run][:, None]
+        target = group.target / factors[group.run][:, None]
         count, outputs = target.shape
         fit = Conditioned(factor, target, factor.solved(target)).scale
         nll += outputs * (count * math.log(max(fit, 1e-300)) + float(factor.log_determinant))
-        nll -= 2 * outputs * float(turn.abs().log()[group.run].sum())
-    return nll, 1 / turn
+        nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
+    return nll, factors
 
 
 def _strongest(shape: Shape, values: Values) -> tuple[Shape, Values]:
@@ -285,14 +269,13 @@ class _Search:
         errors = np.mean(
             [_left_out(part, power).mean(1) for part, power in zip(parts, own, strict=True)], axis=0
         )
-        nll = evidence(parts, values.power, values.towards) + self._worth(shape, values)
+        nll = evidence(parts, values) + self._worth(shape, values)
         return Candidate(shape, values, nll, errors)
 
     def _fitted(self, shape: Shape, values: Values) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compressed(shape, values)
-        power, towards, _ = fit_all(parts, shape, values.power, values.towards, SHRINKAGE)
-        return self._measured(shape, replace(values, power=power, towards=towards), parts)
+        return self._measured(shape, fit_powers(parts, shape, values, SHRINKAGE)[0], parts)
 
     def _worth(self, shape: Shape, values: Values) -> float:
         """What the terms beside the isotropic field must gain [nats]."""
@@ -314,16 +297,15 @@ class _Search:
         powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
         start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
         values = replace(values, power=torch.tensor(start, dtype=torch.float64))
-        tried: list[tuple[float, Values]] = []
+        tried: list[tuple[Values, float]] = []
         for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if gains else GAINS[:1]:
                 if tried and budget.over(LENGTHS_SHARE):
                     break
                 lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
                 trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
-                power, nll = fit_powers(self._compressed(shape, trial), shape, trial.power, 0.0, SHORT)
-                tried.append((nll, replace(trial, power=power)))
-        return self._fitted(shape, min(tried, key=lambda each: each[0])[1])
+                tried.append(fit_powers(self._compressed(shape, trial), shape, trial, 0.0, SHORT))
+        return self._fitted(shape, min(tried, key=lambda each: each[1])[0])
 
     def _moved(self, found: Candidate) -> Candidate:
         """With static ends where they really are."""
@@ -381,8 +363,8 @@ class _Search:
         values = replace(before.values, power=torch.cat([power, old[1:]]))
         parts = self._compressed(shape, values)
         errors = self._crossed(parts, shape, values)
-        power, _ = fit_powers(parts, shape, values.power, SHRINKAGE, 2 * SHORT)
-        found = self._fitted(*_strongest(shape, replace(values, power=power)))
+        values, _ = fit_powers(parts, shape, values, SHRINKAGE, 2 * SHORT)
+        found = self._fitted(*_strongest(shape, values))
         return replace(found, errors=np.maximum(found.errors, errors))
 
     def _of_all_ends(self, kept: list[Candidate], known: bool, notes: list[str]) -> None:
@@ -416,13 +398,13 @@ class _Search:
             rest = tuple(
                 without(part, torch.from_numpy(left)) for part, left in zip(parts, held, strict=True)
             )
-            power, _ = fit_powers(rest, shape, values.power, SHRINKAGE, 2 * SHORT)
+            power = fit_powers(rest, shape, values, SHRINKAGE, 2 * SHORT)[0].power
             for part, left in zip(parts, held, strict=True):
                 errors += _left_out(part, power)[:, left].sum(1) / len(left) / len(parts)
         return errors
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
-        groups = drift.stretches(self.every)
+        groups = drift.contiguous_rows(self.every)
         signals = drift.signals_of(groups, before.shape, before.values)
         shape, values, gain = drift.with_drift(groups, signals, before.shape, before.values)
         errors = [np.zeros(1 + len(DEPTHS)), np.zeros(1 + len(DEPTHS))]

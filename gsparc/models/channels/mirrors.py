@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsparc.models.channels.covariance import Shape, Values, image_waves
 from gsparc.models.channels.evidence import Compressed
-from gsparc.models.channels.probe import Probe
+from gsparc.models.channels.probe import Probe, summed_gains
 from gsparc.physics.mirror_planes import Reflections, images
 
 LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
@@ -34,7 +34,6 @@ REFINED = 5  # halvings of the step
 LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
 PARAMETERS = 4  # of a plane: two angles, an offset and a power
 SAME = 0.25  # wavelengths between images of two sequences that are one
-CHUNK = 300_000  # entries of waves held at a time
 
 
 @dataclass(frozen=True)
@@ -42,35 +41,56 @@ class _Searcher:
     shape: Shape
     values: Values
     wavelength: float
-    late: Callable[[], bool]
+    ends: Tensor
 
     def waves(self, probe: Probe, planes: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """(W, n) of images in planes (P, 4)."""
-        values = replace(self.values, planes=planes)
-        return image_waves(
-            replace(self.shape, sequences=sequences), values, probe.group.slot, probe.group.places
-        )
+        shape, values = replace(self.shape, sequences=sequences), replace(self.values, planes=planes)
+        return image_waves(shape, values, probe.group.slot, probe.group.places)
 
     def gains(
-        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...], exact: bool
-    ) -> Tensor:
+        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...],
+        known: Callable[[Probe, Tensor], Tensor] = Probe.known,
+    ) -> Tensor:  # fmt: skip
         """Rise of the log likelihood (W, levels) of each sequence alone."""
-        total = torch.zeros(len(sequences), len(LEVELS), dtype=torch.float64)
-        for probe in probes:
-            for chunk in torch.arange(len(sequences)).split(max(CHUNK // len(probe.group), 1)):
-                chosen = tuple(sequences[i] for i in chunk.tolist())
-                near = {index: i for i, index in enumerate(dict.fromkeys(sum(chosen, ())))}
-                renamed = tuple(tuple(near[index] for index in sequence) for sequence in chosen)
-                waves = self.waves(probe, planes[list(near)], renamed)
-                known = probe.known(waves) if exact else _about(probe, waves)
-                total[chunk] += torch.stack([probe.gain(waves, level, known) for level in LEVELS], 1)
-        return total
+
+        def waves(probe: Probe, chunk: Tensor) -> Tensor:
+            chosen = tuple(sequences[i] for i in chunk.tolist())
+            near = {index: i for i, index in enumerate(dict.fromkeys(sum(chosen, ())))}
+            renamed = tuple(tuple(near[index] for index in sequence) for sequence in chosen)
+            return self.waves(probe, planes[list(near)], renamed)
+
+        return summed_gains(probes, len(sequences), waves, LEVELS, known)
+
+    def added(
+        self, probes: tuple[Probe, ...], planes: Tensor, sequence: Reflections, level: float
+    ) -> tuple[Probe, ...]:
+        """With an image among the terms."""
+        return tuple(probe.added(self.waves(probe, planes, (sequence,))[0], level) for probe in probes)
+
+    def is_new(
+        self, planes: Tensor, sequences: list[Reflections] | tuple[Reflections, ...], least: float
+    ) -> bool:
+        """Whether the last image of some end is at least so many wavelengths from that in each other."""
+        placed = images(self.ends, planes, sequences)
+        away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
+        return not bool((away < least * self.wavelength).any())
+
+    def starts(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
+        """The best planes whose images of the ends are apart."""
+        chosen: list[Tensor] = []
+        for number in scores.argsort(descending=True).tolist():
+            if self.is_new(torch.stack([*chosen, grid[number]]), _single(len(chosen) + 1), APART):
+                chosen.append(grid[number])
+            if len(chosen) == STARTS:
+                break
+        return chosen
 
     def best(
         self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...]
     ) -> tuple[int, float, float]:
         """Number of the best sequence, its level, and what it gains [nats]."""
-        gains = self.gains(probes, planes, sequences, True)
+        gains = self.gains(probes, planes, sequences)
         number = int(gains.argmax()) // len(LEVELS)
         return number, LEVELS[int(gains[number].argmax())], float(gains[number].max())
 
@@ -114,38 +134,38 @@ def find_mirrors(
         most: planes.
         late: asked again and again; nothing new is tried when it says so.
     """
-    search = _Searcher(shape, values, wavelength, late)
     rough, probes = (
         tuple(Probe.of(part, part.own(values.power, values.towards)) for part in each)
         for each in (coarse, parts)
     )
+    ends = torch.stack([part.group.slot.end for part in parts]) + values.offset
+    search = _Searcher(shape, values, wavelength, ends)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
     grid, turn = candidates(rough, shape, values, wavelength)
     planes, sequences, risen = grid[:0], list[Reflections](), 0.0
     while len(planes) < most and not late():
-        scores = search.gains(rough, grid, _single(len(grid)), False).max(1).values
+        scores = search.gains(rough, grid, _single(len(grid)), _about).max(1).values
         if not len(planes):
             kept = scores.topk(min(PROMISING, len(grid))).indices
             grid, scores = grid[kept], scores[kept]
-        starts = _apart(grid, scores, probes, values, wavelength)
-        found = max((search.moved(probes, plane, turn / 2) for plane in starts), key=lambda each: each[2])
-        plane, level, gain = found
+        starts = search.starts(grid, scores)
+        plane, level, gain = max((search.moved(probes, at, turn / 2) for at in starts), key=lambda m: m[2])
         if gain < PARAMETERS * worth:
             break
         planes, risen = torch.cat([planes, plane[None]]), risen + gain
         fresh = (len(planes) - 1,)
-        rough, probes = (_with(search, each, planes, fresh, level) for each in (rough, probes))
+        rough, probes = (search.added(each, planes, fresh, level) for each in (rough, probes))
         sequences.append(fresh)
-    pairs = [pair for pair in permutations(range(len(planes)), 2)]
+    pairs = list(permutations(range(len(planes)), 2))
     while pairs and not late():
-        pairs = [pair for pair in pairs if not _known(probes, values, planes, sequences, pair, wavelength)]
+        pairs = [pair for pair in pairs if search.is_new(planes, [*sequences, pair], SAME)]
         if not pairs:
             break
         number, level, gain = search.best(probes, planes, tuple(pairs))
         if gain < 2 * worth:
             break
-        probes = _with(search, probes, planes, pairs[number], level)
+        probes = search.added(probes, planes, pairs[number], level)
         sequences.append(pairs.pop(number))
         risen += gain
     return (planes, tuple(sequences)) if 2 * risen > LEAST * numbers else (planes[:0], ())
@@ -185,40 +205,3 @@ def _about(probe: Probe, waves: Tensor) -> Tensor:
     few = torch.linspace(0, len(waves) - 1, min(32, len(waves))).long()
     share = probe.known(waves[few]).sum() / size[few].sum().clamp_min(1e-30)
     return size * share
-
-
-def _apart(
-    grid: Tensor, scores: Tensor, probes: tuple[Probe, ...], values: Values, wavelength: float
-) -> list[Tensor]:
-    """The best planes whose images of the ends are apart."""
-    ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
-    chosen: list[Tensor] = []
-    for number in scores.argsort(descending=True).tolist():
-        placed = images(ends, torch.stack([*chosen, grid[number]]), _single(len(chosen) + 1))
-        away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
-        if not bool((away < APART * wavelength).any()):
-            chosen.append(grid[number])
-        if len(chosen) == STARTS:
-            break
-    return chosen
-
-
-def _with(
-    search: _Searcher, probes: tuple[Probe, ...], planes: Tensor, sequence: Reflections, level: float
-) -> tuple[Probe, ...]:
-    return tuple(probe.added(search.waves(probe, planes, (sequence,))[0], level) for probe in probes)
-
-
-def _known(
-    probes: tuple[Probe, ...],
-    values: Values,
-    planes: Tensor,
-    sequences: list[Reflections],
-    pair: Reflections,
-    wavelength: float,
-) -> bool:
-    """Whether a sequence's images are those of another."""
-    ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
-    placed = images(ends, planes, [*sequences, pair])
-    away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
-    return bool((away < SAME * wavelength).any())

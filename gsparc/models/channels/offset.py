@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import Group
-from gsparc.models.channels.covariance import Shape, Values
+from gsparc.models.channels.covariance import Shape, Values, direct_wave
 from gsparc.models.channels.evidence import Compressed
-from gsparc.models.channels.kernels import steering
-from gsparc.models.channels.probe import Probe
+from gsparc.models.channels.probe import Probe, summed_gains
 
 REACH = 1.0  # wavelengths to either side that are looked at, and the prior's standard deviation
 COARSE = 4  # steps to either side
 REFINED = 3  # halvings of the step
-CHUNK = 400_000  # entries of waves held at a time
 
 
 def best_offset(
@@ -34,12 +32,12 @@ def best_offset(
     probes = [Probe.of(part, power) for part in parts]
 
     def gain(offsets: Tensor) -> Tensor:
-        score = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
-        for probe in probes:
-            for chunk in torch.arange(len(offsets)).split(max(CHUNK // len(probe.group), 1)):
-                waves = _waves(probe.group, shape, offsets[chunk])
-                score[chunk] += probe.gain(waves, level)
-        return score
+        def waves(probe: Probe, chunk: Tensor) -> Tensor:
+            moved = (replace(values, offset=offset) for offset in offsets[chunk])
+            return torch.stack([direct_wave(shape, at, probe.group.slot, probe.group.places) for at in moved])
+
+        prior = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
+        return prior + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
 
     step = REACH * wavelength / COARSE
     axis = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64) * step
@@ -53,15 +51,3 @@ def best_offset(
         grid = torch.cartesian_prod(near, near, near)
     none, found = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
     return best if math.isfinite(found) and found > none else None
-
-
-def _waves(group: Group, shape: Shape, offsets: Tensor) -> Tensor:
-    """Direct waves (m, n) complex128 from offset places (m, 3)."""
-    ends = group.slot.end + offsets
-    away = torch.linalg.vector_norm(ends - shape.middle, dim=1)
-    return torch.stack(
-        [
-            steering(group.places, end, group.slot.wavenumber, reference)
-            for end, reference in zip(ends, away, strict=True)
-        ]
-    )

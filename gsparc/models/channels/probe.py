@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 from gsparc.models.channels.columns import Group
 from gsparc.models.channels.evidence import Compressed, solved
 from gsparc.processes.factor import Factor
+
+CHUNK = 300_000  # entries of waves held at a time
 
 
 @dataclass(frozen=True)
@@ -67,3 +70,17 @@ class Probe:
         share = level / (1 + level * float((wave.conj() @ own).real))
         alpha = self.alpha - share * own[:, None] * (wave.conj() @ self.alpha)[None]
         return replace(self, alpha=alpha, taken=torch.cat([self.taken, share**0.5 * own[:, None]], 1))
+
+
+def summed_gains(
+    probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
+    known: Callable[[Probe, Tensor], Tensor] = Probe.known,
+) -> Tensor:  # fmt: skip
+    """Rise of the log likelihood (count, levels) of all groups; `waves` (m, n) of some numbers (m,)."""
+    total = torch.zeros(count, len(levels), dtype=torch.float64)
+    for probe in probes:
+        for chunk in torch.arange(count).split(max(CHUNK // len(probe.group), 1)):
+            each = waves(probe, chunk)
+            size = known(probe, each)
+            total[chunk] += torch.stack([probe.gain(each, level, size) for level in levels], 1)
+    return total

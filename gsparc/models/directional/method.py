@@ -172,13 +172,10 @@ class DirectionalGP(FramedMethod):
     def _refit(self) -> None:
         """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         some, rows = self._few(SELECTION_ROWS)
-        waves = self._visible_waves(rows, self.observer[some])
-        uncertain = self.positions.uncertain(rows.position, rows.frequency)
+        waves, uncertain, _, retained = self._prior(rows, self.observer[some])
         mean_power = float(waves.abs().square().sum(1).mean())
         self.power = torch.full((len(self.sources),), 1 / max(mean_power, 1e-30))
         correlation = {kernel: kernel.correlation(rows.position, rows.position) for kernel in KERNELS}
-        phase_vectors = self.positions.only(uncertain).phase_vectors(rows.position, rows.frequency)
-        retained = coherence(phase_vectors, phase_vectors)
         for _ in range(ROUNDS):
             covariance = _covariance(waves, waves, self.power, uncertain, retained)
             tried = {
@@ -196,11 +193,8 @@ class DirectionalGP(FramedMethod):
     def _prepare(self) -> None:
         """Quantities derived from the state that queries need."""
         rows = self.rows
-        self.waves = self._visible_waves(rows, self.observer)
-        self.uncertain = self.positions.uncertain(rows.position, rows.frequency)
-        self.phase_vectors = self.positions.only(self.uncertain).phase_vectors(rows.position, rows.frequency)
+        self.waves, self.uncertain, self.phase_vectors, retained = self._prior(rows, self.observer)
         correlation = self.kernel.correlation(rows.position, rows.position)
-        retained = coherence(self.phase_vectors, self.phase_vectors)
         covariance = _covariance(self.waves, self.waves, self.power, self.uncertain, retained)
         self.conditioned = with_noise(covariance * correlation, self.kernel.noise, rows.target)
 
@@ -245,9 +239,15 @@ class DirectionalGP(FramedMethod):
             self._refit()
         return changed
 
-    def _visible_waves(self, rows: Rows, observer: Tensor) -> Tensor:
-        """Waves (n, K) complex64 of the sources at every row, zero where its receiver does not see them."""
-        return steering(rows, self.sources) * self.visibility.seen[observer].float()
+    def _prior(self, rows: Rows, observer: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Waves (n, K), zero where a receiver does not see a source; of uncertain sources (K',) the rest.
+
+        These are `UncertainPositions.phase_vectors` (K', n, 3), and the `coherence` (K', n, n) of these.
+        """
+        waves = steering(rows, self.sources) * self.visibility.seen[observer].float()
+        uncertain = self.positions.uncertain(rows.position, rows.frequency)
+        turned = self.positions.only(uncertain).phase_vectors(rows.position, rows.frequency)
+        return waves, uncertain, turned, coherence(turned, turned)
 
     # ---- predicting ----
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:

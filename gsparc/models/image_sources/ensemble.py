@@ -11,9 +11,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources import refine_phase
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
@@ -41,7 +41,6 @@ def search_many(
     budget: TimeBudget,
     clutter: bool,
     cache: SearchCache,
-    stage: str = "search",
 ) -> list[Member]:
     """One search per set of rows, best first; at least one, others while the budget lasts.
 
@@ -55,8 +54,7 @@ def search_many(
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: of all together; see `LAST_START`, `ROUNDS_END` and `SEARCH_END`.
         clutter: search for occluding boxes and finite mirrors, too.
-        cache: of finished searches, under the name of `stage`.
-        stage: distinguishes searches of one fit.
+        cache: of finished searches.
 
     Raises:
         KeyboardInterrupt: by the user, within a step of each search.
@@ -67,17 +65,31 @@ def search_many(
     def unwanted() -> bool:
         return stopped.is_set() or at_noise_floor(errors, noise_floor)
 
+    def made(number: int) -> Member:
+        """Sources, their phases, and the clutter that the noise does not hide."""
+        rows, over = row_sets[number], partial(budget.over, SEARCH_END)
+        rounds_over = partial(budget.over, ROUNDS_END)
+        scene = Search(rows, transmitter, settings, seed + number, rounds_over, over).run()
+        phased = PhasedScene.of(rows, scene, QUADRATURE)
+        phased = learn_visibility(rows, phased, 10, settings.visibility, noise_floor, over)
+        phased = refine(rows, phased, 20, noise_floor, late=over)
+        error = left_out_error(rows, phased, noise_floor)
+        hidden = phased.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
+        if clutter and not hidden and compact(rows):
+            generator = torch.Generator().manual_seed(seed + number)
+            phased = find_clutter(rows, phased, generator, late=over, noise_floor=noise_floor)
+            error = left_out_error(rows, phased, noise_floor)
+        return Member(phased, error, number)
+
     def search(number: int) -> Member | None:
-        if done := cache.find(stage, number):
+        if done := cache.find(number):
             errors.append(done.left_out)
             return done
         if unwanted() or (number > 0 and budget.over(LAST_START)):
             return None
         try:
             with ended_by(unwanted):
-                member = _search(
-                    row_sets[number], transmitter, settings, seed, number, noise_floor, budget, clutter
-                )
+                member = made(number)
         except Ended:
             return None
         scene = member.phased.scene
@@ -87,7 +99,7 @@ def search_many(
             budget.spent, budget.seconds,
         )  # fmt: skip
         errors.append(member.left_out)
-        cache.put(stage, member, budget.limited_by)
+        cache.put(member, budget.limited_by)
         return member
 
     threads = torch.get_num_threads()
@@ -121,34 +133,9 @@ def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
             )  # fmt: skip
 
 
-def _search(
-    rows: Rows,
-    transmitter: Tensor,
-    settings: SearchSettings,
-    seed: int,
-    number: int,
-    noise_floor: float,
-    budget: TimeBudget,
-    clutter: bool,
-) -> Member:
-    """Search `number`, its phases, and the clutter that the noise does not hide."""
-    seed += number
-    over = partial(budget.over, SEARCH_END)
-    scene = Search(rows, transmitter, settings, seed, partial(budget.over, ROUNDS_END), over).run()
-    phased = PhasedScene.of(rows, scene, QUADRATURE)
-    phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor, over)
-    phased = refine_phase.refine(rows, phased, 20, noise_floor, late=over)
-    error = left_out_error(rows, phased, noise_floor)
-    if clutter and phased.quadrature < 1 and not at_noise_floor([error], noise_floor, 1) and compact(rows):
-        generator = torch.Generator().manual_seed(seed)
-        phased = find_clutter(rows, phased, generator, late=over, noise_floor=noise_floor)
-        error = left_out_error(rows, phased, noise_floor)
-    return Member(phased, error, number)
-
-
 def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
     """A search's result on rows that have changed a little."""
-    phased = refine_phase.refine(rows, member.phased, 20, noise_floor)
+    phased = refine(rows, member.phased, 20, noise_floor)
     return Member(phased, left_out_error(rows, phased, noise_floor), member.number)
 
 

@@ -8,8 +8,10 @@ and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), chapter
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import final
 
 import torch
 from torch import Tensor
@@ -25,6 +27,7 @@ from gsparc.processes.conditioned import Conditioned
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
 
 
+@final
 @dataclass(frozen=True)
 class Scene:
     """Image sources as sequences over mirror planes, with amplitudes, visibility, clutter and noise.
@@ -80,10 +83,10 @@ class Scene:
         log_amplitude = torch.cat([self.log_amplitude, amplitude.log().float()])
         return replace(self, sequences=(*self.sequences, *sequences), log_amplitude=log_amplitude)
 
-    def only(self, kept: list[int]) -> Scene:
-        """The sources of these indices, and the planes that they use."""
+    def only(self, kept: list[int], planes: Iterable[int] = ()) -> Scene:
+        """The sources of these indices, and the planes that they use, or that are named."""
         sequences = [self.sequences[i] for i in kept]
-        used = sorted({index for sequence in sequences for index in sequence})
+        used = sorted({index for sequence in sequences for index in sequence}.union(planes))
         new = {old: i for i, old in enumerate(used)}
         renamed = tuple(tuple(new[index] for index in sequence) for sequence in sequences)
         return replace(
@@ -112,17 +115,58 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
     return wave(ranges(rows.position, sources), rows.frequency[:, None])
 
 
+def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
+    """Amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
+    waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
+    return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
+
+
 def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
     """Visibility correlations (K, n, n) float32."""
     return torch.stack([kernel.correlation(rows.places, source) for source in sources])
 
 
-def add_covariance(real: Tensor, imag: Tensor, scaled: Tensor, correlation: Tensor) -> None:
-    """Add one source, `(s a)(s a)^H * C`, to a covariance (n, n) held as two real matrices."""
-    pair = torch.stack([scaled.real, scaled.imag], 1)
-    turned = torch.stack([scaled.imag, -scaled.real], 1)
-    real.addcmul_(correlation, pair @ pair.T)
-    imag.addcmul_(correlation, turned @ pair.T)
+class CircularGains:
+    """Covariance of n rows by sources whose gains have any phase, to which sources are added one by one."""
+
+    def __init__(self, rows: Rows) -> None:
+        self.target, n = rows.target, len(rows)
+        self._real, self._imag = torch.zeros(n, n), torch.zeros(n, n)
+
+    @property
+    def matrix(self) -> Tensor:
+        """(n, n) complex64."""
+        return torch.complex(self._real, self._imag)
+
+    def add(self, scaled: Tensor, correlation: Tensor) -> None:
+        """Add one source, `(s a)(s a)^H * C`."""
+        pair = torch.stack([scaled.real, scaled.imag], 1)
+        turned = torch.stack([scaled.imag, -scaled.real], 1)
+        self._real.addcmul_(correlation, pair @ pair.T)
+        self._imag.addcmul_(correlation, turned @ pair.T)
+
+    def given(self, noise: Tensor | float) -> Conditioned:
+        """The rows' targets given the covariance with noise of this variance."""
+        self._real.diagonal().add_(noise)
+        return Conditioned.of(self.matrix, self.target)
+
+    def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
+        """Derivatives (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
+        real, imag = slope.real.contiguous(), slope.imag.contiguous()
+        found = torch.empty_like(scaled)
+        for k, one in enumerate(correlation):
+            pair = torch.stack([scaled[:, k].real, scaled[:, k].imag], 1)
+            a, b = (real * one) @ pair, (imag * one) @ pair
+            found[:, k] = torch.complex(a[:, 0] - b[:, 1], a[:, 1] + b[:, 0])
+        return 2 * found
+
+    def by_noise(self, slope: Tensor) -> Tensor:
+        """The derivative () by the variance of the noise."""
+        return slope.diagonal().real.sum()
+
+    def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
+        """Derivatives (n, n) by the correlation of one source."""
+        return (slope.conj() * scaled[:, None] * scaled.conj()).real
 
 
 def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
@@ -143,22 +187,27 @@ class Posterior:
         """(n, K) complex64."""
         return self.scene.waves(self.rows)
 
+    def gains(self) -> CircularGains:
+        """Of no source yet."""
+        return CircularGains(self.rows)
+
     @cached_property
-    def covariance(self) -> Tensor:
-        """(n, n) complex64, noise included."""
-        n = len(self.rows)
-        real, imag = torch.zeros(n, n), torch.zeros(n, n)
-        scaled = self.waves * self.scene.log_amplitude.exp()
+    def _summed(self) -> CircularGains:
+        found, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
-            correlation = self.scene.visibility.correlation(self.rows.places, source)
-            add_covariance(real, imag, scaled[:, k], correlation)
-        real.diagonal().add_(torch.tensor(self.scene.log_noise).exp() + self.noise_floor)
-        return torch.complex(real, imag)
+            found.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
+        return found
 
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        return Conditioned.of(self.covariance, self.rows.target)
+        return self._summed.given(torch.tensor(self.scene.log_noise).exp() + self.noise_floor)
+
+    @property
+    def covariance(self) -> Tensor:
+        """Of the rows, noise included."""
+        assert self.conditioned
+        return self._summed.matrix
 
     @property
     def nll(self) -> float:
@@ -167,9 +216,7 @@ class Posterior:
 
     def without(self, k: int) -> float:
         """`nll` of the scene without source k."""
-        scaled = self.waves[:, k] * self.scene.log_amplitude[k].exp()
-        n = len(self.rows)
-        real, imag = torch.zeros(n, n), torch.zeros(n, n)
-        correlation = self.scene.visibility.correlation(self.rows.places, self.scene.sources[k])
-        add_covariance(real, imag, scaled, correlation)
-        return Conditioned.of(self.covariance - torch.complex(real, imag), self.rows.target).nll
+        one, source = CircularGains(self.rows), self.scene.sources[k]
+        correlation = self.scene.visibility.correlation(self.rows.places, source)
+        one.add(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
+        return Conditioned.of(self.covariance - one.matrix, self.rows.target).nll

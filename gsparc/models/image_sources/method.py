@@ -209,10 +209,10 @@ class ImageSourceGP(FramedMethod):
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
-        cache: SearchCache, stage: str = "search",
+        cache: SearchCache,
     ) -> list[Member]:  # fmt: skip
         transmitter, floor = self._transmitter(), self.noise_floor
-        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, stage)
+        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache)
 
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
         """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""

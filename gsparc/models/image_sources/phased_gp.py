@@ -13,21 +13,21 @@ each source's visibility; the phases must be known first, so the search itself s
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, final
 
 import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.blocking import Clutter
-from gsparc.models.image_sources.gp_likelihood import JITTER, Posterior, Scene
+from gsparc.models.image_sources.gp_likelihood import JITTER, CircularGains, Posterior, Scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.processes.conditioned import Conditioned
 
 
+@final
 @dataclass(frozen=True)
 class PhasedScene:
     """A scene whose gains have fixed phases.
@@ -90,49 +90,72 @@ def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
 
 
-def shares(quadrature: float) -> Tensor:
+def shares(quadrature: Tensor | float) -> Tensor:
     """Variance along and across a gain's phase, (2,)."""
     return torch.tensor([1 - quadrature / 2, quadrature / 2])
 
 
-def add_source(covariance: Tensor, wave: Tensor, quadrature: float, correlation: Tensor) -> None:
-    """Add one source to a covariance (2, n, 2, n); `wave` (n,) complex is s_k w_k."""
-    pair = torch.stack(stacked(wave), 1)
-    covariance.addcmul_(
-        ((pair * shares(quadrature)) @ pair.T).view_as(covariance), correlation[None, :, None, :]
-    )
+class PhasedGains(CircularGains):
+    """The same of gains of fixed phases, of 2 n real numbers; waves are turned by these."""
+
+    def __init__(self, rows: Rows, quadrature: Tensor | float) -> None:
+        self.target, n = rows.target, len(rows)
+        self.quadrature, self._sum = quadrature, torch.zeros(2, n, 2, n)
+
+    @property
+    def matrix(self) -> Tensor:
+        """(2 n, 2 n) float32."""
+        return self._sum.view(2 * len(self.target), -1)
+
+    def add(self, scaled: Tensor, correlation: Tensor) -> None:
+        """Add one source, with waves s_k w_k."""
+        pair = torch.stack(stacked(scaled), 1)
+        product = (pair * shares(self.quadrature)) @ pair.T
+        self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
+
+    def given(self, noise: Tensor | float) -> Conditioned:
+        """The rows' targets, half of the noise in either part."""
+        self.matrix.diagonal().add_(noise / 2)
+        return Conditioned.of(self.matrix, stacked(self.target)[0])
+
+    def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
+        """See `CircularGains`."""
+        n, found = len(scaled), torch.empty_like(scaled)
+        blocks = slope.view(2, n, 2, n)
+        for k, one in enumerate(correlation):
+            pair = torch.stack(stacked(scaled[:, k]), 1) * shares(self.quadrature)
+            by = (blocks * one[None, :, None, :]).view(2 * n, 2 * n) @ pair
+            # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
+            found[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
+        return found
+
+    def by_noise(self, slope: Tensor) -> Tensor:
+        """See `CircularGains`."""
+        return slope.diagonal().sum() / 4
+
+    def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
+        """See `CircularGains`; differentiable in `quadrature`."""
+        n, share = len(scaled), torch.as_tensor(self.quadrature) / 2
+        weighted = ((slope * z[:, None] * z).view(2, n, 2, n).sum((0, 2)) for z in stacked(scaled))
+        along, across = weighted
+        return ((1 - share) * along + share * across) / 2
 
 
-def given(covariance: Tensor, target: Tensor) -> Conditioned:
-    """Targets (n, R) complex as 2 n real numbers, given their covariance (2, n, 2, n), noise included."""
-    size = 2 * len(target)
-    return Conditioned.of(covariance.reshape(size, size), stacked(target)[0])
-
-
-class PhasedPosterior:
-    """Posterior of a phased scene's gains given rows."""
+class PhasedPosterior(Posterior):
+    """Posterior of a phased scene's gains given rows; `waves` are w_k."""
 
     def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
-        self.rows, self.phased, self.noise_floor = rows, phased, noise_floor
-        self.scene = phased.scene
+        super().__init__(rows, phased.scene, noise_floor)
+        self.phased = phased
 
     @cached_property
     def waves(self) -> Tensor:
         """w_k at the rows, (n, K) complex64."""
         return self.phased.waves(self.rows)
 
-    @cached_property
-    def conditioned(self) -> Conditioned:
-        """The rows' targets given their covariance."""
-        n, scene = len(self.rows), self.scene
-        covariance = torch.zeros(2, n, 2, n)
-        for k, source in enumerate(scene.sources):
-            scaled = self.waves[:, k] * scene.log_amplitude[k].exp()
-            correlation = scene.visibility.correlation(self.rows.places, source)
-            add_source(covariance, scaled, self.phased.quadrature, correlation)
-        noise = math.exp(scene.log_noise) + self.noise_floor
-        covariance.view(2 * n, 2 * n).diagonal().add_(noise / 2)
-        return given(covariance, self.rows.target)
+    def gains(self) -> PhasedGains:
+        """Of no source yet."""
+        return PhasedGains(self.rows, self.phased.quadrature)
 
     @property
     def dual_weights(self) -> Tensor:

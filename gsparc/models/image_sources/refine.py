@@ -1,26 +1,20 @@
-"""Maximise the marginal likelihood over planes, amplitudes and noise, and over the visibility kernel."""
+"""Maximise the marginal likelihood over planes, amplitudes, noise, phases, and the visibility kernel."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import (
-    JITTER,
-    Posterior,
-    Scene,
-    add_covariance,
-    correlations,
-    steering,
-)
+from gsparc.models.image_sources.gp_likelihood import JITTER, Posterior, Scene, correlations, steering
+from gsparc.models.image_sources.phased_gp import PhasedGains, PhasedPosterior, PhasedScene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
-from gsparc.processes.conditioned import Conditioned
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
@@ -31,31 +25,34 @@ PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and al
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
-Objective = Callable[[list[Tensor], Tensor], tuple[float, list[Tensor]]]
+S = TypeVar("S", Scene, PhasedScene)
 Late = Callable[[], bool]
-Cost = Callable[[Tensor, Tensor], Tensor]  # of planes and log amplitudes
+# Negative log prior [nats] of transmitter, planes (P, 4), log amplitudes (K,), log noise and phases (K,).
+Cost = Callable[[list[Tensor]], Tensor]
 
 
-def never() -> bool:
+def no_deadline() -> bool:
     """Of work without an end in time."""
     return False
 
 
-def descend(
-    rows: Rows, scene: Scene, steps: int, objective: Objective, *more: Tensor, late: Late = never
-) -> tuple[Scene, list[Tensor]]:
-    """The best scene, and the best of `more` parameters [rad], by Adam (D. P. Kingma and J. Ba, ICLR 2015).
+def refine(
+    rows: Rows, start: S, steps: int, noise_floor: float = JITTER, late: Late = no_deadline,
+    cost: Cost | None = None,
+) -> S:  # fmt: skip
+    """The best scene of `steps` steps of Adam (D. P. Kingma and J. Ba, ICLR 2015), or of those until `late`.
 
     Args:
         rows: measurements.
-        scene: start.
+        start: the start; a phased scene's phases move, too.
         steps: at least 0.
-        objective: transmitter, planes, log amplitudes, log noise and `more`, and visibility correlations
-            (K, n, n), to the objective and its derivatives.
-        more: start of parameters beside the scene's.
+        noise_floor: known variance of the noise, in units of the rows' power.
         late: asked after every step; none follows when it says so.
+        cost: a negative log prior, added to the negative log likelihood.
     """
-    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), *more]
+    scene = _scene_of(start)
+    phases: list[Tensor] = [start.phase] if isinstance(start, PhasedScene) else []
+    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), *phases]
     rates = [torch.tensor(step, dtype=torch.float64) for step in (TRANSMITTER_STEP, PLANE_STEP)]
     rates += [torch.tensor(STEP)] * (len(values) - 2)
     first, second = [torch.zeros_like(v) for v in values], [torch.zeros_like(v) for v in values]
@@ -63,7 +60,13 @@ def descend(
     for step in range(steps + 1):
         if step % REFRESH == 0:
             correlation = correlations(rows, images(values[0], values[1], scene.sequences), scene.visibility)
-        value, gradient = objective(values, correlation)
+        value, gradient = _likelihood(rows, start, values, correlation, noise_floor)
+        if cost is not None:
+            leaves = [v.detach().requires_grad_() for v in values]
+            with torch.enable_grad():
+                more = cost(leaves)
+                slopes = torch.autograd.grad(more, leaves, materialize_grads=True)
+            value, gradient = value + more.item(), [g + s for g, s in zip(gradient, slopes, strict=True)]
         if value < lowest:
             lowest, best = value, values
         if step == steps or late():
@@ -80,92 +83,87 @@ def descend(
     found = replace(
         scene, transmitter=best[0], planes=best[1], log_amplitude=best[2], log_noise=float(best[3])
     )
-    return found, best[4:]
+    return replace(start, scene=found, phase=best[4]) if isinstance(start, PhasedScene) else found
 
 
-def refine(
-    rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER, late: Late = never,
-    cost: Cost | None = None,
-) -> Scene:  # fmt: skip
-    """The best scene of `steps` steps, or of those until `late`."""
-
-    def objective(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
-        return _likelihood(rows, scene, values, correlation, noise_floor)
-
-    return descend(rows, scene, steps, with_cost(objective, cost), late=late)[0]
+def _scene_of(start: Scene | PhasedScene) -> Scene:
+    return start.scene if isinstance(start, PhasedScene) else start
 
 
-def with_cost(objective: Objective, cost: Cost | None) -> Objective:
-    """The objective plus a cost of planes (P, 4) and log amplitudes (K,), a negative log prior [nats]."""
-    if cost is None:
-        return objective
-
-    def both(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
-        value, gradient = objective(values, correlation)
-        with torch.enable_grad():
-            leaves = [v.detach().requires_grad_() for v in values[1:3]]
-            more = cost(*leaves)
-            slopes = torch.autograd.grad(more, leaves)
-        gradient[1:3] = [g + slope for g, slope in zip(gradient[1:3], slopes, strict=True)]
-        return value + more.item(), gradient
-
-    return both
+def _posterior(rows: Rows, start: Scene | PhasedScene, noise_floor: float) -> Posterior:
+    if isinstance(start, PhasedScene):
+        return PhasedPosterior(rows, start, noise_floor)
+    return Posterior(rows, start, noise_floor)
 
 
 def _likelihood(
-    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor, noise_floor: float
+    rows: Rows, start: Scene | PhasedScene, values: list[Tensor], correlation: Tensor, noise_floor: float
 ) -> tuple[float, list[Tensor]]:
-    """Negative log likelihood and its gradient: `d nll = trace(G dK)`, `G = R K^-1 - alpha alpha^H`."""
-    transmitter, planes = (v.detach().requires_grad_() for v in values[:2])
-    sources = images(rows.static_ends(transmitter), planes, scene.sequences)
-    waves = steering(rows, sources) * scene.visible_share(rows.position)
-    scaled = waves.detach() * values[2].exp()
-    noise = values[3].exp()
-    n = len(rows)
-    real, imag = torch.zeros(n, n), torch.zeros(n, n)
-    for k in range(len(scene.sequences)):
-        add_covariance(real, imag, scaled[:, k], correlation[k])
-    real.diagonal().add_(noise + noise_floor)
-    conditioned = Conditioned.of(torch.complex(real, imag), rows.target)
-    slope_re, slope_im = (part.contiguous() for part in (conditioned.slope.real, conditioned.slope.imag))
-    weighted = torch.empty_like(scaled)  # (G * C_k) s_k a_k
-    for k in range(len(scene.sequences)):
-        pair = torch.stack([scaled[:, k].real, scaled[:, k].imag], 1)
-        a = (slope_re * correlation[k]) @ pair
-        b = (slope_im * correlation[k]) @ pair
-        weighted[:, k] = torch.complex(a[:, 0] - b[:, 1], a[:, 1] + b[:, 0])
-    by_amplitude = 2 * (scaled.conj() * weighted).sum(0).real
-    by_noise = noise * slope_re.diagonal().sum()
-    by_wave = 2 * weighted * values[2].exp()
-    places = torch.autograd.grad(waves, [transmitter, planes], by_wave, materialize_grads=True)
-    return conditioned.nll, [*places, by_amplitude, by_noise]
+    """Negative log likelihood and its derivatives by the values: `d nll = trace(G dK)`."""
+    scene = _scene_of(start)
+    transmitter, planes, *phases = (v.detach().requires_grad_() for v in (*values[:2], *values[4:]))
+    waves = steering(rows, images(rows.static_ends(transmitter), planes, scene.sequences))
+    for phase in phases:
+        waves = waves * torch.polar(torch.ones(()), phase)
+    waves = waves * scene.visible_share(rows.position)
+    scaled, noise = waves.detach() * values[2].exp(), values[3].exp()
+    gains = _posterior(rows, start, noise_floor).gains()
+    for k, one in enumerate(correlation):
+        gains.add(scaled[:, k], one)
+    conditioned = gains.given(noise + noise_floor)
+    by_waves = gains.by_waves(conditioned.slope, scaled, correlation)
+    by_amplitude = (scaled.conj() * by_waves).sum(0).real
+    leaves = [transmitter, planes, *phases]
+    by_place, by_plane, *by_phase = torch.autograd.grad(
+        waves, leaves, by_waves * values[2].exp(), materialize_grads=True
+    )
+    by_noise = noise * gains.by_noise(conditioned.slope)
+    return conditioned.nll, [by_place, by_plane, by_amplitude, by_noise, *by_phase]
 
 
 def learn_visibility(
-    rows: Rows, scene: Scene, steps: int, start: KernelVisibility, late: Late = never
-) -> Scene:
-    """Parameters of the visibility kernel by likelihood, with a log-normal prior about `start`.
+    rows: Rows, start: S, steps: int, centre: KernelVisibility, noise_floor: float = JITTER,
+    late: Late = no_deadline,
+) -> S:  # fmt: skip
+    """Parameters of the visibility kernel by likelihood, with a log-normal prior about `centre`.
 
-    Without the prior the lengths collapse to explain the power of sources not found yet.
+    Without the prior the lengths collapse to explain the power of sources not found yet. Of a phased scene
+    `quadrature` is learned as well, unless it is 1: its prior is about the present one.
 
     Args:
         rows: a few hundred are enough.
+        start: the start.
         steps: of Adam.
-        start: centre of the prior.
+        centre: of the prior.
+        noise_floor: known variance of the noise, in units of the rows' power.
         late: asked before every step; none follows when it says so.
     """
-    centre, value = start.parameters(0.02), scene.visibility.parameters(0.02).requires_grad_()
-    optimizer = torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.95))
+    scene, phased = _scene_of(start), isinstance(start, PhasedScene)
+    shares, least = ((start.quadrature,), 0.005) if isinstance(start, PhasedScene) else ((), 0.02)
+    about, value = (kernel.parameters(least, *shares) for kernel in (centre, scene.visibility))
+    width = SPREAD * torch.tensor([1.0, 1.0, 1.0, 2.0])[: len(value)] * (2**0.5 if phased else 1)
+    optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=(0.8, 0.95))
+
+    def current() -> S:
+        bare = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
+        if not isinstance(start, PhasedScene):
+            return bare
+        kept = float(torch.sigmoid(value.detach()[3])) if start.quadrature < 1 else 1.0
+        return replace(start, scene=bare, quadrature=kept)
+
     for _ in range(steps):
         if late():
             break
-        posterior = Posterior(rows, replace(scene, visibility=KernelVisibility.of(value.detach())))
-        slope = posterior.conditioned.slope
+        posterior = _posterior(rows, current(), noise_floor)
+        slope, gains = posterior.conditioned.slope, posterior.gains()
+        if isinstance(gains, PhasedGains) and gains.quadrature < 1:
+            gains.quadrature = torch.sigmoid(value[3])
         scaled = posterior.waves * scene.log_amplitude.exp()
-        optimizer.zero_grad()
+        loss = ((value - about) / width).square().sum()
         for k, source in enumerate(scene.sources):
-            weight = (slope.conj() * scaled[:, k, None] * scaled[:, k].conj()).real
-            (weight * KernelVisibility.of(value).correlation(rows.places, source)).sum().backward()
-        ((value - centre).square().sum() / SPREAD**2).backward()
+            correlation = KernelVisibility.of(value).correlation(rows.places, source)
+            loss = loss + (gains.by_correlation(slope, scaled[:, k]) * correlation).sum()
+        optimizer.zero_grad()
+        loss.backward()
         optimizer.step()
-    return replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
+    return current()

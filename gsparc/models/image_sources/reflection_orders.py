@@ -13,25 +13,27 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
-from gsparc.models.image_sources.refine import Late, never, refine
+from gsparc.models.image_sources.refine import Late, no_deadline, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 
 LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
 MIN_IMAGE_SHIFT_M = 0.2  # [m], half the least distance of a source from its mirror image
+DROP_STEPS, ALLOWANCE = 12, 10.0  # of refinement without a plane, and nats that may be lost
+WALL_TOLERANCE = 0.03  # of a source's distance from the transmitter, to its image in a wall
+NEAR_SEQUENCE_M = 0.06  # [m], to that in perpendicular ones, plus 1 % of the distance
+MOST_WALLS, MOST_ORTHOGONAL = 10, 8
 MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
-def drop_planes(
-    rows: Rows, scene: Scene, tolerance: float, steps: int = 12, allowance: float = 10.0, late: Late = never
-) -> Scene:
+def drop_planes(rows: Rows, scene: Scene, tolerance: float, late: Late = no_deadline) -> Scene:
     """Try to remove planes until `late`: their sequences become the nearest over others [tolerance: m]."""
     index = 0
     while index < len(scene.planes) and not late():
         shorter = _without_plane(scene, index, tolerance)
         if shorter is not None:
-            shorter = refine(rows, shorter, steps)
-            if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + allowance:
+            shorter = refine(rows, shorter, DROP_STEPS)
+            if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + ALLOWANCE:
                 scene = shorter
                 continue
         index += 1
@@ -71,10 +73,10 @@ def _distances(scene: Scene, sequences: list[Reflections], places: Tensor, per_r
     return (position[None] - places[:, None]).norm(dim=-1) + per_reflection * order
 
 
-def find_walls(sources: Tensor, relative: float = 0.03, most: int = 10) -> Tensor | None:
+def find_walls(sources: Tensor) -> Tensor | None:
     """Walls: planes (P, 4) that mirror many of the sources (K, 3) into one another, or None."""
     count = len(sources)
-    tolerance = relative * (sources - sources[0]).norm(dim=1) + 0.02
+    tolerance = WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + 0.02
     first, second = torch.triu_indices(count, count, 1)
     planes = bisector(sources[first], sources[second])
     planes = planes[(sources[first] - sources[second]).norm(dim=1) > 2 * MIN_IMAGE_SHIFT_M]
@@ -88,7 +90,7 @@ def find_walls(sources: Tensor, relative: float = 0.03, most: int = 10) -> Tenso
     agreement = agreement * moved[..., None] * ~torch.eye(count, dtype=torch.bool)[:, None]
     support = agreement.amax(2).sum(0) / 2
     chosen: list[Tensor] = []
-    while len(chosen) < most and support.max() >= 1.7:
+    while len(chosen) < MOST_WALLS and support.max() >= 1.7:
         best = int(support.argmax())
         chosen.append(planes[best])
         alike = (mirrored - mirrored[:, best : best + 1]).norm(dim=-1).mean(0) < 2 * tolerance.mean()
@@ -96,22 +98,18 @@ def find_walls(sources: Tensor, relative: float = 0.03, most: int = 10) -> Tenso
     return torch.stack(chosen) if chosen else None
 
 
-def orthogonal_walls(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor | None:
+def orthogonal_walls(scene: Scene) -> Tensor | None:
     """The fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
 
     Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources that differ
-    along one normal only gives a plane. None when no two planes are perpendicular.
-
-    Args:
-        scene: sources; their sequences may be wrong.
-        most: planes.
-        near: tolerance between a source and its sequence [m], plus 1 % of its distance from the transmitter.
+    along one normal only gives a plane. None when no two planes are perpendicular. The sequences of the
+    scene's sources may be wrong.
     """
     triad = _triad(scene)
     if triad is None:
         return None
     sources = scene.sources
-    allowed = near + 0.01 * (sources - sources[0]).norm(dim=1)
+    allowed = NEAR_SEQUENCE_M + 0.01 * (sources - sources[0]).norm(dim=1)
     first, second = torch.triu_indices(len(sources), len(sources), 1)
     candidates = []
     for direction in triad:
@@ -124,7 +122,7 @@ def orthogonal_walls(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor 
         offsets = ((sources[first] + sources[second]) @ direction / 2)[fits]
         candidates += [torch.cat([direction, offset[None]]) for offset in offsets]
     chosen, explained = torch.zeros(0, 4, dtype=sources.dtype), 1.0
-    for _ in range(most):
+    for _ in range(MOST_ORTHOGONAL):
         tried = [torch.cat([chosen, plane[None]]) for plane in candidates]
         gains = [_explained(scene, planes, allowed) for planes in tried]
         if not gains or max(gains) < explained + 0.8:
@@ -160,10 +158,10 @@ def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
     return float(worth.amax(1).sum())
 
 
-def reassign(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
+def reassign(scene: Scene, walls: Tensor) -> Scene:
     """New sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
     sources = scene.sources
-    tolerance = 2.5 * (relative * (sources - sources[0]).norm(dim=1) + 0.02)
+    tolerance = 2.5 * (WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + 0.02)
     base = replace(scene, planes=walls)
     candidates = all_sequences(list(range(len(walls))), 3)
     distance = _distances(base, candidates, sources, 1.5 * LENGTH_PENALTY_M)
@@ -186,7 +184,7 @@ def reassign(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
     return explained.only(list(range(len(kept))))
 
 
-def prune(rows: Rows, scene: Scene, least: float, late: Late = never) -> Scene:
+def prune(rows: Rows, scene: Scene, least: float, late: Late = no_deadline) -> Scene:
     """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
     posterior = Posterior(rows, scene)
     weakest_first: list[Reflections] = sorted(

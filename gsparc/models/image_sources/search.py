@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, steering
-from gsparc.models.image_sources.refine import Late, learn_visibility, never, refine
+from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, direct_amplitude
+from gsparc.models.image_sources.refine import Late, learn_visibility, no_deadline, refine
 from gsparc.models.image_sources.reflection_orders import (
     drop_planes,
     find_walls,
@@ -72,22 +72,17 @@ class Search:
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
-        late: Late = never, over: Late = never,
+        late: Late = no_deadline, over: Late = no_deadline,
     ) -> None:  # fmt: skip
         self.rows, self.settings, self.late, self.over = rows, settings, late, over
         self.generator = torch.Generator().manual_seed(seed)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
-        waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
-        gain = (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
         self.scene = Scene(
-            transmitter,
-            torch.zeros(0, 4, dtype=torch.float64),
-            ((),),
-            gain.log().reshape(1),
-            math.log(settings.noise),
+            transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),),
+            direct_amplitude(rows, transmitter).log().reshape(1), math.log(settings.noise),
             settings.visibility,
-        )
+        )  # fmt: skip
 
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
@@ -139,7 +134,7 @@ class Search:
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, self.over)
+            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, late=self.over)
 
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""

@@ -38,7 +38,7 @@ class Member:
 
 
 class SearchCache:
-    """Finished searches by name.
+    """Finished searches by number.
 
     Args:
         folder: of the run; None or an empty path for no cache.
@@ -82,19 +82,19 @@ class SearchCache:
         self._kept, self.spent, self.limited_by = kept, spent, stored.get("limited_by")
         log.info("reusing %d cached searches (%.0f s of training time)", len(kept), wall)
 
-    def find(self, name: str, number: int) -> Member | None:
-        """The finished search of this name and number, or None."""
+    def find(self, number: int) -> Member | None:
+        """The finished search of this number, or None."""
         with self._lock:
-            kept = self._kept.get(f"{name} {number}")
+            kept = self._kept.get(f"search {number}")
         return (
             None if kept is None else Member(PhasedScene.from_state(kept["scene"]), kept["left_out"], number)
         )
 
-    def put(self, name: str, member: Member, limited_by: Clock | None) -> None:
+    def put(self, member: Member, limited_by: Clock | None) -> None:
         """Store a finished search, and what has ended one so far; the file is written atomically."""
         with self._lock:
             self.limited_by = less_repeatable(self.limited_by, limited_by)
-            self._kept[f"{name} {member.number}"] = {
+            self._kept[f"search {member.number}"] = {
                 "scene": member.phased.state(),
                 "left_out": member.left_out,
             }

@@ -9,9 +9,7 @@ error is that of an image drawn at random.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +17,7 @@ from scipy.spatial import cKDTree
 from sklearn.linear_model import RidgeCV
 from torch import Tensor
 
+from gsparc.models.moving_array.power_gp import WithKernel
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, matern32
 
@@ -42,7 +41,7 @@ def image_features(image: Tensor, added: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ErrorModel:
+class ErrorModel(WithKernel):
     """The regression.
 
     Attributes:
@@ -102,15 +101,6 @@ class ErrorModel:
         predicted = self.level + ((columns - self.centre) / self.scale) @ self.slope
         beyond = (nearest / self.farthest).clamp_min(1.0).square()
         return predicted.clamp(math.log(MIN_ERROR), math.log(MAX_ERROR)).exp() * beyond, nearest
-
-    def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers."""
-        return {**vars(self), "kernel": self.kernel.state()}
-
-    @staticmethod
-    def from_state(state: Mapping[str, Any]) -> ErrorModel:
-        """Inverse of `state`."""
-        return ErrorModel(**{**state, "kernel": Kernel.read(state["kernel"])})
 
 
 def fit_error_model(

@@ -324,18 +324,12 @@ class MovingArrayField(Interpolator):
             raise ValueError(f"{self.name}: fit or restore it first")
         return self._queries(tx, rx).detach()
 
-    def query(self, searches: int | None = None, count: int | None = None, stride: int = 1) -> Query:
-        """Answers with the first searches and components (None: all) on every `stride`-th pixel."""
-        if self._query is not None and (searches, count, stride) == (None, None, 1):
-            return self._query
-        residual = self.residual if count is None else self.residual.first(count)
-        query = Query(
-            self.array(stride), self.basis, self.trends[:searches], residual,
-            torch.from_numpy(self.positions), stride,
-        )  # fmt: skip
-        if (searches, count, stride) == (None, None, 1):
-            self._query = query
-        return query
+    def query(self) -> Query:
+        """Answers with all that was found, made once."""
+        if self._query is None:
+            places = torch.from_numpy(self.positions)
+            self._query = Query(self.array(), self.basis, self.trends, self.residual, places)
+        return self._query
 
     def size(self) -> int:
         """Number of sources of all searches."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -31,8 +31,23 @@ class TrendSettings:
     rows: int = 600
 
 
+class WithKernel:
+    """A dataclass of tensors and numbers with a kernel among them, stored and read."""
+
+    kernel: Kernel
+
+    def state(self) -> dict[str, Any]:
+        """Plain tensors and numbers."""
+        return {**vars(self), "kernel": self.kernel.state()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Self:
+        """Inverse of `state`."""
+        return cls(**{**state, "kernel": Kernel.read(state["kernel"])})
+
+
 @dataclass(frozen=True)
-class Trend:
+class Trend(WithKernel):
     """The sources of one search and how their powers vary.
 
     Attributes:
@@ -50,16 +65,6 @@ class Trend:
     def powers(self, far: Tensor) -> Tensor:
         """Power (m, K) of every source at places that are `far` (m, n) [m] from the training receivers."""
         return torch.addmm(self.level, self.kernel.correlation(far), self.weights)
-
-    def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers."""
-        return {**vars(self), "kernel": self.kernel.state()}
-
-    @staticmethod
-    def from_state(state: Mapping[str, Any]) -> Trend:
-        """Inverse of `state`."""
-        kernel = Kernel.read(state["kernel"])
-        return Trend(state["sources"], kernel, state["level"].float(), state["weights"].float())
 
 
 def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:

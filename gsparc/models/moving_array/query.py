@@ -61,24 +61,16 @@ class Query:
 
     Args:
         array: that looks.
-        basis: of what the residual adds.
+        basis: of what the residual adds, on the array's pixels.
         trends: of the searches, whose images are averaged.
         residual: the process.
         places: (n, 3) float64 [m] of the training receivers.
-        stride: between the pixels that are rendered, as the array's.
     """
 
     def __init__(
-        self,
-        array: Array,
-        basis: Separable,
-        trends: Sequence[Trend],
-        residual: Residual,
-        places: Tensor,
-        stride: int = 1,
+        self, array: Array, basis: Separable, trends: Sequence[Trend], residual: Residual, places: Tensor
     ) -> None:
-        self._array, self._trends, self._residual = array, trends, residual
-        self._basis = basis if stride == 1 else basis.thinned(stride)
+        self._array, self._basis, self._trends, self._residual = array, basis, trends, residual
         self._middle = places.mean(0)
         self._places = (places - self._middle).float()
 

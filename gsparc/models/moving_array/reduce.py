@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsparc.models.coarse_grid import Filled
 from gsparc.models.method import Method, Prediction
+from gsparc.models.moving_array.query import Query
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import View
 from gsparc.ops import Pose
@@ -53,7 +54,10 @@ class ReducedMean(View):
 
     def __init__(self, inner: MovingArrayField, searches: int, count: int, stride: int) -> None:
         super().__init__(inner)
-        self._query = inner.query(searches, count, stride)
+        basis = inner.basis if stride == 1 else inner.basis.thinned(stride)
+        trends, residual = inner.trends[:searches], inner.residual.first(count)
+        places = torch.from_numpy(inner.positions)
+        self._query = Query(inner.array(stride), basis, trends, residual, places)
         self._method, self._count = inner, count
 
     @torch.no_grad()

@@ -6,9 +6,7 @@ they share (`gsparc.physics.separable`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +14,7 @@ from scipy.linalg import eigh
 from torch import Tensor
 
 from gsparc.models.baselines.gp import choose_kernel
-from gsparc.models.moving_array.power_gp import solved
+from gsparc.models.moving_array.power_gp import WithKernel, solved
 from gsparc.processes.kernel import Kernel
 
 KERNEL_COMPONENTS = 128  # principal components that kernels are chosen on
@@ -24,7 +22,7 @@ SPARED = 3e-4  # of the left-out error: energy of predictions along all axes lef
 
 
 @dataclass(frozen=True)
-class Residual:
+class Residual(WithKernel):
     """The process, conditioned.
 
     Attributes:
@@ -46,15 +44,6 @@ class Residual:
     def first(self, count: int) -> Residual:
         """With the `count` axes that most is predicted along."""
         return Residual(self.kernel, self.mean, self.axes[:count], self.weights[:, :count].contiguous())
-
-    def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers."""
-        return {**vars(self), "kernel": self.kernel.state()}
-
-    @staticmethod
-    def from_state(state: Mapping[str, Any]) -> Residual:
-        """Inverse of `state`."""
-        return Residual(Kernel.read(state["kernel"]), state["mean"], state["axes"], state["weights"])
 
 
 def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int) -> tuple[Residual, Tensor]:

@@ -11,7 +11,14 @@ from rooms import WAVELENGTH, nmse
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.channels.complex_gp import ComplexGP
-from gsparc.models.channels.covariance import Shape, Values, diffuse_of, directional, prior, ways
+from gsparc.models.channels.covariance import (
+    Shape,
+    Values,
+    angle_knot_weights,
+    diffuse_of,
+    directional,
+    prior,
+)
 from gsparc.models.channels.field import ChannelField, restored
 from gsparc.models.channels.initial import initialise
 from gsparc.models.channels.kernels import sphere
@@ -76,7 +83,7 @@ def test_knots_add_up_and_mirrored_directions_count_alike():
     half = half[half[:, 2] > 0]
     shape = Shape(half, 8.0, False, False, False, middle, 10.0)
     ends = torch.tensor([[1.0, 0.5, 2.0], [1.0, 0.5, -2.0]], dtype=torch.float64)
-    found = ways(shape, ends, 5)
+    found = angle_knot_weights(shape, ends, 5)
     torch.testing.assert_close(found.sum(-1), torch.ones(2, len(half)).double())
     torch.testing.assert_close(found[0], found[1], atol=0.05, rtol=0)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from gains import gains
 
-from gsparc.models.image_sources import refine, refine_phase
+from gsparc.models.image_sources import refine
 from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, correlations, steering
 from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.models.image_sources.query import Query
@@ -122,11 +122,11 @@ def test_slopes_of_the_phased_likelihood():
     values = [
         scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), phased.phase,
     ]  # fmt: skip
-    start = refine_phase._likelihood(rows, phased, values, seen, 1e-5)[0]
+    start = refine._likelihood(rows, phased, values, seen, 1e-5)[0]
     assert start == pytest.approx(PhasedPosterior(rows, phased).conditioned.nll, rel=1e-5)
     _gradients_agree(
         values,
-        lambda v: refine_phase._likelihood(rows, phased, v, seen, 1e-5),
+        lambda v: refine._likelihood(rows, phased, v, seen, 1e-5),
         lambda i: 3e-4 if i < 2 else 2e-2,
     )
 
@@ -134,7 +134,7 @@ def test_slopes_of_the_phased_likelihood():
 def test_refining_never_worsens_the_likelihood():
     rows, scene, phased = _rows(), _scene(), _phased()
     assert Posterior(rows, refine.refine(rows, scene, 8)).nll < Posterior(rows, scene).nll
-    better = refine_phase.refine(rows, phased, 8)
+    better = refine.refine(rows, phased, 8)
     assert PhasedPosterior(rows, better).conditioned.nll < PhasedPosterior(rows, phased).conditioned.nll
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import JITTER
-from gsparc.models.image_sources.phased_gp import PhasedScene, add_source, shares, stacked
+from gsparc.models.image_sources.phased_gp import PhasedGains, PhasedScene, shares, stacked
 from gsparc.models.image_sources.rows import Rows
 from gsparc.processes.factor import Factor
 from gsparc.processes.worker import ask
@@ -53,14 +53,14 @@ class Residual:
 
     def _parts(self, phased: PhasedScene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
-        n, scene = len(self.rows), phased.scene
+        scene = phased.scene
         scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
-        varying, kernel = torch.zeros(2, n, 2, n), replace(scene.visibility, constant=0.0)
+        varying = PhasedGains(self.rows, phased.quadrature)
+        kernel = replace(scene.visibility, constant=0.0)
         for k, source in enumerate(scene.sources):
-            correlation = kernel.correlation(self.rows.places, source)
-            add_source(varying, scaled[:, k], phased.quadrature, correlation)
+            varying.add(scaled[:, k], kernel.correlation(self.rows.places, source))
         across = stacked(scaled)[1]
-        return varying.view(2 * n, 2 * n), shares(phased.quadrature)[1] * (across @ across.T)
+        return varying.matrix, shares(phased.quadrature)[1] * (across @ across.T)
 
     def _tuned(self, phased: PhasedScene) -> PhasedScene:
         """Constant share and noise by likelihood, in turn on a grid."""

@@ -11,7 +11,6 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources import refine_phase
 from gsparc.models.image_sources.backprojection import pick_apart
 from gsparc.models.image_sources.clutter.blocking import SOFT, Clutter, tangents, visible_share, within
 from gsparc.models.image_sources.clutter.boxes import find_box, inside_out
@@ -26,6 +25,7 @@ from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, des
 from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual
 from gsparc.models.image_sources.gp_likelihood import JITTER, Scene
 from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences
@@ -120,14 +120,22 @@ class _ClutterSearcher:
         Varying part and noise are those last factored; with `exact` they are the new scene's own, since the
         old ones would explain what the new scene occludes.
         """
-        residual, before, nll = self.residual, self.phased, self.nll
-        self._set_scene(replace(before, scene=scene, phase=before.phase if phase is None else phase))
-        self._descend(6)
-        if self.nll < nll - least:
-            if exact:
+        nll, moved = self.nll, replace(self.phased, scene=scene)
+
+        def change() -> None:
+            self._set_scene(moved if phase is None else replace(moved, phase=phase))
+            self._descend(6)
+            if exact and self.nll < nll - least:
                 self._refactor(self.phased)
-            if self.nll < nll - least:
-                return True
+
+        return self._changed(change, least)
+
+    def _changed(self, change: Callable[[], None], least: float) -> bool:
+        """Change something, and undo it where that gains fewer than `least` nats."""
+        residual, before, nll = self.residual, self.phased, self.nll
+        change()
+        if self.nll < nll - least:
+            return True
         self.residual = residual
         self._set_scene(before)
         return False
@@ -182,16 +190,20 @@ class _ClutterSearcher:
         self._drop()
         self._refactor(self.phased)
         self._drop_sequences()
-        cost = partial(self.phase_prior.cost, sequences=self.scene.sequences)
-        self._refactor(refine_phase.refine(self.rows, self.phased, STEPS, self.noise_floor, cost))
+        prior, sequences = self.phase_prior, self.scene.sequences
+        moved = refine(
+            self.rows, self.phased, STEPS, self.noise_floor, cost=lambda v: prior.cost(v[4], sequences)
+        )
+        self._refactor(moved)
 
     def _descend_soft(self, soft: float) -> None:
         """Descend with softer edges, whose gradients reach farther, then with sharp ones."""
-        before, nll = self.phased, self.nll
-        self._descend(16, soft)
-        self._descend(10)
-        if self.nll > nll:
-            self._set_scene(before)
+
+        def change() -> None:
+            self._descend(16, soft)
+            self._descend(10)
+
+        if not self._changed(change, 0.0):
             self._descend(10)
 
     def _mirrors(self) -> None:
@@ -348,30 +360,28 @@ class _ClutterSearcher:
     def _relocate_boxes(self) -> None:
         """Search for every box anew, given the others."""
         for number in range(len(self.scene.clutter.boxes)):
-            before, own = self.phased, self.scene.clutter.boxes[number]
-            nll = self.nll
-            self._set_scene(self._with_clutter(self.scene.clutter.without(number)))
-            near = own + 0.1 * torch.randn(4, 6, generator=self.generator)
-            box, _ = find_box(
-                self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator,
-                draws=400, parents=8, seeds=torch.cat([own[None], near]),
-            )  # fmt: skip
-            self._set_scene(self._with_clutter(self.scene.clutter.with_box(box, number)))
-            if self.nll > nll - 0.5:
-                self._set_scene(before)
+            self._changed(partial(self._relocate, number), 0.5)
 
-    def _with_clutter(self, clutter: Clutter) -> PhasedScene:
-        return replace(self.phased, scene=replace(self.scene, clutter=clutter))
+    def _relocate(self, number: int) -> None:
+        own = self.scene.clutter.boxes[number]
+        self._set_clutter(self.scene.clutter.without(number))
+        near = own + 0.1 * torch.randn(4, 6, generator=self.generator)
+        box, _ = find_box(
+            self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator,
+            draws=400, parents=8, seeds=torch.cat([own[None], near]),
+        )  # fmt: skip
+        self._set_clutter(self.scene.clutter.with_box(box, number))
+
+    def _set_clutter(self, clutter: Clutter) -> None:
+        self._set_scene(replace(self.phased, scene=replace(self.scene, clutter=clutter)))
 
     def _drop(self) -> None:
         """Remove clutter that the likelihood no longer supports."""
         number = 0
         while number < len(clutter := self.scene.clutter):
-            parameters, before, nll = BOX if number < len(clutter.boxes) else PATCH, self.phased, self.nll
-            self._set_scene(self._with_clutter(clutter.without(number)))
-            if self.nll > nll + parameters * self.parameter_cost:
-                self._set_scene(before)
-                number += 1
+            parameters = BOX if number < len(clutter.boxes) else PATCH
+            less = partial(self._set_clutter, clutter.without(number))
+            number += not self._changed(less, -parameters * self.parameter_cost)
 
     def _drop_sequences(self) -> None:
         """Remove sources whose constant and varying parts both gain too little."""
@@ -379,11 +389,8 @@ class _ClutterSearcher:
         kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
         dropped = len(gains) - len(kept)
         if dropped:
-            residual, before, nll = self.residual, self.phased, self.nll
-            self._refactor(replace(before, scene=self.scene.only(kept), phase=before.phase[kept]))
-            if self.nll > nll + dropped * self.parameter_cost:
-                self.residual = residual
-                self._set_scene(before)
+            fewer = replace(self.phased, scene=self.scene.only(kept), phase=self.phased.phase[kept])
+            self._changed(partial(self._refactor, fewer), -dropped * self.parameter_cost)
 
 
 def _sequences_over(number: int, known: list[int]) -> list[Reflections]:

@@ -12,16 +12,15 @@ import torch
 from torch import Tensor
 
 from gsparc.data.walls import SceneWalls
-from gsparc.models.image_sources import refine_phase
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.ensemble import SEARCH_END, compact, left_out_error
-from gsparc.models.image_sources.gp_likelihood import Scene, steering
+from gsparc.models.image_sources.gp_likelihood import Scene, direct_amplitude
 from gsparc.models.image_sources.known.images import affordable, hiding, start_amplitudes, visible_sequences
 from gsparc.models.image_sources.known.mirrors import MOST_PATCHES, Mirrors
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.phased_gp import PhasedScene
-from gsparc.models.image_sources.refine import refine
+from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
@@ -60,18 +59,23 @@ class KnownWallsGP(ImageSourceGP):
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
-        cache: SearchCache, stage: str = "search",
+        cache: SearchCache,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search."""
         rows, floor, over = row_sets[0], self.noise_floor, partial(budget.over, SEARCH_END)
         start = self._scene(rows, settings, clutter)
-        near = partial(walls_cost, start.planes, start.sequences)
+
+        def near(values: list[Tensor]) -> Tensor:
+            return walls_cost(start.planes, start.sequences, values[1], values[2])
+
+        def both(values: list[Tensor]) -> Tensor:
+            return near(values) + prior.cost(values[4], start.sequences)
+
         scene = refine(rows, start, STEPS[0], floor, over, near)
         phased = PhasedScene.of(rows, scene, QUADRATURE)
-        phased = refine_phase.learn_visibility(rows, phased, STEPS[1], settings.visibility, floor, over)
+        phased = learn_visibility(rows, phased, STEPS[1], settings.visibility, floor, over)
         prior = ReflectionPhasePrior.of(phased)
-        cost = partial(prior.cost, sequences=phased.scene.sequences)
-        phased = refine_phase.refine(rows, phased, STEPS[2], floor, cost, over, near)
+        phased = refine(rows, phased, STEPS[2], floor, over, both)
         error = left_out_error(rows, phased, floor)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
@@ -98,18 +102,13 @@ class KnownWallsGP(ImageSourceGP):
             mirrors, indices, transmitter, rows.position, order, settings.max_sources, hidden
         )
         held = hiding(mirrors, sequences, transmitter, rows.position) if hidden else Clutter.none()
-        direct = self._direct(rows, transmitter)
+        direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
             transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
             math.log(settings.noise), settings.visibility,
         )  # fmt: skip
-        return _without_idle(replace(bare, clutter=held))
-
-    @staticmethod
-    def _direct(rows: Rows, transmitter: Tensor) -> float:
-        """Amplitude of the direct wave if it were all there is."""
-        waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
-        return float((waves.mH @ rows.target).abs().mean() / waves.abs().square().sum())
+        # without planes that neither mirror nor hide
+        return replace(bare, clutter=held).only([*range(len(sequences))], held.plane)
 
 
 def walls_cost(
@@ -123,11 +122,3 @@ def walls_cost(
     law = torch.stack([torch.ones_like(order), order], 1)
     left = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)
     return (moved + turned + left.square().sum() / LOUDER**2) / 2
-
-
-def _without_idle(scene: Scene) -> Scene:
-    """The same without planes that neither mirror nor hide."""
-    used = sorted({index for sequence in scene.sequences for index in sequence} | set(scene.clutter.plane))
-    new = {old: i for i, old in enumerate(used)}
-    sequences = tuple(tuple(new[index] for index in sequence) for sequence in scene.sequences)
-    return replace(scene, planes=scene.planes[used], sequences=sequences, clutter=scene.clutter.renamed(new))
