@@ -62,14 +62,12 @@ COMMANDS = {
             "predict", f"{ROOM}predict.command", "predictions at places of a table: ckpt=FILE places=FILE"
         ),
         Command("simulate", f"{ROOM}simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
-        Command(
-            "study", f"{ROOM}study.command", "variants of one model: kind=effects, positions or measurements"
-        ),
-        Command("tradeoff", f"{ROOM}tradeoff.command", "accuracy against latency of one model: ckpt=FILE"),
-        Command("compare", f"{ROOM}compare.command", "every method under the same data, metrics and clock"),
+        Command("study", f"{ROOM}study", "variants of one model: kind=effects, positions or measurements"),
+        Command("tradeoff", f"{ROOM}tradeoff", "accuracy against latency of one model: ckpt=FILE"),
+        Command("compare", f"{ROOM}compare", "every method under the same data, metrics and clock"),
         Command(
             "calibrate",
-            f"{ROOM}calibrate.command",
+            f"{ROOM}calibrate",
             "compare confidences; a threshold with a bounded risk: ckpt=FILE",
         ),
         Command("link", f"{ROOM}link.command", "rates and block errors with predicted channels: ckpt=FILE"),

@@ -13,8 +13,8 @@ from gsparc.data.assemble import identity
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
+from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.metrics import paired_values
-from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import Scores, rows_of, score, unseen_runs
 from gsparc.models.label import common_label
 from gsparc.models.method import Method

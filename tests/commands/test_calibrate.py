@@ -10,13 +10,23 @@ import numpy as np
 import pytest
 from campaigns import brief, compose, spectra
 
-from gsparc.commands.calibrate import command
-from gsparc.commands.calibrate.command import collect, figures, tables
-from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
-from gsparc.commands.calibrate.trial import Trial, best_kind, cells, divided, divisible, trials
+from gsparc.commands import calibrate as command
+from gsparc.commands.calibrate import collect, figures, tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.prediction.confidence_scores import Evidence, gather, joined
+from gsparc.evaluation.calibration import (
+    Trial,
+    best_kind,
+    bounded,
+    cells,
+    divided,
+    divisible,
+    perfect_area,
+    rank_correlation,
+    risk_coverage,
+    trials,
+)
+from gsparc.prediction.confidence import Evidence, gather, joined
 from gsparc.prediction.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
 from gsparc.training.context import FitContext
 
@@ -161,10 +171,10 @@ def test_nobody_accepted_is_no_promise_kept() -> None:
 
 def test_a_picture_of_nobody_accepted(tmp_path) -> None:
     """Nothing to divide by is no reason to draw nothing."""
-    from gsparc.commands.calibrate.pictures import draw
+    from gsparc.evaluation.calibration import draw_calibration
 
     mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
-    draw(_evidence(), [mute], "silent", tmp_path / "confidence.png")
+    draw_calibration(_evidence(), [mute], "silent", tmp_path / "confidence.png")
     assert (tmp_path / "confidence.png").stat().st_size > 1000
 
 

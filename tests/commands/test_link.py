@@ -13,9 +13,8 @@ from cities import city, fold
 
 from gsparc import load
 from gsparc.commands.link.adaptation import Rates
-from gsparc.commands.link.beams import gain, loss_db
 from gsparc.commands.link.channels import truth
-from gsparc.commands.link.study import beam_facts, crossing, rate_facts
+from gsparc.commands.link.study import beam_facts, crossing, gain, loss_db, rate_facts
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings

@@ -9,9 +9,8 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsparc.commands.bench import kernels, layers, steps
-from gsparc.commands.bench.case import Call
-from gsparc.commands.bench.measure import Machine, measure, timed, undisturbed
+from gsparc.commands.bench import kernels, layers
+from gsparc.commands.bench.measure import Call, Machine, measure, timed, undisturbed
 from gsparc.commands.bench.scene import Scene, scene
 from gsparc.ops.projection import Projection
 from gsparc.prediction.timing import ClockSettings
@@ -109,7 +108,7 @@ def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:
 
 def _learning(projection: Projection) -> list[Claim]:
     """A step takes the same way in either, to 1e-4: what it costs less, a given accuracy costs less."""
-    case = steps.step(projection)
+    case = layers.step(projection)
     assert case.reference is not None
     ratio = _ratio(case.reference, case.kernel, ClockSettings(rounds=3, least=2, warmup=1, budget_s=2.0))
     return [Claim(f"training step, PyTorch / kernels at {case.count}", ratio, 2.0, True)]

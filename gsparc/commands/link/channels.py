@@ -16,7 +16,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.image_sources.phase_offsets import estimate
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
-from gsparc.prediction.confidence_scores import Evidence, expected_score, rivals
+from gsparc.prediction.confidence import Evidence, expected_score, rivals
 from gsparc.prediction.resource_grid import interpolated
 
 if TYPE_CHECKING:
