@@ -13,14 +13,14 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from gsparc.commands.output import columns, run_directory, show
+from gsparc.commands.output import columns, finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.fit import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Row, Study, Variant
-from gsparc.evaluation.summary import provenance, run_conditions, shown, table, write_samples, write_summary
+from gsparc.evaluation.summary import run_conditions, shown, table, write_samples
 from gsparc.models.method import Method
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
@@ -62,7 +62,7 @@ def task(config: DictConfig) -> list[Row]:
     except KeyboardInterrupt:  # whose advice is that of a training, which can be gone on with
         raise KeyboardInterrupt("the study was interrupted; it keeps nothing to go on from") from None
     facts: dict[str, Any] = {
-        **dataset_facts(data), **split_facts(split), **machine_facts(), **provenance(),
+        **dataset_facts(data), **split_facts(split),
         "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base,
     }  # fmt: skip
     for row in rows:
@@ -70,9 +70,10 @@ def task(config: DictConfig) -> list[Row]:
     title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", columns(rows, Row))
     draw_study(rows, title, run_dir / "study.png")
-    write_summary(run_dir / "summary.json", facts)
     ratios = "" if study.base is None else f"ratios to {study.base!r}; "
-    show(run_dir, table_of(rows, title), lines=run_conditions(facts), before=ratios)
+    finish(
+        run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()), before=ratios
+    )
     return rows
 
 

@@ -14,9 +14,8 @@ from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.site_plan import still_ends
+from gsparc.evaluation.site_plan import INCHES, corners, frame, still_ends
 
-INCHES = 6.5  # longer side of the map
 UPRIGHT = 0.3  # vertical part of a unit normal, below which a plane is drawn as a wall
 LEAST_DB = 0.5  # of a Gaussian that is drawn
 AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them with walls and without
@@ -34,7 +33,7 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     origin = data.site.origin
     places = np.unique(data.moving[:, -3:], axis=0) + origin
     ends = still_ends(data)
-    low, high = _view(np.concatenate([places[:, :2], ends]), AROUND if len(objects.planes) else MARGIN)
+    low, high = corners(np.concatenate([places[:, :2], ends]), AROUND if len(objects.planes) else MARGIN)
     width, height = (high - low) / (high - low).max() * INCHES
     figure, axes = panels(max(width, 3.0) + 1.9, max(height, 2.3) + 1.6)
     axis = axes[0, 0]
@@ -52,19 +51,11 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     level = _draw_planes(axis, objects.planes, origin, low, high)
     if len(ends):
         axis.plot(*ends.T, "k^", markersize=9, markeredgecolor="white", linestyle="", label="ends that stand")
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    axis.ticklabel_format(useOffset=False, style="plain")
+    frame(axis, low, high, {"xlabel": "x [m]", "ylabel": "y [m]"})
     figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
     title = f"{data.site.name}: what the field found"
     figure.suptitle(title if not level else f"{title}\n{level}", fontsize="medium")
     save(figure, path)
-
-
-def _view(shown: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of the map: points (n, 2) and a share of their extent around them."""
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    margin = max(float((high - low).max()), 1e-3) * share
-    return low - margin, high + margin
 
 
 def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:

@@ -166,9 +166,20 @@ def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
         shown.append(data.tx[:, :2] + data.site.origin[:2])
     every = np.concatenate(shown)
     every = every[np.isfinite(every).all(axis=1)]  # but for what stands at an unknown place
-    low, high = every.min(axis=0), every.max(axis=0)
-    margin = 0.06 * max(float((high - low).max()), 1e-3)
+    return corners(every, 0.06)
+
+
+def corners(shown: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (2,) of a map: points (n, 2) and a share of their extent around them."""
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    margin = max(float((high - low).max()), 1e-3) * share
     return low - margin, high + margin
+
+
+def frame(axis: Any, low: np.ndarray, high: np.ndarray, labels: dict[str, str]) -> None:
+    """The same scale along both axes, plain numbers, labels."""
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", **labels)
+    axis.ticklabel_format(useOffset=False, style="plain")
 
 
 def _draw_map(
@@ -199,8 +210,7 @@ def _draw_map(
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}
         axis.scatter(*ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how)
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", **_labels(data))
-    axis.ticklabel_format(useOffset=False, style="plain")
+    frame(axis, low, high, _labels(data))
     _draw_stations(axis, data, jumping)
     _draw_suspicious(axis, found, low, high)
 

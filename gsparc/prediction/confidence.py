@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +46,6 @@ class Evidence:
     def __len__(self) -> int:
         return len(self.row)
 
-    def at(self, index: np.ndarray) -> Evidence:
-        """Some of the positions."""
-        scores = {kind: score[index] for kind, score in self.scores.items()}
-        return Evidence(self.row[index], self.position[index], self.error[index], scores)
-
 
 def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Ask `method` about `rows`, and the rivals too.
@@ -58,20 +53,23 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
     `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
     (in a fade the same variance is a larger relative error); a method without them has no such kind.
     """
-    errors, learned, expected = [], [], []
+    parts = []
     for start in range(0, len(rows), CHUNK):
-        batch = data.batch(rows[start : start + CHUNK])
-        found = method.answer(batch)
-        miss = (found.mean - batch.target).abs().square().flatten(1).sum(1)
-        power = batch.target.abs().square().flatten(1).sum(1)
-        errors.append((miss / power.clamp_min(1e-30)).double().numpy())
-        sure = found.confidence
-        none = np.full(len(batch), np.nan)
-        learned.append(none if sure is None else sure.double().numpy())
-        expected.append(none if found.variance is None else expected_score(found).double().numpy())
-    own = {"learned": np.concatenate(learned), "expected": np.concatenate(expected)}
-    scores = {kind: score for kind, score in own.items() if not np.isnan(score).any()}
-    return Evidence(rows, data.moving[rows], np.concatenate(errors), scores | rivals(data, fold, rows))
+        some = rows[start : start + CHUNK]
+        batch = data.batch(some)
+        parts.append(Evidence(some, data.moving[some], *judged(method.answer(batch), batch.target)))
+    found = joined(parts)
+    return replace(found, scores=found.scores | rivals(data, fold, rows))
+
+
+def judged(said: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state."""
+    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
+    expected = None if said.variance is None else expected_score(said)
+    own = {"learned": said.confidence, "expected": expected}
+    stated = {kind: score.double().numpy() for kind, score in own.items() if score is not None}
+    error = (miss / power.clamp_min(1e-30)).double().numpy()
+    return error, {kind: score for kind, score in stated.items() if not np.isnan(score).any()}
 
 
 def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:

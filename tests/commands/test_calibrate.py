@@ -10,17 +10,19 @@ import numpy as np
 import pytest
 from campaigns import brief, compose, spectra
 
-from gsparc.commands import calibrate as command
-from gsparc.commands.calibrate import collect, figures, tables
+from gsparc.commands.calibrate import tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
+from gsparc.evaluation import calibration as command
 from gsparc.evaluation.calibration import (
     Trial,
     best_kind,
     bounded,
     cells,
+    collect,
     divided,
     divisible,
+    figures,
     perfect_area,
     rank_correlation,
     risk_coverage,
@@ -187,7 +189,7 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
     with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
         divided(two, "spatial", rng)
     with pytest.raises(ValueError, match="2 positions cannot be parted"):
-        divided(two.at(np.arange(2)), "random", rng)
+        divided(_evidence(2), "random", rng)
 
 
 def test_positions_on_a_plumb_line_have_patches() -> None:

@@ -18,7 +18,7 @@ from gsparc.commands.link.study import beam_facts, crossing, gain, loss_db, rate
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings
-from gsparc.prediction.resource_grid import centred, interpolated, resource_grid
+from gsparc.prediction.export import centred, interpolated, resource_grid
 from gsparc.prediction.risk_threshold import binomial_interval
 from gsparc.training.context import FitContext
 

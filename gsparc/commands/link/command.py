@@ -28,14 +28,13 @@ from gsparc.commands.link.study import (
     tradeoff,
     transmit,
 )
-from gsparc.commands.output import run_directory, show
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.calibration import accept
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import provenance, shown, table, write_summary
-from gsparc.prediction.resource_grid import SUBCARRIERS_PER_BLOCK, centred
+from gsparc.evaluation.summary import shown, table, write_summary
+from gsparc.prediction.export import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.prediction.risk_threshold import Promise
-from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
 
@@ -148,10 +147,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     if drawn:
         draw_errors(drawn, title, run_dir / "bler.png")
         draw_acceptance(trades, float(accepted.mean()), run_dir / "acceptance.png")
-    facts |= {**machine_facts(), **provenance(), "time/total_s": time.perf_counter() - started}
-    write_summary(run_dir / "summary.json", facts)
-    show(run_dir, *tables(facts, title, list(wanted), levels))
-    return facts
+    facts["time/total_s"] = time.perf_counter() - started
+    return finish(run_dir, facts, *tables(facts, title, list(wanted), levels))
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:

@@ -15,14 +15,14 @@ from lightning import Callback, Trainer
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.load import split_settings
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.scores import score
 from gsparc.models import parts
 from gsparc.models.method import Method
 from gsparc.models.per_station import for_links
-from gsparc.prediction.timing import ClockSettings, cycling, interleaved
+from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Clock, less_repeatable
 
@@ -65,9 +65,6 @@ def plain(node: DictConfig) -> dict[str, Any]:
 def callbacks_of(nodes: Mapping[str, Any] | None) -> list[Callback]:
     """Every callback of the group `callbacks` that was not set to null."""
     return [instantiate(node) for node in (nodes or {}).values() if node is not None]
-
-
-QUERIES = 64  # different positions asked for
 
 
 @dataclass(frozen=True)
@@ -146,14 +143,9 @@ def fit_and_score(
     return found if eval_on is None else found.scored_on(data, split, eval_on)
 
 
-def queries(data: Measurements, rows: np.ndarray) -> list[Batch]:
-    """Single queries at the first rows (n,)."""
-    return [data.batch(rows[i : i + 1]) for i in range(min(len(rows), QUERIES))]
-
-
 def query_ms(
     methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings
 ) -> dict[str, tuple[float, float]]:
     """Median and 95th percentile of warm single queries, all methods in turns [ms]."""
     times = interleaved(cycling(methods, queries(data, rows)), clock)
-    return {name: (float(np.median(ms)), float(np.quantile(ms, 0.95))) for name, ms in times.items()}
+    return {name: percentiles(ms) for name, ms in times.items()}

@@ -11,12 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.data.files import whole_file
-from gsparc.evaluation.experiment.fit import queries
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models import loading
 from gsparc.models.method import Method
-from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, reference_copy
+from gsparc.prediction.timing import (
+    COPY,
+    ClockSettings,
+    cycling,
+    interleaved,
+    percentiles,
+    queries,
+    reference_copy,
+)
 
 log = logging.getLogger(__name__)
 
@@ -66,12 +73,7 @@ def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
 def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:
     copy = float(np.median(times[COPY]))
     return {
-        name: Latency(
-            p50_ms=float(np.median(values)),
-            p95_ms=float(np.quantile(values, 0.95)),
-            to_copy=float(np.median(values)) / copy,
-            rounds=len(values),
-        )
+        name: Latency(*percentiles(values), float(np.median(values)) / copy, len(values))
         for name, values in times.items()
         if name != COPY
     }

@@ -13,7 +13,7 @@ from matplotlib.artist import Artist
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
 from gsparc.evaluation.experiment.study import Row as StudyRow
 from gsparc.evaluation.experiment.table import SCORE, Row, mean_behind
-from gsparc.evaluation.figures import lower_is_better
+from gsparc.evaluation.figures import axis_of, lower_is_better
 
 LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches
@@ -65,7 +65,6 @@ def _panel(axis: Any, rows: Sequence[Row], horizontal: str, ours: str) -> None:
     logarithmic(axis, fine=False)
 
 
-LABEL = {"nmse": "NMSE", "rmse_db": "RMSE [dB]", "psnr_db": "PSNR [dB]"}
 LINE = 0.34  # height of a method [inch]
 
 
@@ -102,7 +101,7 @@ def draw_splits(rows: Sequence[Row], path: Path) -> None:
             )  # fmt: skip
         draws = max(row.seeds for row in here.values())
         axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
-        axis.set_xlabel(LABEL[best.figure])
+        axis.set_xlabel(axis_of(best.figure))
         axis.set_yticks(np.arange(len(names)), names)
         axis.grid(axis="y", visible=False)
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)

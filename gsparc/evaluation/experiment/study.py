@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -217,3 +217,137 @@ def _value(outcome: Outcome, figure: str) -> float:
     if value is None:
         raise ValueError(f"{figure} is not defined on these test rows")
     return value
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What each effect costs, and what it gains: the data stay as they are."""
+
+    title: ClassVar[str] = "what effects cost and gain"
+
+    def conditions(self) -> list[Condition]:
+        """The data as they are."""
+        return [Condition()]
+
+
+@dataclass(frozen=True)
+class Positions:
+    """What errors of positions and of directions of arrival cost.
+
+    Attributes:
+        errors_m: standard deviations of each coordinate [m].
+        errors_deg: of directions of arrival about each of two axes, where receivers measured them [degrees].
+        train_errors: whether training positions are disturbed, too; else those of queries alone.
+    """
+
+    title: ClassVar[str] = "accuracy against errors of positions and directions"
+    errors_m: Sequence[float] = ()
+    errors_deg: Sequence[float] = ()
+    train_errors: bool = True
+
+    def conditions(self) -> list[Condition]:
+        """No error, then errors of positions in a `query`, in training (`train`), and of `directions`."""
+        errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
+        return [
+            Condition(),
+            *(Condition("query", error, tested=partial(_asked_elsewhere, error)) for error in errors),
+            *(
+                Condition("train", error, learned=partial(_learned_elsewhere, error))
+                for error in errors
+                if self.train_errors
+            ),
+            *(Condition("directions", error, learned=partial(_turned, error)) for error in degrees),
+        ]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Accuracy against the number of measurements.
+
+    Attributes:
+        keep: training sets, as shares of the rows up to 1 or as numbers of rows above; smaller ones are
+            subsets of larger ones. Validation rows are thinned with them, test rows stay.
+    """
+
+    title: ClassVar[str] = "accuracy against the number of measurements"
+    keep: Sequence[float] = (1.0,)
+
+    def __post_init__(self) -> None:
+        if not self.keep or not all(float(keep) > 0 for keep in self.keep):
+            raise ValueError(f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed")
+
+    def conditions(self) -> list[Condition]:
+        """A condition per training set, called `keep`."""
+        return [Condition("keep", float(keep), learned=partial(_thinned, float(keep))) for keep in self.keep]
+
+
+def _asked_elsewhere(error_m: float, data: Measurements, split: Split, seed: int) -> Measurements:
+    return displaced(data, np.concatenate([fold.test for fold in split.folds]), error_m, seed)
+
+
+def _learned_elsewhere(
+    error_m: float, data: Measurements, fold: Fold, seed: int
+) -> tuple[Measurements, Fold]:
+    return displaced(data, np.concatenate([fold.train, fold.val]), error_m, seed), fold
+
+
+def _turned(error_deg: float, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
+    return turned(data, error_deg, seed), fold
+
+
+def _thinned(keep: float, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
+    return data, thinned(fold, keep, seed)
+
+
+def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
+    """The moving end of `rows` believed elsewhere by N(0, error_m^2) per coordinate; all else the same."""
+    offset = np.random.default_rng(seed).normal(scale=error_m, size=(len(rows), 3))
+    name = "tx" if data.site.moving_end == "tx" else "rx_position"
+    moved = getattr(data, name).copy()
+    moved[rows] += offset
+    return replace(data, **{name: moved})
+
+
+def turned(
+    data: Measurements, error_deg: float, seed: int, *, missing: float = 0.0, false: float = 0.0
+) -> Measurements:
+    """Directions of arrival as a receiver measures them; all else the same.
+
+    Args:
+        data: with directions.
+        error_deg: standard deviation about each of two axes across a direction [degrees].
+        seed: of the draw.
+        missing: share of the directions that are not there.
+        false: number of directions from anywhere, as a share of those that are there.
+
+    Raises:
+        ValueError: no directions.
+    """
+    if data.directions is None:
+        raise ValueError(f"{data.site.name}: no directions of arrival to disturb; take kind.errors_deg=[]")
+    rng, sigma = np.random.default_rng(seed), np.radians(error_deg)
+    measured = []
+    for true in data.directions:
+        ray = true.astype(np.float64)
+        aside = rng.normal(scale=sigma, size=ray.shape)
+        ray = ray + aside - (aside * ray).sum(1, keepdims=True) * ray
+        ray = ray[rng.random(len(ray)) >= missing]
+        ray = np.concatenate([ray, rng.normal(size=(rng.binomial(len(ray), false), 3))])
+        measured.append((ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32))
+    return replace(data, directions=measured)
+
+
+def thinned(fold: Fold, keep: float, seed: int) -> Fold:
+    """A fold with fewer rows to learn from; smaller ones are subsets of larger ones of the same seed.
+
+    Args:
+        fold: its training and validation rows are thinned alike, its test rows stay.
+        keep: a share of the rows up to 1; above, a number of rows.
+        seed: of the choice.
+    """
+    every = len(fold.train) + len(fold.val)
+    total = min(round(keep * every if keep <= 1 else keep), every)
+    validate = min(max(round(total * len(fold.val) / every), 1), len(fold.val))
+    rng = np.random.default_rng([seed, 4])
+    train, val = (rng.permutation(rows) for rows in (fold.train, fold.val))
+    return Fold(np.sort(train[: max(total - validate, 1)]), np.sort(val[:validate]), fold.test)

@@ -14,7 +14,7 @@ from gsparc.data.schema import Kind
 from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled, score_db
 from gsparc.evaluation.experiment.latency import Latency
-from gsparc.evaluation.figures import DECIDING
+from gsparc.evaluation.figures import DECIDING, heading_of
 from gsparc.evaluation.summary import BUSY, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
@@ -322,9 +322,6 @@ def _columns(block: Block) -> dict[str, Callable[[Row], str]]:
     }
 
 
-UNIT = {"nmse": "NMSE", "rmse_db": "RMSE, dB", "psnr_db": "PSNR, dB"}
-
-
 def overview(rows: Sequence[Row]) -> str:
     """Markdown: the figure ± its standard error of the mean, (how far behind the best of the same draws).
 
@@ -346,7 +343,8 @@ def overview(rows: Sequence[Row]) -> str:
         lines.append(
             "| " + " | ".join([name, *cells, f"{first.train_s:.2g}", shown(first.query_ms, ".2g")]) + " |"
         )
-    title = f"### {rows[0].dataset}: {UNIT[rows[0].figure]}, {draws} draws of each split"
+    figure = heading_of(rows[0].figure).replace(" dB", ", dB")
+    title = f"### {rows[0].dataset}: {figure}, {draws} draws of each split"
     return "\n".join([title, "", *lines])
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,15 +16,22 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.evaluate import paired_differences
-from gsparc.evaluation.figures import DECIDING, lower_is_better, score_of
+from gsparc.evaluation.figures import DECIDING, axis_of, lower_is_better, score_of
+from gsparc.evaluation.open_runs import Opened, trained_on
 from gsparc.evaluation.scores import Scores, rows_of, score
+from gsparc.models import loading
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Point, Settings
+from gsparc.models.pareto import Point, Settings, cost_of_halving
 from gsparc.models.reduced import View
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import Call, ClockSettings, interleaved
+from gsparc.prediction.timing import (
+    Call,
+    ClockSettings,
+    interleaved,
+)
 
 log = logging.getLogger(__name__)
 
@@ -128,11 +137,6 @@ def _difference(scores: Scores, full: Scores, figure: str) -> tuple[float | None
     return found.get(stem), found.get(f"{stem}_se")
 
 
-NAMES = {
-    "psnr_db": "PSNR [dB]", "nmse": "NMSE", "rmse_db": "RMSE [dB]", "ssim_gauss": "SSIM (11 x 11 Gaussian)"
-}  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Other:
     """Another method on the same axes: its accuracy and median latency [ms]."""
@@ -195,7 +199,7 @@ def draw_front(
         below = [name for name, other in others.items() if other.value < axes.get_ylim()[0]]
         if below:
             axes.text(0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, fontsize=8)
-    axes.set(xlabel="one query end to end, median [ms]", ylabel=NAMES.get(figure_name, figure_name))
+    axes.set(xlabel="one query end to end, median [ms]", ylabel=axis_of(figure_name))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
@@ -209,3 +213,88 @@ def draw_front(
     text = "\n".join(["       median  accuracy  settings", *told])
     legend.text(0, 1, text, va="top", family="monospace", fontsize=7.5)
     return figure
+
+
+def others_of(
+    run: Opened, baselines: Sequence[str], peers: Sequence[str], ckpt: str, eval_on: str, cache: Path
+) -> dict[str, tuple[Method, float | None]]:
+    """Baselines and the methods in other checkpoints, with the deciding figure of each."""
+    figure, data = DECIDING[run.data.site.kind], run.data
+    whole = Split("tradeoff", (run.split.folds[0],), "")
+    found: dict[str, tuple[Method, float | None]] = {}
+    for name in baselines:
+        fitted = baseline(name, data, run.split, eval_on, cache)
+        found[name] = (fitted.methods[0], fitted.scores.figures()[figure])
+    for path in peers:
+        method, other = loading.load(path)
+        if trained_on([other], replace(run.split, folds=run.split.folds[:1])) is False:
+            raise ValueError(f"peers: {path} was trained on another split than {ckpt}")
+        names = (method.name, f"{method.name} ({Path(path).parent.name})", path)
+        name = next(name for name in names if name not in found)
+        found[name] = (method, score([method], data, whole, eval_on).figures()[figure])
+    return found
+
+
+def columns_of(
+    points: list[Point], shown: list[int], chosen: list[int], copy_ms: float
+) -> dict[str, list[Any]]:
+    """Columns of `tradeoff.csv`, fastest point first."""
+    order = sorted(range(len(points)), key=lambda i: points[i].p50)
+    rows = [points[i] for i in order]
+    knobs = list(dict.fromkeys(knob for p in points for knob in p.settings))
+    return {
+        "label": [p.label for p in rows],
+        "render_ms_p50": [p.p50 for p in rows],
+        "render_ms_p95": [p.p95 for p in rows],
+        "ratio_to_copy": [p.p50 / copy_ms for p in rows],
+        **{figure: [p.figures[figure] for p in rows] for figure in points[0].figures},
+        "difference_to_full": [p.difference[0] for p in rows],
+        "difference_se": [p.difference[1] for p in rows],
+        "closeness_db": [p.closeness_db for p in rows],
+        "front": [int(i in shown) for i in order],
+        "kept_with_model": [int(i in chosen) for i in order],
+        "threads": [p.threads for p in rows],
+        "num_gaussians": [p.size for p in rows],
+        **{f"set/{knob}": [_cell(p.settings.get(knob)) for p in rows] for knob in knobs},
+    }
+
+
+def _cell(value: Any) -> Any:
+    return "+".join(map(str, value)) if isinstance(value, (list, tuple)) else value
+
+
+def facts_of(
+    points: list[Point], best: list[Point], figure: str, others: dict[str, Other], copy_ms: float
+) -> dict[str, Any]:
+    """`tradeoff/*`, `front/<number>/*`, `baseline/<name>/*` and the full model's time and accuracy."""
+    full = min((p for p in points if not p.settings), key=lambda p: p.p50)
+    useful = [p for p in best if beaten_by(p, others, figure) is None]  # a slope of points that others beat
+    halving = cost_of_halving([p.p50 for p in useful], [score_of(figure, p.value(figure)) for p in useful])
+    facts: dict[str, Any] = {
+        "tradeoff/points": len(points),
+        "tradeoff/front": len(best),
+        "tradeoff/span": best[-1].p50 / best[0].p50,
+        "tradeoff/per_halving": halving,
+        "tradeoff/figure": figure,
+        "tradeoff/front_beaten_by_others": sum(beaten_by(p, others, figure) is not None for p in best),
+        "time/copy_ms": copy_ms,
+        "time/render_ms_p50": full.p50,
+        "time/render_ms_p95": full.p95,
+        f"test/{figure}": full.value(figure),
+    }
+    for number, p in enumerate(best, 1):
+        own = {"render_ms_p50": p.p50, "render_ms_p95": p.p95, "label": p.label, **p.figures}
+        facts |= {f"front/{number}/{name}": value for name, value in own.items()}
+    for name, other in others.items():
+        facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
+    return facts
+
+
+def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows of the table of points."""
+    rows = []
+    for p in best:
+        gap, error = p.difference
+        apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
+        rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
+    return ["point", "ms p50", "ms p95", figure, "difference to full"], rows

@@ -10,9 +10,8 @@ from itertools import product
 import numpy as np
 
 from gsparc.evaluation.figures import PER_SAMPLE, TABLES, form_of, heading_of, score_of
-from gsparc.evaluation.report.intervals import Interval, interval, over_seeds
 from gsparc.evaluation.report.runs import Run, number, sizes
-from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.report.table import Column, Interval, Table, interval, over_seeds
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 WORST = 3

@@ -9,7 +9,7 @@ import pytest
 from invented import divide, invent
 from rooms import directed
 
-from gsparc.evaluation.experiment.conditions import displaced, thinned, turned
+from gsparc.evaluation.experiment.study import displaced, thinned, turned
 
 
 def test_positions_move_where_asked_and_by_what_was_asked():

@@ -9,9 +9,8 @@ import pytest
 from clocks import WoundClock
 from invented import divide, invent
 
-from gsparc.evaluation.experiment.conditions import Measured, Positions
 from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
-from gsparc.evaluation.experiment.study import Study, Variant
+from gsparc.evaluation.experiment.study import Measured, Positions, Study, Variant
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.baselines.nearest import Nearest

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from gsparc.evaluation.report import tables
-from gsparc.evaluation.report.intervals import Interval, bootstrap, interval
 from gsparc.evaluation.report.plots import short
 from gsparc.evaluation.report.runs import Run, columns, distinct_overrides, find_runs
-from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.report.table import Column, Interval, Table, bootstrap, interval
 
 
 def cells(table, row: int) -> dict:

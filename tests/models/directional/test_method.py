@@ -13,7 +13,7 @@ from scenes import error
 
 from gsparc.data.campaigns.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
-from gsparc.evaluation.experiment.conditions import turned
+from gsparc.evaluation.experiment.study import turned
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.gp_likelihood import steering
 from gsparc.models.image_sources.method import ImageSourceGP
