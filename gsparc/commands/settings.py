@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
-from gsparc.evaluation.experiment.fit import plain as plain
+from gsparc.evaluation.console import plain as plain
 from gsparc.models.registry import build, known
 
 

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.console import plain
 from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.scores import score
 from gsparc.models import parts
@@ -55,11 +56,6 @@ def context_of(
         config_yaml=OmegaConf.to_yaml(config, resolve=True),
         **others,
     )
-
-
-def plain(node: DictConfig) -> dict[str, Any]:
-    """A group of settings as plain containers; a setting that is still missing is an error."""
-    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
 
 
 def callbacks_of(nodes: Mapping[str, Any] | None) -> list[Callback]:

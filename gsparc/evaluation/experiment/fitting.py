@@ -18,10 +18,10 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.claims import each_once
 from gsparc.data.files import no_room
 from gsparc.data.schema import Kind
-from gsparc.evaluation.console import one_line
+from gsparc.evaluation.console import one_line, plain
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.cells import Cell, Contender, key
-from gsparc.evaluation.experiment.fit import context_of, fit_and_score, in_folders, plain
+from gsparc.evaluation.experiment.fit import context_of, fit_and_score, in_folders
 from gsparc.evaluation.experiment.problem import RESULT, Problem, compose, facts_of
 from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.summary import provenance, write_summary

@@ -20,7 +20,7 @@ from gsparc.data.assemble import identity
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.experiment.fit import plain
+from gsparc.evaluation.console import plain
 from gsparc.simulate.scenes.build import names_scene
 
 log = logging.getLogger(__name__)
