@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsparc.commands.compare import problem
-from gsparc.commands.compare.cells import key
-from gsparc.commands.compare.problem import SplitChoice, load_problems
 from gsparc.data.assemble import identity
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
 from gsparc.evaluation import baseline_cache
+from gsparc.evaluation.experiment import problem
+from gsparc.evaluation.experiment.cells import key
+from gsparc.evaluation.experiment.problem import SplitChoice, load_problems
 from gsparc.models.array_vectors import vector_cache
 from gsparc.models.checkpoint import _as_numpy, _plain, _site_from
 from gsparc.models.image_sources.method import ImageSourceGP

@@ -30,7 +30,7 @@ ARROWS = {
     "training": "data field ops processes",
     "models": "data field ops physics processes simulate training",
     "prediction": "data models ops processes",
-    "evaluation": "conf data models prediction training",
+    "evaluation": "conf data models prediction simulate training",
     "maps": "data evaluation models prediction processes training",
     "view": "data evaluation maps models ops prediction",
     "callbacks": "data evaluation field training",

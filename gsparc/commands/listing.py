@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
+ROOM = "gsparc.commands."
+
 
 @dataclass(frozen=True)
 class Command:
@@ -15,17 +17,22 @@ class Command:
 
     Attributes:
         name: also of its configuration, `conf/<name>.yaml`.
-        module: has `task(config)`.
         answers: one line for the list.
+        own: module with `task(config)`; empty: `gsparc.commands.<name>`.
         bare: setting that takes words without an equals sign, as a list of paths.
         configured: False for a command without a configuration: its module has `main(arguments)`.
     """
 
     name: str
-    module: str
     answers: str
+    own: str = ""
     bare: str | None = None
     configured: bool = True
+
+    @property
+    def module(self) -> str:
+        """Where its task is."""
+        return self.own or ROOM + self.name
 
     def arguments(self, given: Sequence[str]) -> list[str]:
         """A command line in Hydra's words: bare paths become `<bare>=[...]`."""
@@ -46,42 +53,28 @@ class Command:
         cli.run(module.task, self.name)
 
 
-ROOM = "gsparc.commands."
 COMMANDS = {
     command.name: command
     for command in (
-        Command("train", f"{ROOM}train", "train a method on a dataset and test it beside baselines"),
-        Command("evaluate", f"{ROOM}evaluate", "test a checkpoint again: ckpt=FILE"),
+        Command("train", "train a method on a dataset and test it beside baselines"),
+        Command("evaluate", "test a checkpoint again: ckpt=FILE"),
+        Command("check", "what is in files of measurements, or what is wrong: FILE...", configured=False),
         Command(
-            "check",
-            f"{ROOM}check",
-            "what is in files of measurements, or what is wrong: FILE...",
-            configured=False,
+            "predict", "predictions at places of a table: ckpt=FILE places=FILE", f"{ROOM}predict.command"
         ),
-        Command(
-            "predict", f"{ROOM}predict.command", "predictions at places of a table: ckpt=FILE places=FILE"
-        ),
-        Command("simulate", f"{ROOM}simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
-        Command(
-            "study", f"{ROOM}study.command", "variants of one model: kind=effects, positions or measurements"
-        ),
-        Command("tradeoff", f"{ROOM}tradeoff.command", "accuracy against latency of one model: ckpt=FILE"),
-        Command("compare", f"{ROOM}compare.command", "every method under the same data, metrics and clock"),
-        Command(
-            "calibrate",
-            f"{ROOM}calibrate.command",
-            "compare confidences; a threshold with a bounded risk: ckpt=FILE",
-        ),
-        Command("link", f"{ROOM}link.command", "rates and block errors with predicted channels: ckpt=FILE"),
-        Command("map", f"{ROOM}map", "received power over an area with a promised error: ckpt=FILE"),
-        Command("view", f"{ROOM}view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
-        Command(
-            "plan", f"{ROOM}plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"
-        ),
-        Command("place", f"{ROOM}place", "where one more station serves an area best: ckpt=FILE"),
-        Command("llvm", "gsparc.simulate.llvm", "fetch the LLVM that ray tracing needs", configured=False),
-        Command("report", f"{ROOM}report", "one page about many runs: RUN...", "runs"),
-        Command("bench", f"{ROOM}bench.command", "timings of kernels as ratios to the machine's limit"),
+        Command("simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
+        Command("study", "variants of one model: kind=effects, positions or measurements"),
+        Command("tradeoff", "accuracy against latency of one model: ckpt=FILE"),
+        Command("compare", "every method under the same data, metrics and clock"),
+        Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
+        Command("link", "rates and block errors with predicted channels: ckpt=FILE", f"{ROOM}link.command"),
+        Command("map", "received power over an area with a promised error: ckpt=FILE"),
+        Command("view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
+        Command("plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"),
+        Command("place", "where one more station serves an area best: ckpt=FILE"),
+        Command("llvm", "fetch the LLVM that ray tracing needs", "gsparc.simulate.llvm", configured=False),
+        Command("report", "one page about many runs: RUN...", bare="runs"),
+        Command("bench", "timings of kernels as ratios to the machine's limit", f"{ROOM}bench.command"),
     )
 }
 

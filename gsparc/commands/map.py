@@ -12,12 +12,11 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from gsparc.commands.output import run_directory, show
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.open_runs import Opened, open_files
-from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.maps import geotiff
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan, read_plan
@@ -30,7 +29,7 @@ from gsparc.models import checkpoint
 from gsparc.models.registry import build
 from gsparc.prediction.load import load
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import machine_facts, peak_memory
+from gsparc.prediction.timing import peak_memory
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -198,15 +197,14 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts = {
         **found.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,
-        "promise/calibrated": int(promise is not None), **provenance(), **machine_facts(), **peak_memory(),
+        "promise/calibrated": int(promise is not None), **peak_memory(),
     }  # fmt: skip
     if kept is not None and promise is not None:
         reach = promise.calibration(how.share).reach
         facts |= {f"promise/held/{name}": value for name, value in vars(kept).items()}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
-    write_summary(run_dir / "summary.json", facts)
-    show(run_dir, lines=lines, before=f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map ")
-    return facts
+    before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map "
+    return finish(run_dir, facts, lines=lines, before=before)
 
 
 def check_map(predictor: Predictor, asked: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,8 @@ from hydra.core.hydra_config import HydraConfig
 from rich.console import RenderableType
 
 from gsparc.evaluation.console import open_console
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.prediction.timing import machine_facts
 
 
 def run_directory() -> Path:
@@ -25,6 +27,14 @@ def show(run_dir: Path, *shown: RenderableType, lines: Iterable[str] = (), befor
         console.print(one)
     for line in (*lines, f"{before}written to {run_dir}"):
         console.print(line, highlight=False)
+
+
+def finish(run_dir: Path, facts: Mapping[str, Any], *shown: RenderableType, **said: Any) -> dict[str, Any]:
+    """Write `summary.json` with the program and the machine, and `show` what is `said`; returns the facts."""
+    whole = {**facts, **provenance(), **machine_facts()}
+    write_summary(run_dir / "summary.json", whole)
+    show(run_dir, *shown, **said)
+    return whole
 
 
 def columns(rows: Sequence[Any], of: type) -> dict[str, list[Any]]:

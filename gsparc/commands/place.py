@@ -9,9 +9,9 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.map import context_of_stored, opened, progress, promise_of
-from gsparc.commands.output import run_directory, show
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
-from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.evaluation.summary import write_samples
 from gsparc.maps.pictures import draw_placing
 from gsparc.maps.placing import (
     NewStation,
@@ -26,7 +26,6 @@ from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
 from gsparc.models.registry import build
 from gsparc.prediction.load import load
-from gsparc.prediction.timing import machine_facts
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -69,9 +68,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "place/after": found.goal[0], "place/low": found.low[0], "place/high": found.high[0],
         "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
-        **provenance(), **machine_facts(),
     }  # fmt: skip
-    write_summary(run_dir / "summary.json", facts)
     low, high = (number(found.what, ends[0], unit) for ends in (found.low, found.high))
     lines = [
         f"now {in_words(found.what, found.before, level, unit)}",
@@ -80,5 +77,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     ]
     if not error.stations:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")
-    show(run_dir, lines=lines, before=f"{len(found.places)} candidates; ")
-    return facts
+    return finish(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

@@ -9,15 +9,14 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.map import plan_of, promise_of, settings_of, stations_of
-from gsparc.commands.output import run_directory, show
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import plain
-from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.evaluation.summary import write_samples
 from gsparc.maps.pictures import draw_plan_picture
 from gsparc.maps.planning import Plan, plan_next
 from gsparc.maps.promise import PromiseSettings
 from gsparc.prediction.load import load
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import machine_facts
 
 
 def write_places(path: Path, found: Plan, predictor: Predictor | None) -> None:
@@ -54,12 +53,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan/length_m": found.length_m, "plan/stopped": found.stopped or None,
         "plan/scatter_db": found.scatter_db, "plan/in_vain": int(bool(found.in_vain)),
         "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
-        **provenance(), **machine_facts(),
     }  # fmt: skip
-    write_summary(run_dir / "summary.json", facts)
     said = f"{len(found.places)} places: expected error {found.before_db:.2f} -> {found.after_db:.2f} dB"
     if config.route or config.route_m is not None:
         said += f", a walk of {found.length_m:.4g} m"
     lines = [line for line in (found.stopped, found.in_vain) if line]
-    show(run_dir, lines=lines, before=f"{said}; plan ")
-    return facts
+    return finish(run_dir, facts, lines=lines, before=f"{said}; plan ")

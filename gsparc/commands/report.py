@@ -14,8 +14,7 @@ from gsparc.commands.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.report.page import studies, write
 from gsparc.evaluation.report.readme import refresh
-from gsparc.evaluation.report.runs import columns, find_runs
-from gsparc.evaluation.report.timing import retime
+from gsparc.evaluation.report.runs import columns, find_runs, retime
 from gsparc.evaluation.summary import program, provenance, write_summary
 
 

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
+from gsparc.evaluation.console import plain as plain
 from gsparc.models.registry import build, known
 
 
@@ -97,8 +98,3 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         return
     for key, value in node.items():
         yield from _leaves(value, f"{prefix}.{key}" if prefix else str(key))
-
-
-def plain(node: DictConfig) -> dict[str, Any]:
-    """A group of settings as plain containers; a setting that is still missing is an error."""
-    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]

@@ -16,12 +16,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands import cli
-from gsparc.commands.context import callbacks_of, context_of
 from gsparc.commands.continued import once
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
-from gsparc.commands.study.run import fit_and_score
 from gsparc.data.datamodule import DataModule
 from gsparc.data.files import platform_cache
 from gsparc.data.instantiate import suggest
@@ -30,6 +28,7 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.experiment.fit import callbacks_of, context_of, fit_and_score
 from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metrics import figure_names

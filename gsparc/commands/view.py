@@ -11,16 +11,15 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.map import plan_of
-from gsparc.commands.output import run_directory, show
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.limits import finite
 from gsparc.data.walls import read_walls
-from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.pictures import layers
-from gsparc.prediction.timing import machine_facts, peak_memory
+from gsparc.prediction.timing import peak_memory
 from gsparc.view.building import Given, cloud_colours, cloud_of
 from gsparc.view.ply import write_ply
 from gsparc.view.site_view import SiteView, grid_for
@@ -46,11 +45,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts = {
         "dataset/name": view.viewed.site.name, "dataset/kind": view.viewed.site.kind,
         "model/name": view.viewed.predictor.method.name, "ckpt": str(config.ckpt),
-        "view/operating_points": len(view.viewed.ways), **provenance(), **machine_facts(), **peak_memory(),
+        "view/operating_points": len(view.viewed.ways), **peak_memory(),
     }  # fmt: skip
-    write_summary(run_directory() / "summary.json", facts)
-    show(run_directory(), lines=said, before="summary ")
-    return facts
+    return finish(run_directory(), facts, lines=said, before="summary ")
 
 
 def check(save: Path | None, port: int) -> None:

@@ -1,4 +1,4 @@
-"""Output of commands: a console, and errors in one line with what to do."""
+"""What commands read and say: plain settings, a console, errors in one line with what to do."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import os
 import re
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from hydra import errors
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
@@ -31,6 +33,11 @@ def open_console() -> Console:
     return Console(
         soft_wrap=True, markup=False, width=WIDE
     )  # a log has no width: 80 columns cut headings short
+
+
+def plain(node: DictConfig) -> dict[str, Any]:
+    """A group of settings as plain containers; a setting that is still missing is an error."""
+    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
 
 
 def one_line(error: BaseException) -> str:

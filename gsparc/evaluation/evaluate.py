@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import identity
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
+from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.metrics import paired_values
-from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import Scores, rows_of, score, unseen_runs
 from gsparc.models.label import common_label
 from gsparc.models.method import Method
 from gsparc.prediction import timing
-from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved
+from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, percentiles, queries
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
@@ -129,11 +129,11 @@ def latencies(
     Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
     """
     clock = clock or ClockSettings()
-    singles = cycling(methods, _queries(data, rows, 1))
+    singles = cycling(methods, queries(data, rows, 1))
     one = interleaved({**singles, COPY: timing.reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
     quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
-    many = interleaved(cycling(quick, _queries(data, rows, BATCH)), fewer)
+    many = interleaved(cycling(quick, queries(data, rows, BATCH)), fewer)
     copy_ms = float(np.median(one[COPY]))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
     facts: dict[str, float | int | str | None] = {
@@ -146,7 +146,7 @@ def latencies(
     }
     for name in methods:
         room = "time" if name == OWN else f"baseline/{name}"
-        p50, p95 = float(np.median(one[name])), float(np.quantile(one[name], 0.95))
+        p50, p95 = percentiles(one[name])
         facts |= {
             f"{room}/render_ms_p50": p50,
             f"{room}/render_ms_p95": p95,
@@ -173,13 +173,6 @@ def split_facts(split: Split) -> dict[str, Any]:
     """`split/*`; counts are sums over folds."""
     counts = {f"split/{k}": sum(len(getattr(f, k)) for f in split.folds) for k in ("train", "val", "test")}
     return {"split/name": split.name, "split/sha256": split.sha256, "split/folds": len(split.folds), **counts}
-
-
-def _queries(data: Measurements, rows: np.ndarray, size: int) -> list[Batch]:
-    """Batches of `size` of the `rows`, another set each, without targets."""
-    picks = [np.take(rows, np.arange(turn, turn + size), mode="wrap") for turn in range(min(len(rows), 64))]
-    where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
-    return [where.batch(pick) for pick in picks]
 
 
 def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:

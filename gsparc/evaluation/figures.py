@@ -55,6 +55,11 @@ def heading_of(name: str) -> str:
     return _look_up(name).heading
 
 
+def axis_of(name: str) -> str:
+    """Of an axis, with the unit in brackets."""
+    return heading_of(name).replace(" dB", " [dB]")
+
+
 def form_of(name: str) -> str:
     """Format of its numbers."""
     return _look_up(name).form

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import norm
 
 from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
@@ -69,4 +70,19 @@ def levels(data: Measurements) -> np.ndarray | None:
     found = np.full(1 if data.site.stations is None else len(data.site.stations), np.nan)
     rows = np.flatnonzero(data.censored)
     found[station[rows]] = 10 * np.log10(data.target[rows, 0].astype(np.float64) * data.site.target_scale)
+    return found
+
+
+def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
+    """Accuracies, of powers how honest variances are; `rmse_db_after_constant` where stations are held out.
+
+    Args:
+        scores: of rows of `data`.
+        data, split: what was learned from.
+    """
+    found = scores.figures()
+    if data.site.kind == "rssi":
+        found |= power_intervals(scores, data)
+        if split.name == "stations" and data.station is not None:
+            found["rmse_db_after_constant"] = scores.after_constant(data.station)
     return found

@@ -1,20 +1,120 @@
-"""Which confidence to trust, kept with a model: `gsparc.load` answers with it, and with the threshold."""
+"""How sure predictions are: several confidences, which one a model is trusted with, and from when on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
+from torch import Tensor
 
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.method import Prediction
-from gsparc.prediction.confidence_scores import KINDS, expected_score, process_variance
+from gsparc.models.baselines.gp import choose_kernel, principal_components
+from gsparc.models.method import Method, Prediction
+from gsparc.models.target_rows import training_targets
 from gsparc.prediction.risk_threshold import Promise, Threshold
+from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
+
+KINDS = ("learned", "expected", "distance", "gp_variance")
+CHUNK = 64
+KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Positions a method did not learn from.
+
+    Attributes:
+        row: (n,) rows of the dataset.
+        position: (n, 3) [m].
+        error: (n,) |e|^2 / |h|^2; for powers, of the linear power.
+        scores: by kind, (n,) each, larger is surer.
+    """
+
+    row: np.ndarray
+    position: np.ndarray
+    error: np.ndarray
+    scores: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+    """Ask `method` about `rows`, and the rivals too.
+
+    `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
+    (in a fade the same variance is a larger relative error); a method without them has no such kind.
+    """
+    parts = []
+    for start in range(0, len(rows), CHUNK):
+        some = rows[start : start + CHUNK]
+        batch = data.batch(some)
+        parts.append(Evidence(some, data.moving[some], *judged(method.answer(batch), batch.target)))
+    found = joined(parts)
+    return replace(found, scores=found.scores | rivals(data, fold, rows))
+
+
+def judged(said: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state."""
+    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
+    expected = None if said.variance is None else expected_score(said)
+    own = {"learned": said.confidence, "expected": expected}
+    stated = {kind: score.double().numpy() for kind, score in own.items() if score is not None}
+    error = (miss / power.clamp_min(1e-30)).double().numpy()
+    return error, {kind: score for kind, score in stated.items() if not np.isnan(score).any()}
+
+
+def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """The two cheap confidences (n,) of rows (n,): minus the distance to the nearest training point [m], and
+    minus the variance of a Gaussian process, as a share of the prior's."""
+    known = known_positions(data, fold)
+    distance = cKDTree(known).query(data.moving[rows])[0]
+    variance = process_variance(position_kernel(data, fold), known, data.moving[rows])
+    return {"distance": -distance, "gp_variance": -variance}
+
+
+def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
+    """Of the moving end, local, that a method may have learned from (n, 3) [m]."""
+    return data.moving[np.concatenate([fold.train, fold.val])]
+
+
+def position_kernel(data: Measurements, fold: Fold) -> Kernel:
+    """Of the process whose variance is the rival: length and noise by likelihood on a few known rows."""
+    known = np.concatenate([fold.train, fold.val])
+    few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
+    parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
+    return choose_kernel(data.moving[few], parts.scores, len(parts.mean))
+
+
+def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """What a process of the positions `known` (n, 3) does not know of `places` (B, 3), share of the prior."""
+    rows = torch.from_numpy(known)
+    white = Factor.of(kernel.gram(rows)).whitened(kernel.between(rows, torch.from_numpy(places)))
+    return (1 + kernel.noise - white.square().sum(0)).numpy()
+
+
+def expected_score(said: Prediction) -> Tensor:
+    """Minus the error variance over the power predicted (B,): in a fade the same variance is worse."""
+    assert said.variance is not None
+    return -said.variance / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
+
+
+def joined(parts: Sequence[Evidence]) -> Evidence:
+    """Folds together; scores that not every part has are dropped."""
+    kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
+    scores = {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds}
+    facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
+    row, position, error = map(np.concatenate, facts)
+    return Evidence(row, position, error, scores)
+
 
 KEY = "confidence"
 

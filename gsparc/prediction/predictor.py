@@ -22,7 +22,7 @@ from gsparc.prediction.timing import Call
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
     from gsparc.prediction.export import Paths
-    from gsparc.prediction.stored_front import Operating
+    from gsparc.prediction.operating_point import Operating
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
 COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost

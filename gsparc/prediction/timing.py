@@ -8,19 +8,20 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
 
-from gsparc.data.schema import Batch
+from gsparc.data.schema import Batch, Measurements
 from gsparc.models.method import Method
 
 Key = TypeVar("Key")
 Call = Callable[[int], object]
 
+QUERIES = 64  # different ones, by turns
 COPY = "copy"
 COPY_BYTES = 16 * 2**20  # beyond most second-level caches, below a second everywhere
 
@@ -108,6 +109,18 @@ def cycling(methods: Mapping[Key, Method], queries: Sequence[Batch]) -> dict[Key
         return lambda turn: method.answer(queries[turn % len(queries)])
 
     return {name: call(method) for name, method in methods.items()}
+
+
+def percentiles(times: np.ndarray) -> tuple[float, float]:
+    """Median and 95th percentile of times (n,)."""
+    return float(np.median(times)), float(np.quantile(times, 0.95))
+
+
+def queries(data: Measurements, rows: np.ndarray, size: int = 1) -> list[Batch]:
+    """Batches of `size` of the rows (n,), another set each, without targets; at most `QUERIES`."""
+    picks = [np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))]
+    where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
+    return [where.batch(pick) for pick in picks]
 
 
 def reference_copy() -> Call:

@@ -20,8 +20,8 @@ from gsparc.models import loading
 from gsparc.models.reduced import reduced
 from gsparc.prediction.confidence import Trusted
 from gsparc.prediction.confidence import kept as trusted_of
+from gsparc.prediction.operating_point import kept
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.stored_front import kept
 
 log = logging.getLogger(__name__)
 

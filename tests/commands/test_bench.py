@@ -7,10 +7,9 @@ import sys
 import pytest
 import torch
 
-from gsparc.commands.bench import kernels, steps
-from gsparc.commands.bench.case import Case, Work
+from gsparc.commands.bench import kernels, layers
 from gsparc.commands.bench.claims import Claim
-from gsparc.commands.bench.measure import Machine, measure
+from gsparc.commands.bench.measure import Case, Machine, Work, measure
 from gsparc.commands.bench.report import markdown
 from gsparc.commands.bench.scene import receiver, scene
 from gsparc.ops import composite, machine_limits, make_plan
@@ -63,14 +62,15 @@ def test_every_row_of_the_rasterizer_renders_the_same_scene():
 
 
 def test_a_step_learns_with_either_backend():
-    """Both contenders of the promise lower the same loss by the same steps."""
-    case = steps.step("tangent", count=5, batch=2)
+    """Both contenders of the promise lower the same loss by the same layers."""
+    case = layers.step("tangent", count=5, batch=2)
     assert case.reference is not None
     for call in (case.kernel, case.reference):
         losses = [call() for _ in range(6)]
         assert losses[-1] < losses[0]
     first = [
-        float(call()) for call in (steps.step("tangent", 5, 2).kernel, steps.step("tangent", 5, 2).reference)
+        float(call())
+        for call in (layers.step("tangent", 5, 2).kernel, layers.step("tangent", 5, 2).reference)
     ]
     assert first[0] == pytest.approx(first[1], abs=1e-4)
 

@@ -10,13 +10,25 @@ import numpy as np
 import pytest
 from campaigns import brief, compose, spectra
 
-from gsparc.commands.calibrate import command
-from gsparc.commands.calibrate.command import collect, figures, tables
-from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
-from gsparc.commands.calibrate.trial import Trial, best_kind, cells, divided, divisible, trials
+from gsparc.commands.calibrate import tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.prediction.confidence_scores import Evidence, gather, joined
+from gsparc.evaluation import calibration as command
+from gsparc.evaluation.calibration import (
+    Trial,
+    best_kind,
+    bounded,
+    cells,
+    collect,
+    divided,
+    divisible,
+    figures,
+    perfect_area,
+    rank_correlation,
+    risk_coverage,
+    trials,
+)
+from gsparc.prediction.confidence import Evidence, gather, joined
 from gsparc.prediction.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
 from gsparc.training.context import FitContext
 
@@ -161,10 +173,10 @@ def test_nobody_accepted_is_no_promise_kept() -> None:
 
 def test_a_picture_of_nobody_accepted(tmp_path) -> None:
     """Nothing to divide by is no reason to draw nothing."""
-    from gsparc.commands.calibrate.pictures import draw
+    from gsparc.evaluation.calibration import draw_calibration
 
     mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
-    draw(_evidence(), [mute], "silent", tmp_path / "confidence.png")
+    draw_calibration(_evidence(), [mute], "silent", tmp_path / "confidence.png")
     assert (tmp_path / "confidence.png").stat().st_size > 1000
 
 
@@ -177,7 +189,7 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
     with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
         divided(two, "spatial", rng)
     with pytest.raises(ValueError, match="2 positions cannot be parted"):
-        divided(two.at(np.arange(2)), "random", rng)
+        divided(_evidence(2), "random", rng)
 
 
 def test_positions_on_a_plumb_line_have_patches() -> None:

@@ -13,13 +13,12 @@ from cities import city, fold
 
 from gsparc import load
 from gsparc.commands.link.adaptation import Rates
-from gsparc.commands.link.beams import gain, loss_db
 from gsparc.commands.link.channels import truth
-from gsparc.commands.link.study import beam_facts, crossing, rate_facts
+from gsparc.commands.link.study import beam_facts, crossing, gain, loss_db, rate_facts
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings
-from gsparc.prediction.resource_grid import centred, interpolated, resource_grid
+from gsparc.prediction.export import centred, interpolated, resource_grid
 from gsparc.prediction.risk_threshold import binomial_interval
 from gsparc.training.context import FitContext
 

@@ -16,13 +16,13 @@ from invented import invent
 from scipy.spatial import cKDTree
 
 import gsparc
-from gsparc.commands.compare.cells import code_version, plugged
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.plugins import offer
 from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
+from gsparc.evaluation.experiment.cells import code_version, plugged
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 import gsparc
-from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split, SplitSettings, make_split
 from gsparc.evaluation.baseline_cache import fitting
 from gsparc.evaluation.evaluate import evaluate
+from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
 from gsparc.evaluation.scores import score
 from gsparc.models import checkpoint, loading
 from gsparc.models.per_station import PerStation, for_links, of_station

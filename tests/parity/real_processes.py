@@ -13,7 +13,7 @@ from gsparc.maps import covariance
 from gsparc.models.baselines import gp
 from gsparc.models.left_out_images import predict_left_out
 from gsparc.models.powers import settings as power_settings
-from gsparc.prediction.confidence_scores import process_variance
+from gsparc.prediction.confidence import process_variance
 from gsparc.processes import censored, density, features, nearest, powers
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior

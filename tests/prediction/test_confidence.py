@@ -10,8 +10,14 @@ import pytest
 import gsparc
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.prediction.confidence import Trusted, as_confidence, keep
-from gsparc.prediction.confidence_scores import gather, known_positions, position_kernel
+from gsparc.prediction.confidence import (
+    Trusted,
+    as_confidence,
+    gather,
+    keep,
+    known_positions,
+    position_kernel,
+)
 from gsparc.prediction.risk_threshold import Promise
 from gsparc.training.context import FitContext
 

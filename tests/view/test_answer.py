@@ -12,7 +12,7 @@ import pytest
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.models import checkpoint
-from gsparc.prediction.stored_front import KEY, Operating
+from gsparc.prediction.operating_point import KEY, Operating
 from gsparc.view.answer import Answer, Rays, ask, rays
 from gsparc.view.building import rays_of
 from gsparc.view.crossed import Obstacles, crossed_losses

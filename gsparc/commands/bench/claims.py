@@ -9,9 +9,8 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsparc.commands.bench import kernels, layers, steps
-from gsparc.commands.bench.case import Call
-from gsparc.commands.bench.measure import Machine, measure, timed, undisturbed
+from gsparc.commands.bench import kernels, layers
+from gsparc.commands.bench.measure import Call, Case, Machine, measure, timed, undisturbed
 from gsparc.commands.bench.scene import Scene, scene
 from gsparc.ops.projection import Projection
 from gsparc.prediction.timing import ClockSettings
@@ -58,61 +57,39 @@ def claims(
     torch.set_num_threads(threads)
     try:
         fields = [scene(count, projection) for count in counts]
-        middle = fields[len(fields) // 2]
-        return [
-            *_backward(middle, clock),
-            *_forward(fields[1:], machine, clock),
-            *_frozen(middle, batch, clock),
-            *_product(fields[1:], machine, clock),
-            *_channels(middle, clock),
-            *_growth(fields, clock),
-            *_learning(projection),
-        ]
+        middle, found = fields[len(fields) // 2], []
+        size = len(middle)
+        ratio = _ratio(kernels.backward(middle, 1).kernel, kernels.moving(middle, 1).kernel, clock)
+        found.append(Claim(f"backward / forward at {size}", ratio, 3.0))
+        for field in fields[1:]:
+            bound = FORWARD[projection][len(field) > MANY]
+            found.append(_limit("forward / limit", kernels.moving(field, 1), bound, machine, clock))
+        queries = {"moving": kernels.moving(middle, 1), "one": kernels.frozen(middle, 1)}
+        queries["many"] = kernels.frozen(middle, batch)
+        times = _times({name: _whole(case) for name, case in queries.items()}, clock)
+        each, together = times["moving"] / times["one"], batch * times["moving"] / times["many"]
+        found.append(Claim(f"moving / frozen at {size}", each, 3.0, True))
+        found.append(Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True))
+        for field in fields[1:]:
+            found.append(_limit("frozen / bytes", kernels.frozen(field, 1), FROZEN, machine, clock))
+        one, many = (_whole(layers.channel(middle, *shape, 1)) for shape in ((1, 1), layers.MANY))
+        found.append(Claim(f"1664 channels / 1 at {size}", _ratio(many, one, clock), 2.0))
+        return [*found, *_growth(fields, clock), _learning(projection)]
     finally:
         torch.set_num_threads(before)
 
 
-def _backward(field: Scene, clock: ClockSettings) -> list[Claim]:
-    ratio = _ratio(kernels.backward(field, 1).kernel, kernels.moving(field, 1).kernel, clock)
-    return [Claim(f"backward / forward at {len(field)}", ratio, 3.0)]
+def _limit(name: str, case: Case, bound: float, machine: Machine, clock: ClockSettings) -> Claim:
+    over = measure(case, machine, None, clock, references=False).over
+    return Claim(f"{name} at {case.count}", over, bound)
 
 
-def _forward(fields: list[Scene], machine: Machine, clock: ClockSettings) -> list[Claim]:
-    rows = [measure(kernels.moving(field, 1), machine, None, clock, references=False) for field in fields]
-    bounds = [FORWARD[field.projection][len(field) > MANY] for field in fields]
-    return [
-        Claim(f"forward / limit at {row.case.count}", row.over, bound)
-        for row, bound in zip(rows, bounds, strict=True)
-    ]
-
-
-def _product(fields: list[Scene], machine: Machine, clock: ClockSettings) -> list[Claim]:
-    rows = [measure(kernels.frozen(field, 1), machine, None, clock, references=False) for field in fields]
-    return [Claim(f"frozen / bytes at {row.case.count}", row.over, FROZEN) for row in rows]
-
-
-def _channels(field: Scene, clock: ClockSettings) -> list[Claim]:
-    one, many = (_whole(layers.channel(field, *shape, 1)) for shape in ((1, 1), layers.MANY))
-    return [Claim(f"1664 channels / 1 at {len(field)}", _ratio(many, one, clock), 2.0)]
-
-
-def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:
-    moving, one = _whole(kernels.moving(field, 1)), _whole(kernels.frozen(field, 1))
-    many = _whole(kernels.frozen(field, batch))
-    times = _times({"moving": moving, "one": one, "many": many}, clock)
-    each, together = times["moving"] / times["one"], batch * times["moving"] / times["many"]
-    return [
-        Claim(f"moving / frozen at {len(field)}", each, 3.0, True),
-        Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True),
-    ]
-
-
-def _learning(projection: Projection) -> list[Claim]:
+def _learning(projection: Projection) -> Claim:
     """A step takes the same way in either, to 1e-4: what it costs less, a given accuracy costs less."""
-    case = steps.step(projection)
+    case = layers.step(projection)
     assert case.reference is not None
     ratio = _ratio(case.reference, case.kernel, ClockSettings(rounds=3, least=2, warmup=1, budget_s=2.0))
-    return [Claim(f"training step, PyTorch / kernels at {case.count}", ratio, 2.0, True)]
+    return Claim(f"training step, PyTorch / kernels at {case.count}", ratio, 2.0, True)
 
 
 def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
@@ -127,7 +104,7 @@ def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
     return found
 
 
-def _whole(case) -> Call:
+def _whole(case: Case) -> Call:
     assert case.whole is not None
     return case.whole
 

@@ -10,10 +10,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.bench import kernels, layers, steps
-from gsparc.commands.bench.case import Case
+from gsparc.commands.bench import kernels, layers
 from gsparc.commands.bench.claims import claims
-from gsparc.commands.bench.measure import Machine, Row, facts, measure
+from gsparc.commands.bench.measure import Case, Machine, Row, facts, measure
 from gsparc.commands.bench.report import claims_table, markdown, rows_table
 from gsparc.commands.bench.scene import NETWORK, scene
 from gsparc.commands.output import run_directory
@@ -49,7 +48,7 @@ def cases(config: DictConfig) -> Iterator[Case]:
     for batch in config.batches:
         yield layers.loss(batch)
     for projection in config.projections:
-        yield steps.step(projection)
+        yield layers.step(projection)
 
 
 def task(config: DictConfig) -> dict[str, Any]:

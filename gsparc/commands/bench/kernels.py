@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.commands.bench.case import Call, Case, Work, size
+from gsparc.commands.bench.measure import Call, Case, Work, size
 from gsparc.commands.bench.scene import COMPLEX, GRID, Scene, places, receiver, receivers
 from gsparc.field.frozen import frozen_view
 from gsparc.ops import composite, freeze, machine_limits, mean_weights, rasterize

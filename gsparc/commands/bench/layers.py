@@ -1,4 +1,4 @@
-"""The rows that time what stands around the rasterizer: emission networks, channels and the loss."""
+"""The rows that time what stands around the rasterizer: networks, channels, the loss, an optimiser step."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from gsparc.commands.bench.case import Case, Work, size
-from gsparc.commands.bench.scene import GRID, NETWORK, PAPER, Scene, places, receivers, scene
+from gsparc.commands.bench.measure import Call, Case, Work, size
+from gsparc.commands.bench.scene import GRID, NETWORK, PAPER, Scene, places, receiver, receivers, scene
 from gsparc.field.emission import Emission, EmissionSettings
-from gsparc.ops import mean_weights
+from gsparc.field.model import GaussianModel
+from gsparc.ops import Pose, mean_weights
 from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products
+from gsparc.ops.projection import Projection
 from gsparc.training.losses import spectrum_loss
+from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 TONES = (2.4e9, 312_500.0)  # first subcarrier and spacing [Hz]
 MANY = (64, 26)  # antennas and subcarriers of the Argos release: 1,664 channels
@@ -107,3 +110,37 @@ def _layers(module: Emission) -> list[Tensor]:
 
 def _work(layers: list[Tensor], encoded: Tensor, count: int, batch: int) -> Work:
     return Work(size(layers) + encoded.nbytes + 4 * batch * count * 2)
+
+
+COUNT, BATCH = 100, 16  # as many Gaussians as the dense tensors of plain PyTorch leave memory for
+
+
+def step(projection: Projection, count: int = COUNT, batch: int = BATCH) -> Case:
+    """Emission, plan, blending, L1 and SSIM, their gradients and Adam; the reference does it in PyTorch."""
+    model = scene(count, projection).model
+    parameters = 4 * sum(parameter.numel() for parameter in model.parameters())
+    return Case(
+        *("training step", projection, count, batch),
+        work=Work(7 * parameters + 8 * batch * GRID.height * GRID.width),  # Adam: four read, three written
+        kernel=_learning(model, batch),
+        reference=_learning(scene(count, projection, backend="reference").model, batch),
+    )
+
+
+def _learning(model: GaussianModel, batch: int) -> Call:
+    optimizer = optimizer_for(model, OptimizerSettings())
+    draw = torch.Generator().manual_seed(0)
+    target = torch.rand((batch, GRID.height, GRID.width), generator=draw)
+    tx, rx = places(batch) + 1, Pose.identity(places(batch))
+
+    def call() -> Tensor:
+        with torch.enable_grad():
+            optimizer.zero_grad(set_to_none=True)
+            values = model.features(tx, rx)[..., :1]
+            image = model.raster(values, receiver()).image
+            loss = spectrum_loss(image.squeeze(1), target).mean()
+            loss.backward()
+            optimizer.step()
+        return loss.detach()
+
+    return call

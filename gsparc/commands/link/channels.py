@@ -16,8 +16,8 @@ from gsparc.data.splits import Fold
 from gsparc.models.image_sources.phase_offsets import estimate
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
-from gsparc.prediction.confidence_scores import Evidence, expected_score, rivals
-from gsparc.prediction.resource_grid import interpolated
+from gsparc.prediction.confidence import Evidence, judged, rivals
+from gsparc.prediction.export import interpolated
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World
@@ -92,12 +92,8 @@ def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tup
 
 def on_band(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
-    power = band.true.abs().square().mean((1, 2))
-    error = (band.predicted - band.true).abs().square().mean((1, 2)) / power.clamp_min(1e-30)
-    said = Prediction(band.predicted, band.confidence, band.variance)
-    own = {"learned": band.confidence, "expected": expected_score(said)}
-    scores = {kind: s.double().numpy() for kind, s in own.items() if not s.isnan().any()}
-    return Evidence(rows, data.moving[rows], error.double().numpy(), scores | rivals(data, fold, rows))
+    error, own = judged(Prediction(band.predicted, band.confidence, band.variance), band.true)
+    return Evidence(rows, data.moving[rows], error, own | rivals(data, fold, rows))
 
 
 @lru_cache(maxsize=1)

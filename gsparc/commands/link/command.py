@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
@@ -11,11 +12,11 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
-from gsparc.commands.calibrate.trial import accept
 from gsparc.commands.link.adaptation import Band
 from gsparc.commands.link.channels import Channels, channels, on_band
-from gsparc.commands.link.pictures import draw_acceptance, draw_errors, draw_rates
+from gsparc.commands.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.commands.link.pusch import RECEIVERS, Pusch, frequency_correlation
 from gsparc.commands.link.study import (
     acceptance,
@@ -27,14 +28,13 @@ from gsparc.commands.link.study import (
     tradeoff,
     transmit,
 )
-from gsparc.commands.link.tables import tables
-from gsparc.commands.output import run_directory, show
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
+from gsparc.evaluation.calibration import accept
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.prediction.resource_grid import SUBCARRIERS_PER_BLOCK, centred
+from gsparc.evaluation.summary import shown, table, write_summary
+from gsparc.prediction.export import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.prediction.risk_threshold import Promise
-from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
 
@@ -147,7 +147,46 @@ def task(config: DictConfig) -> dict[str, Any]:
     if drawn:
         draw_errors(drawn, title, run_dir / "bler.png")
         draw_acceptance(trades, float(accepted.mean()), run_dir / "acceptance.png")
-    facts |= {**machine_facts(), **provenance(), "time/total_s": time.perf_counter() - started}
-    write_summary(run_dir / "summary.json", facts)
-    show(run_dir, *tables(facts, title, list(wanted), levels))
-    return facts
+    facts["time/total_s"] = time.perf_counter() - started
+    return finish(run_dir, facts, *tables(facts, title, list(wanted), levels))
+
+
+def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
+    """Rates, block errors and beams; what was not computed has no table."""
+    accepted = (
+        f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {facts['confidence/kind']}"
+    )
+    wanted = (
+        ("oracle_mbps", ".1f"), ("chosen_mbps", ".1f"), ("shortfall", ".1%"), ("shortfall_accepted", ".1%"),
+        ("tbler", ".1%"), ("outage", ".1%"),
+    )  # fmt: skip
+    rates = [
+        [f"{level:g}", *(shown(facts.get(f"mcs/{level:.0f}dB/{key}"), form) for key, form in wanted)]
+        for level in levels
+    ]
+    columns = ["median SNR dB", "oracle Mbit/s", "chosen", "short", "short, accepted", "TBLER", "outage"]
+    found = [table(f"{title}: throughput, {accepted}", [], columns, rates)]
+    if modulations:
+        keys = ("ebno_at_bler_0.1", "behind_perfect_db")
+        errors = [
+            [label, *(shown(facts[f"pusch/{m}/{name}/{key}"], ".2f") for m in modulations for key in keys)]
+            for name, (label, _, _) in STYLES.items()
+            if f"pusch/{modulations[0]}/{name}/behind_perfect_db" in facts
+        ]
+        heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
+        numbers = [column for modulation in modulations for column in (modulation, "behind")]
+        found.append(table(heading, ["receiver"], numbers, errors))
+    antennas = sorted(
+        {int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.count("/") == 2}
+    )
+    if antennas:
+        named = {
+            "gain_db": "gain dB", "predicted_gain_db": "predicted", "loss_db": "loss dB",
+            "loss_db_mean": "mean loss", "loss_db_p95": "95 %", "loss_db_max": "worst",
+            "loss_db_accepted": "mean, accepted",
+        }  # fmt: skip
+        beams = [[str(n), *(shown(facts[f"beams/{n}/{key}"], ".2f") for key in named)] for n in antennas]
+        found.append(
+            table("maximum-ratio beams, all test positions", [], ["antennas", *named.values()], beams)
+        )
+    return found

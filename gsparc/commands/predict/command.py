@@ -10,8 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.output import run_directory, show
-from gsparc.commands.predict.answers import Answers, answers
-from gsparc.commands.predict.files import check_fits, decibels, target, write
+from gsparc.commands.predict.answers import Answers, answers, check_fits, decibels, target, write
 from gsparc.commands.predict.placing import far_outside, in_a_speck, in_world, stations_of, with_heights
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.query_places import QueryPlaces, read_query_places

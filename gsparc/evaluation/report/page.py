@@ -14,7 +14,7 @@ import numpy as np
 from jinja2 import Environment
 from PIL import Image
 
-from gsparc.evaluation.report import effects, learning, plots, tables
+from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
 from gsparc.evaluation.report.table import Table
 from gsparc.evaluation.summary import BUSY, better_baseline, run_conditions
@@ -60,7 +60,7 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     study = Study(title, warnings(runs))
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
-    makers = (tables.results, learning.within_minutes, tables.costs, effects.effects, tables.worst)
+    makers = (tables.results, tables.within_minutes, tables.costs, tables.effects, tables.worst)
     found = [make(runs) for make in makers]
     study.tables += [table for table in found if table is not None and table.rows]
     drawn = (

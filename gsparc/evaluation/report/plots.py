@@ -18,10 +18,9 @@ from scipy.stats import spearmanr
 from gsparc.data.schema import Kind
 from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.figures import PER_SAMPLE, heading_of, lower_is_better, score_of
-from gsparc.evaluation.report.intervals import interval, over_seeds
-from gsparc.evaluation.report.learning import curve, validation_figure
 from gsparc.evaluation.report.runs import Run, sizes
-from gsparc.evaluation.report.tables import BASELINES, grouped
+from gsparc.evaluation.report.table import interval, over_seeds
+from gsparc.evaluation.report.tables import BASELINES, curve, grouped, validation_figure
 from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8

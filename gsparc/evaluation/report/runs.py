@@ -1,9 +1,10 @@
-"""Run directories read for the report."""
+"""Run directories read for the report, and their models timed again."""
 
 from __future__ import annotations
 
 import csv
 import json
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,10 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 
 from gsparc.data.schema import Kind
 from gsparc.evaluation.figures import DECIDING
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.summary import write_samples
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
 
 HIDDEN = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
 
@@ -71,7 +77,7 @@ class Run:
     def latency(self) -> tuple[float | None, float | None]:
         """Median and 95th percentile of single queries [ms]; those measured alone, where they were."""
         if len(self.render_ms):
-            return float(np.median(self.render_ms)), float(np.quantile(self.render_ms, 0.95))
+            return percentiles(self.render_ms)
         return number(self.facts.get("time/render_ms_p50")), number(self.facts.get("time/render_ms_p95"))
 
     @property
@@ -201,3 +207,34 @@ def number(value: object) -> float | None:
 def sizes(run: Run, name: str) -> np.ndarray:
     """A per-sample figure (n,) of a run; an error by its size."""
     return np.abs(run.samples[name]) if name == "error_db" else run.samples[name]
+
+
+log = logging.getLogger(__name__)
+
+
+def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
+    """The runs with the times of single queries, each also written to its `render_ms.csv`.
+
+    A sweep runs jobs at the same time, which disturbs their times; call this after it.
+
+    Args:
+        runs: those without a readable checkpoint keep the times they have.
+        rounds: visits to each.
+        budget_s: no new round after this [s].
+    """
+    calls: dict[int, Call] = {}
+    for number, run in enumerate(runs):
+        try:
+            opened = open_files(run.checkpoints[:1])
+        except (ValueError, IndexError) as error:
+            log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
+            continue
+        places = opened.data.moving[opened.split.folds[0].test] + opened.data.site.origin
+        calls[number] = Predictor(opened.methods[0], opened.data.site).cycling(places)
+    threads = {
+        number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
+    }
+    times = interleaved(calls, replace(BLOCKS, rounds=rounds, budget_s=budget_s), threads)
+    for number, ms in times.items():
+        write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
+    return [replace(run, render_ms=times[i]) if i in times else run for i, run in enumerate(runs)]

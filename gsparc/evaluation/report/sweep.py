@@ -16,8 +16,7 @@ from rich.table import Table as Shown
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import one_line, open_console
-from gsparc.evaluation.report.intervals import Interval
-from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.report.table import Column, Interval, Table
 
 log = logging.getLogger(__name__)
 
@@ -68,9 +67,8 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
     from gsparc.evaluation.report import plots
     from gsparc.evaluation.report.page import studies, write
-    from gsparc.evaluation.report.runs import by_study, distinct_overrides, find_runs
+    from gsparc.evaluation.report.runs import by_study, distinct_overrides, find_runs, retime
     from gsparc.evaluation.report.tables import seeds
-    from gsparc.evaluation.report.timing import retime
 
     runs = find_runs([folder])
     if settings.retime:

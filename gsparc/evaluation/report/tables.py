@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from functools import partial
+from itertools import product
 
 import numpy as np
 
-from gsparc.evaluation.figures import PER_SAMPLE, TABLES, form_of, heading_of
-from gsparc.evaluation.report.intervals import Interval, interval, over_seeds
-from gsparc.evaluation.report.runs import Run, number
-from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.figures import PER_SAMPLE, TABLES, form_of, heading_of, score_of
+from gsparc.evaluation.report.runs import Run, number, sizes
+from gsparc.evaluation.report.table import Column, Interval, Table, interval, over_seeds
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 WORST = 3
@@ -136,3 +138,102 @@ def worst(runs: Sequence[Run]) -> Table:
 def _over(values: Sequence[float | None]) -> Interval | None:
     known = [v for v in values if v is not None]
     return over_seeds(known) if known else None
+
+
+MINUTES = (1, 2, 5, 10)
+
+
+def within_minutes(runs: Sequence[Run]) -> Table:
+    """The best validation figure reached within fixed training times, and the time to fixed figures."""
+    figure = validation_figure(runs[0])
+    head = heading_of(figure)
+    table = Table(
+        "Accuracy against training time",
+        [
+            Column("method and setting"), Column("seed", "d"),
+            *(Column(f"{head} within {m} min", form_of(figure)) for m in MINUTES),
+            *(Column(f"s to {level:.4g}", ".3g") for level in levels(runs)),
+            Column("train s in all", ".3g"),
+        ],
+        note="Validation rows; seconds of learning with preparation, without validation. Methods that train "
+        "in one piece have no curve: their test figure counts from the end of their training.",
+    )  # fmt: skip
+    for run in runs:
+        seconds, values = curve(run)
+        if not len(seconds):
+            continue
+        best = np.array([score_of(figure, v) for v in values])
+        early = [seconds <= 60 * minutes for minutes in MINUTES]
+        cells = [float(values[t][best[t].argmax()]) if t.any() else None for t in early]
+        good = [best >= score_of(figure, level) for level in levels(runs)]
+        reached = [float(seconds[t.argmax()]) if t.any() else None for t in good]
+        table.add(run.setting, run.facts.get("seed"), *cells, *reached, run.facts.get("time/train_s"))
+    return table
+
+
+def validation_figure(run: Run) -> str:
+    """The figure of a learning curve: validation of channels and powers logs the mean squared error."""
+    return "psnr_db" if run.kind == "spectrum" else "mse"
+
+
+def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds (n,) and validation figures (n,); one point for a method that trains in one piece."""
+    figure = validation_figure(run)
+    found = run.curve.get(f"val/{figure}")
+    if found is not None and np.isfinite(found).any():
+        known = np.isfinite(found)
+        return run.curve["train_s"][known], found[known]
+    end, value = number(run.facts.get("time/train_s")), run.figure_of(figure)
+    if end is None or value is None:
+        return np.zeros(0), np.zeros(0)
+    return np.array([end]), np.array([value])
+
+
+def levels(runs: Sequence[Run], count: int = 3) -> list[float]:
+    """Round figures between what the worst and the best run reach, the worst first."""
+    score = partial(score_of, validation_figure(runs[0]))
+    ends = [max(curve(run)[1], key=score) for run in runs if len(curve(run)[0])]
+    if not ends:
+        return []
+    worst, best = min(ends, key=score), max(ends, key=score)
+    if abs(best - worst) < 1e-9 * max(abs(best), 1e-9):
+        return [float(f"{worst:.3g}")]
+    between = {float(f"{v:.3g}") for v in np.linspace(worst, best, count + 2)[:-1]}
+    return sorted(between, key=score)[:count]
+
+
+def effects(runs: Sequence[Run]) -> Table | None:
+    """Gain and cost of each effect: paired differences between runs of one split; None without pairs."""
+    name = PER_SAMPLE[runs[0].kind]
+    table = Table(
+        "Effects: gain and cost",
+        [
+            Column("effect"), Column("without"), Column("with"),
+            Column(f"{heading_of(name)} gained", "+.2f"),
+            Column("train s more", "+.3g"), Column("query ms more", "+.3g"),
+        ],
+        note="Differences per test sample, mean and 95 % interval; same seed, same split.",
+    )  # fmt: skip
+    for off, on in product(runs, runs):
+        if _differ_by_effect(off, on):
+            costs = [(number(run.facts.get("time/train_s")), run.latency[0]) for run in (off, on)]
+            spent = [None if a is None or b is None else b - a for a, b in zip(*costs, strict=True)]
+            table.add(on.facts.get("model/effects"), off.setting, on.setting, _paired(off, on, name), *spent)
+    return table if table.rows else None
+
+
+def _differ_by_effect(off: Run, on: Run) -> bool:
+    names = ("dataset/sha256", "split/sha256", "seed", "model/name")
+    same = all(off.facts.get(name) == on.facts.get(name) for name in names)
+    plain = (off.facts.get("model/effects") or "none") == "none"
+    return same and plain and (on.facts.get("model/effects") or "none") != "none"
+
+
+def _paired(off: Run, on: Run, name: str) -> Interval | None:
+    """Mean difference per sample in dB, larger is better."""
+    if name not in off.samples or name not in on.samples or len(off.samples[name]) != len(on.samples[name]):
+        return None
+    gap = (-1 if name == "error_db" else 1) * (sizes(on, name) - sizes(off, name))
+    gap = gap[np.isfinite(gap)]
+    half = 1.96 * float(gap.std(ddof=1)) / math.sqrt(len(gap)) if len(gap) > 1 else math.nan
+    return Interval(float(gap.mean()), float(gap.mean()) - half, float(gap.mean()) + half)

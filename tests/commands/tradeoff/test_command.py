@@ -15,13 +15,13 @@ from hydra.core.hydra_config import HydraConfig
 from towns import town_model
 
 import gsparc
-from gsparc.commands.tradeoff.command import _alone, task
-from gsparc.commands.tradeoff.sweep import Recorded, closeness
+from gsparc.commands.tradeoff import _alone, task
+from gsparc.evaluation.experiment.tradeoff import Recorded, closeness
 from gsparc.evaluation.scores import score
 from gsparc.models import checkpoint
 from gsparc.models.baselines.distance_law import DistanceLaw
 from gsparc.models.pareto import Point
-from gsparc.prediction import operating_point, stored_front
+from gsparc.prediction import operating_point
 from gsparc.prediction.timing import ClockSettings, interleaved
 from gsparc.training import tracking
 
@@ -84,9 +84,9 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
 def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
     _, _, ckpt, _ = swept
     before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
-    points, measured = stored_front.kept(after.extra)
-    assert points and "contribution" in measured and stored_front.kept(before.extra) == ([], {})
-    assert after.config == before.config and set(after.extra) == {*before.extra, stored_front.KEY}
+    points, measured = operating_point.kept(after.extra)
+    assert points and "contribution" in measured and operating_point.kept(before.extra) == ([], {})
+    assert after.config == before.config and set(after.extra) == {*before.extra, operating_point.KEY}
     place = field.data.site.origin + 0.1
     same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
     assert np.array_equal(*same)
@@ -110,7 +110,7 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
 
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt, _ = swept
-    points, _ = stored_front.kept(checkpoint.read(ckpt).extra)
+    points, _ = operating_point.kept(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
     monkeypatch.setattr(operating_point, "interleaved", lambda calls, clock, threads: pretended)
     best = max(points, key=lambda p: p.score)
@@ -147,7 +147,7 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
     )
     point = Point("as trained", {}, 1, {"psnr_db": 1.0}, 1.0, np.ones(3))
     with pytest.raises(KeyboardInterrupt):
-        stored_front.keep(ckpt, [point], "psnr_db", {})
+        operating_point.keep(ckpt, [point], "psnr_db", {})
     assert ckpt.read_bytes() == before and list(tmp_path.iterdir()) == [ckpt]
 
 

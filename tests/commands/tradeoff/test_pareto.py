@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsparc.commands.tradeoff.picture import Other, beaten_by, draw
 from gsparc.evaluation.drawing import look
+from gsparc.evaluation.experiment.tradeoff import Other, beaten_by, draw_front
 from gsparc.models.pareto import Point, cost_of_halving, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
@@ -55,7 +55,7 @@ def test_settings_of_points_were_cut_at_the_edge_of_the_picture():
     said = worded({"keep": 0.12, "stride": 5, "confidence": False}) + ", 1 thread"
     points = [Point(said, {}, 1, {"psnr_db": 30.0 + ms}, 20.0, np.full(3, float(ms))) for ms in range(1, 9)]
     others = {"nearest": Other(40.0, 0.5, 0.6)}
-    figure = draw(points, range(8), others, "psnr_db", "gsparc", "a title")
+    figure = draw_front(points, range(8), others, "psnr_db", "gsparc", "a title")
     figure.canvas.draw()
     axes, legend = figure.axes
     box = legend.texts[0].get_window_extent()

@@ -9,11 +9,10 @@ import json
 import numpy as np
 import pytest
 
-from gsparc.evaluation.report import effects, learning, tables
-from gsparc.evaluation.report.intervals import Interval, bootstrap, interval
+from gsparc.evaluation.report import tables
 from gsparc.evaluation.report.plots import short
 from gsparc.evaluation.report.runs import Run, columns, distinct_overrides, find_runs
-from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.report.table import Column, Interval, Table, bootstrap, interval
 
 
 def cells(table, row: int) -> dict:
@@ -84,7 +83,7 @@ def test_an_interval_of_a_ratio_weighs_samples(three):
 
 def test_time_to_accuracies_and_best_within_minutes(three):
     runs = find_runs(three)
-    table = learning.within_minutes(runs)
+    table = tables.within_minutes(runs)
     first, last = cells(table, 0), cells(table, 2)
     assert first["PSNR dB within 1 min"] == 27.0  # the curve ends at 28 - 1
     assert last["PSNR dB within 1 min"] is None and last["PSNR dB within 5 min"] == 29.5  # 130 s in one piece
@@ -98,20 +97,20 @@ def test_of_channels_the_least_error_is_the_best_reached(tmp_path):
     falling = {"train_s": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.2, 0.1])}
     slower = {"train_s": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.7, 0.5])}
     runs = [Run(tmp_path, {**facts, "seed": i}, curve=c) for i, c in enumerate((falling, slower))]
-    table = learning.within_minutes(runs)
+    table = tables.within_minutes(runs)
     first, second = cells(table, 0), cells(table, 1)
     assert [first[f"MSE within {m} min"] for m in (1, 2, 5)] == [0.9, 0.2, 0.1]
     assert [second[f"MSE within {m} min"] for m in (1, 2, 5)] == [0.9, 0.7, 0.5]
-    assert learning.levels(runs) == pytest.approx([0.5, 0.4, 0.3])  # from what the worse reaches
+    assert tables.levels(runs) == pytest.approx([0.5, 0.4, 0.3])  # from what the worse reaches
     assert first["s to 0.5"] == 100 and second["s to 0.5"] == 200 and second["s to 0.4"] is None
 
 
 def test_effects_are_paired_by_sample_and_seed(three):
-    table = effects.effects(find_runs(three))
+    table = tables.effects(find_runs(three))
     row = cells(table, 0)
     assert len(table.rows) == 1 and row["effect"] == "array" and row["train s more"] == 120
     assert row["PSNR dB gained"].value == pytest.approx(1.5) and row["query ms more"] == pytest.approx(-0.3)
-    assert effects.effects(find_runs(three[:2])) is None
+    assert tables.effects(find_runs(three[:2])) is None
 
 
 def test_the_worst_receivers_are_the_worst(three):

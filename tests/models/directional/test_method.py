@@ -11,9 +11,9 @@ import torch
 from rooms import directed
 from scenes import error
 
-from gsparc.commands.study.disturb import turned
 from gsparc.data.datasets.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.evaluation.experiment.study import turned
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.gp_likelihood import steering
 from gsparc.models.image_sources.method import ImageSourceGP

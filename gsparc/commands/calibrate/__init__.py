@@ -1,1 +1,0 @@
-"""Confidences compared by risk against coverage, and thresholds whose risk is bounded."""

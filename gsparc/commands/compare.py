@@ -1,0 +1,95 @@
+"""`gsparc compare`: methods x datasets x splits under equal budgets, one table, one figure."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from rich.markdown import Markdown
+
+from gsparc.commands.output import columns, run_directory, show
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.files import platform_cache
+from gsparc.evaluation.experiment.cells import Budget, contenders, plan, plugged
+from gsparc.evaluation.experiment.fitting import Failed, Filled, fill_all, prepare
+from gsparc.evaluation.experiment.latency import Latency, timed_here
+from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
+from gsparc.evaluation.experiment.problem import problems_of
+from gsparc.evaluation.experiment.table import Result, Row, markdown, overview, results
+from gsparc.evaluation.experiment.table import blocks as blocks_of
+from gsparc.evaluation.experiment.table import rows as rows_of
+from gsparc.evaluation.summary import provenance, write_samples, write_summary
+
+log = logging.getLogger(__name__)
+
+
+def task(config: DictConfig) -> list[Row]:
+    """Fill the cells that are asked for and not there yet, time all methods, and report."""
+    RunSettings.of(config)
+    run_dir = run_directory()
+    settings = plain(config)
+    methods = plugged() | contenders(settings["methods"])
+    folder = settings["cells"]
+    kept = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
+    problems = problems_of(settings, kept)
+    budgets = [
+        Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
+        for b in settings["budgets"]
+    ]
+    prepared = [
+        prepare(cell, methods[cell.method], settings["datasets"][cell.dataset] or {}, problem, kept)
+        for problem, cell in plan(problems, methods, budgets, settings["only"])
+    ]
+    limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
+    several = HydraConfig.get().mode == RunMode.MULTIRUN
+    failed = Failed(run_dir.parent) if several else None
+    filled = fill_all(prepared, bool(settings["train"]), limit_s, failed)
+    if settings["worker"]:
+        log.info("every cell is filled or has failed; the report is worker 0's")
+        return []
+    if not filled:
+        raise ValueError("no cell is filled: nothing to report (train=true fills them)")
+    by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
+    timed = timed_here(filled, by_name, kept, bool(settings["latency"]))
+    return report(filled, timed, str(settings["ours"]), run_dir)
+
+
+def report(
+    filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
+) -> list[Row]:
+    """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
+
+    Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`.
+    """
+    rows = rows_of(filled, timed)
+    blocks = blocks_of(rows)
+    unscored = {one.cell.method for one in filled if not one.scored()}
+    only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
+    drawn = [row for row in rows if row.draws]
+    by_set = [
+        [row for row in drawn if row.dataset == name] for name in dict.fromkeys(r.dataset for r in drawn)
+    ]
+    page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours, only_timed)])
+    write_samples(run_dir / "compare.csv", columns(rows, Row))
+    write_samples(run_dir / "cells.csv", columns(results(filled), Result))
+    (run_dir / "compare.md").write_text(page, encoding="utf-8")
+    for one in by_set:
+        draw_splits(one, run_dir / f"{one[0].dataset}.png")
+    if len(drawn) < len(rows):
+        draw_budgets([row for row in rows if not row.draws], run_dir / "compare.png", ours)
+    facts: dict[str, Any] = {"cells": len(filled), **provenance()}
+    for block in blocks:
+        stem = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"
+        facts[f"{stem}/first"] = block.rows[0].method
+        for row in block.rows:
+            own = {"score_db": row.score_db, "train_s": row.train_s, "query_ms_p50": row.query_ms}
+            facts |= {f"{stem}/{row.method}/{name}": value for name, value in own.items()}
+    write_summary(run_dir / "summary.json", facts)
+    show(run_dir, Markdown(page))
+    return rows

@@ -1,1 +1,0 @@
-"""Every method under the same data, splits, budgets and clock: stored cells, a table, a figure."""

@@ -1,0 +1,95 @@
+"""`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines, on the same data.
+
+Leaves `study.csv`, `study.png` and `summary.json`, whose `study/<variant>[/<what>/<amount>]/*` hold the
+accuracy under its own name, seconds of training, milliseconds of a query and their ratios to `base`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+
+from gsparc.commands.output import columns, finish, run_directory
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.load import load, split_for
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.experiment.fit import context_of
+from gsparc.evaluation.experiment.pictures import draw_study
+from gsparc.evaluation.experiment.study import Row, Study, Variant
+from gsparc.evaluation.summary import run_conditions, shown, table, write_samples
+from gsparc.models.method import Method
+from gsparc.models.registry import build, method_class
+from gsparc.prediction.timing import ClockSettings, machine_facts
+
+
+def variants_of(config: DictConfig) -> list[Variant]:
+    """Those of `config.variants`, each overrides of `config.model`, then `config.baselines` by name."""
+
+    def maker(overrides: Any) -> Callable[[], Method]:
+        return lambda: build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
+
+    # Resolved first: an interpolation would take the place of the model's own settings, not join them.
+    given = plain(config.variants)
+    found = [Variant(str(name), maker(overrides)) for name, overrides in given.items()]
+    return found + [Variant(name, method_class(name)) for name in config.baselines]
+
+
+def study_of(config: DictConfig) -> Study:
+    """The study that a composed configuration describes."""
+    return Study(
+        variants_of(config),
+        instantiate(config.kind).conditions(),
+        config.base,
+        int(config.rounds),
+        int(config.seed),
+        ClockSettings(rounds=int(config.queries), budget_s=float(config.query_s)),
+    )
+
+
+def task(config: DictConfig) -> list[Row]:
+    """Run the study, show its table, write its files."""
+    settings = RunSettings.of(config)
+    run_dir = run_directory()
+    study = study_of(config)
+    data = load(plain(config.dataset))
+    split = split_for(plain(config.split), data)
+    try:
+        rows = study.run(data, split, context_of(config, run_dir=run_dir))
+    except KeyboardInterrupt:  # whose advice is that of a training, which can be gone on with
+        raise KeyboardInterrupt("the study was interrupted; it keeps nothing to go on from") from None
+    facts: dict[str, Any] = {
+        **dataset_facts(data), **split_facts(split),
+        "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base,
+    }  # fmt: skip
+    for row in rows:
+        facts |= row.facts()
+    title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
+    write_samples(run_dir / "study.csv", columns(rows, Row))
+    draw_study(rows, title, run_dir / "study.png")
+    ratios = "" if study.base is None else f"ratios to {study.base!r}; "
+    finish(
+        run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()), before=ratios
+    )
+    return rows
+
+
+def table_of(rows: Sequence[Row], title: str) -> Table:
+    """A line per row; conditions and ratios where the study has any."""
+    changed = any(row.what != "none" for row in rows)
+    compared = any(row.train_ratio is not None for row in rows)
+    ratio = ["ratio"] if compared else []
+    lines = []
+    for row in rows:
+        change = row.what if row.what == "none" else f"{row.what} {row.amount:g}"
+        value = f"{row.value:.4g}" + ("" if row.spread is None else f" ± {row.spread:.2g}")
+        train, query = ([row.train_ratio], [row.query_ratio]) if compared else ([], [])
+        numbers = (row.train_s, *train, row.train_cpu_s, row.query_ms, row.query_p95_ms, *query)
+        words = [row.variant, row.effects, *([change] if changed else [])]
+        lines.append([*words, f"{row.rows:g}", value, *(shown(number, ".3g") for number in numbers)])
+    words = ["variant", "effects", *(["changed"] if changed else [])]
+    costs = ["train s", *ratio, "cpu s", "query ms", "p95", *ratio]
+    return table(title, words, ["rows", rows[0].figure, *costs], lines)

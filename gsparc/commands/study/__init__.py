@@ -1,1 +1,0 @@
-"""Variants of one model and baselines under the same data, splits and clock."""

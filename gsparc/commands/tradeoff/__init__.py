@@ -1,1 +1,0 @@
-"""Accuracy against latency of a trained model: sweep its reductions, draw the front, keep it."""

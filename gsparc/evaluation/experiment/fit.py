@@ -1,0 +1,147 @@
+"""Fit a method on every fold of a split, score it, time it: of a study, a comparison or a run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra.utils import instantiate
+from lightning import Callback, Trainer
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.load import split_settings
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.console import plain
+from gsparc.evaluation.intervals import pooled
+from gsparc.evaluation.scores import score
+from gsparc.models import parts
+from gsparc.models.method import Method
+from gsparc.models.per_station import for_links
+from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import Clock, less_repeatable
+
+
+def context_of(
+    config: DictConfig,
+    trainer: partial[Trainer] | None = None,
+    callbacks: Callable[[], Sequence[Callback]] | None = None,
+    **others: Any,
+) -> FitContext:
+    """The context of a fit: seed, budget, split, `init_from`, `dataset.batch_size`, and what is given.
+
+    Args:
+        config: a composed configuration.
+        trainer: makes a Trainer from further options, once per fold; None: as `config` says.
+        callbacks: makes them anew, once per Trainer; None: as `config` says.
+        **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
+    """
+    init_from, split = config.get("init_from"), config.get("split")
+    return FitContext(
+        seed=int(config.seed),
+        budget_s=config.budget_s,
+        budget_clock=config.get("budget_clock", "wall"),
+        stations=config.get("stations", "auto"),
+        split=None if split is None else split_settings(plain(split)),
+        init_from=None if init_from is None else Path(init_from),
+        batch_size=config.dataset.get("batch_size", 16),
+        trainer=trainer or instantiate(config.trainer, _partial_=True),
+        callbacks=callbacks or partial(callbacks_of, config.get("callbacks")),
+        config_yaml=OmegaConf.to_yaml(config, resolve=True),
+        **others,
+    )
+
+
+def callbacks_of(nodes: Mapping[str, Any] | None) -> list[Callback]:
+    """Every callback of the group `callbacks` that was not set to null."""
+    return [instantiate(node) for node in (nodes or {}).values() if node is not None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A method after it was fitted on every fold.
+
+    Attributes:
+        methods: one per fold.
+        train_s: seconds of each fit [s], without validation.
+        train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not inflate them.
+        figures: accuracies pooled over folds, as in `Scores.figures`; empty when it was not scored.
+        score_s: seconds that scoring took [s].
+        notes: what the first fold's fit said.
+        limited_by: the clock whose seconds decided something: on another machine the result may be another.
+    """
+
+    methods: tuple[Method, ...]
+    train_s: tuple[float, ...]
+    train_cpu_s: tuple[float, ...]
+    figures: dict[str, float | None]
+    score_s: float
+    notes: tuple[str, ...]
+    limited_by: Clock | None = None
+
+    def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
+        """The same fits scored on other data, such as displaced queries."""
+        started = time.perf_counter()
+        figures = pooled(score(self.methods, data, split, eval_on), data, split)
+        return replace(self, figures=figures, score_s=time.perf_counter() - started)
+
+
+def in_folders(context: FitContext) -> Callable[[int], FitContext]:
+    """The context of each fold, which differs in its folder."""
+    return lambda number: replace(context, run_dir=context.run_dir / f"fold{number}")
+
+
+def fit_and_score(
+    make: Callable[[], Method],
+    data: Measurements,
+    split: Split,
+    context: Callable[[int], FitContext],
+    *,
+    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
+    eval_on: str | None = "test",
+    keep: Callable[[int, Method, FitReport], None] | None = None,
+) -> Outcome:
+    """Fit an unfitted method per fold, then score them together.
+
+    Args:
+        make: an unfitted method.
+        data, split: learned from `train` and `val` of each fold.
+        context: of each fold's fit, by its number.
+        learned: what is learned from instead, such as displaced or fewer measurements.
+        eval_on: `train`, `val` or `test` rows that are scored; None scores nothing.
+        keep: called after each fit with the fold's number, the method and its report.
+
+    Raises:
+        ValueError: the method does not serve these data.
+        RuntimeError: training diverged.
+    """
+    methods, seconds, processor, notes = [], [], [], []
+    limited: Clock | None = None
+    for number, fold in enumerate(split.folds):
+        there, rows = (data, fold) if learned is None else learned(data, fold)
+        method, settings = for_links(make, there), context(number)
+        before = time.process_time()
+        report = parts.fit(method, there, rows, settings)
+        processor.append(time.process_time() - before)
+        seconds.append(report.seconds)
+        limited = less_repeatable(limited, report.limited_by)
+        notes += [note for note in report.notes if number == 0]
+        methods.append(method)
+        if keep is not None:
+            keep(number, method, report)
+    found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes), limited)
+    return found if eval_on is None else found.scored_on(data, split, eval_on)
+
+
+def query_ms(
+    methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings
+) -> dict[str, tuple[float, float]]:
+    """Median and 95th percentile of warm single queries, all methods in turns [ms]."""
+    times = interleaved(cycling(methods, queries(data, rows)), clock)
+    return {name: percentiles(ms) for name, ms in times.items()}

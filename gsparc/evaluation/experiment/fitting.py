@@ -1,0 +1,282 @@
+"""A cell filled: composed, trained on every fold, scored, and kept."""
+
+from __future__ import annotations
+
+import logging
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.files import each_once, no_room
+from gsparc.data.schema import Kind
+from gsparc.evaluation.console import one_line, plain
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.experiment.cells import Cell, Contender, key
+from gsparc.evaluation.experiment.fit import context_of, fit_and_score, in_folders
+from gsparc.evaluation.experiment.problem import RESULT, Problem, compose, facts_of
+from gsparc.evaluation.figures import DECIDING, score_of
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.models import checkpoint
+from gsparc.models.label import common_label
+from gsparc.models.method import Method
+from gsparc.models.registry import build
+from gsparc.prediction.timing import machine_facts
+from gsparc.training.context import FitReport
+
+log = logging.getLogger(__name__)
+
+FREE_S = 5.0  # guessed for a method without a budget
+EARLIER = "measured at commit"  # among the facts of a result of earlier program text
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A cell with its result.
+
+    Attributes:
+        cell: which.
+        folder: where its checkpoints are.
+        facts: flat, as in `summary.json`: `test/*`, `time/*`, `model/*`, `dataset/*`, `machine/*`.
+    """
+
+    cell: Cell
+    folder: Path
+    facts: dict[str, Any]
+
+    @property
+    def earlier(self) -> str | None:
+        """Commit of an earlier program text that it was measured with; None for this one's."""
+        return self.facts.get(EARLIER)
+
+    @property
+    def drawn(self) -> bool:
+        """Whether its seed is a draw of the split."""
+        return bool(self.facts.get("problem/drawn"))
+
+    def scored(self) -> bool:
+        """Whether it was tested, not only timed."""
+        return any(name.startswith("test/") for name in self.facts)
+
+    @property
+    def checkpoint(self) -> Path:
+        """Of the first fold."""
+        return self.folder / "fold0.ckpt"
+
+
+def score_db(kind: Kind, facts: Mapping[str, Any]) -> float:
+    """The figure places are given by, as decibels of which more are better."""
+    figure = DECIDING[kind]
+    return score_of(figure, float(facts[f"test/{figure}"]))
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A cell of a problem, composed but not yet trained."""
+
+    cell: Cell
+    problem: Problem
+    config: DictConfig
+    folder: Path
+    scored: bool = True
+
+    @property
+    def lock(self) -> Path:
+        """File by which one process claims to fill the cell."""
+        return self.folder / ".lock"
+
+    @property
+    def expected_s(self) -> float:
+        """Seconds it will take: its budget on every fold, and something for scoring [s]; 0 without data."""
+        folds = self.problem.folds
+        return 0.0 if folds is None else len(folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
+
+    def found(self) -> Filled | None:
+        """The kept result, if there is a whole one."""
+        facts = facts_of(self.folder / RESULT)
+        return None if facts is None else Filled(self.cell, self.folder, facts)
+
+    def found_earlier(self) -> Filled | None:
+        """The latest result of other program text or settings for this cell, the same data and split.
+
+        Published results outlive the code they were measured with; a table must say so, not lose them.
+        """
+        stem = self.folder.name.rpartition("-")[0]
+        same: dict[str, Any] = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
+        data, folds, whole = self.problem.hashes
+        same |= {"dataset/sha256": data, "split/sha256": folds}
+        files = self.folder.parent.glob(f"{stem}-*/{RESULT}")
+        every = {file.parent: facts_of(file) or {} for file in files}
+        found = {path: f for path, f in every.items() if all(f.get(k) == v for k, v in same.items())}
+        found = {path: f for path, f in found.items() if f.get("dataset/identity", whole) == whole}
+        if not found:
+            return None
+        folder, facts = max(found.items(), key=lambda item: item[1].get("made") or "")
+        return Filled(self.cell, folder, {**facts, EARLIER: str(facts.get("git"))[:8]})
+
+
+def prepare(
+    cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, kept: Path
+) -> Prepared:
+    """Compose a cell's configuration and name the folder of its result."""
+    chosen = problem.chosen or (f"dataset={settings.get('dataset', cell.dataset)}",)
+    overrides = [*chosen, *contender.overrides(cell.budget_s)]
+    config = compose(settings, overrides, problem.draw, cell.seed)
+    whole = plain(config)
+    trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
+    # cells from before there was a choice keep their names
+    if whole["trainer"].get("strategy") == "auto":
+        trainer["trainer"] = {name: v for name, v in whole["trainer"].items() if name != "strategy"}
+    if whole["stations"] == "together" or (whole["stations"] == "auto" and problem.stations):
+        trainer["stations"] = whole["stations"]
+    beside = {**whole, "batch_size": whole["dataset"].get("batch_size", 16)}
+    clock = "wall" if whole["budget_s"] is None else "processor"  # as cells without this in their name had
+    for setting, usual in (("budget_clock", clock), ("init_from", None), ("batch_size", 16)):
+        if beside[setting] != usual:
+            trainer[setting] = beside[setting]
+    for named in ((whole["model"].get("init") or {}).get("file"), whole["init_from"]):
+        if named and Path(named).is_file():  # walls, and a start, may change under their names
+            trainer[Path(named).name] = sha256(Path(named).read_bytes()).hexdigest()
+    if problem.draw is None and cell.seed and "seed" not in whole["model"]:
+        trainer["seed"] = cell.seed  # of a draw, the split's own hash tells
+    name = key(whole["model"], trainer, *problem.hashes)
+    folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
+    return Prepared(cell, problem, config, folder, not contender.timed_only)
+
+
+def fill(prepared: Prepared) -> Filled:
+    """Train on every fold, score on the test rows, write checkpoints and then the result.
+
+    Of a split that is drawn several times, the models of the first draw are kept.
+
+    Raises:
+        ValueError: the method does not serve these data.
+        RuntimeError: training diverged.
+    """
+    config, folder, (data, split) = prepared.config, prepared.folder, prepared.problem.present()
+    yaml = OmegaConf.to_yaml(config, resolve=True)
+
+    def keep(number: int, method: Method, report: FitReport) -> None:
+        if prepared.problem.draw:  # queries are timed with models of the first draw
+            return
+        extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
+        checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
+
+    folds = split if prepared.scored else replace(split, folds=split.folds[:1])
+    found = fit_and_score(
+        partial(build, config.model), data, folds, in_folders(context_of(config, run_dir=folder)),
+        eval_on="test" if prepared.scored else None, keep=keep,
+    )  # fmt: skip
+    facts: dict[str, Any] = {f"test/{name}": value for name, value in found.figures.items()}
+    facts |= {
+        "time/train_s": statistics.fmean(found.train_s),
+        "time/train_cpu_s": statistics.fmean(found.train_cpu_s),
+        "time/score_s": found.score_s,
+        "model/name": prepared.cell.method,
+        **found.methods[0].facts(),
+        "model/label": common_label(found.methods[0].name, found.methods),
+        "model/effects": found.methods[0].effects,
+        "model/notes": "; ".join(found.notes),
+        "problem/drawn": prepared.problem.draw is not None,
+        "problem/stations": prepared.problem.stations,
+        "problem/scene": prepared.problem.scene,
+        "seed": prepared.cell.seed,
+        "budget_s": prepared.cell.budget_s,
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    facts |= dataset_facts(data) | split_facts(split) | machine_facts() | provenance()
+    write_summary(folder / RESULT, facts)  # last: a cell without it does not count
+    return Filled(prepared.cell, folder, facts)
+
+
+class Failed:
+    """Cells that processes of one multirun could not fill; those of an earlier multirun are tried again.
+
+    Args:
+        sweep: the multirun's folder.
+    """
+
+    def __init__(self, sweep: Path) -> None:
+        self.folder, self.start = sweep / "failed", sweep / "multirun.yaml"  # which Hydra writes at the start
+
+    def has(self, name: str) -> bool:
+        """Whether a cell failed since the start."""
+        file = self.folder / name
+        if not file.exists():
+            return False
+        return not self.start.exists() or file.stat().st_mtime_ns >= self.start.stat().st_mtime_ns
+
+    def add(self, name: str, why: str) -> None:
+        """Say that a cell failed."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / name).write_text(why + "\n", encoding="utf-8")
+
+
+def fill_all(
+    prepared: Sequence[Prepared],
+    train: bool = True,
+    limit_s: float | None = None,
+    failed: Failed | None = None,
+) -> list[Filled]:
+    """Find or fill one cell after another, saying how far it is and how long it will take.
+
+    A cell that cannot be filled is said and left out; the others go on. One that is not tried keeps what was
+    measured with earlier program text. Processes that fill the same cells share them.
+
+    Args:
+        prepared: the most wanted first.
+        train: whether missing cells are filled.
+        limit_s: no cell is started that would end later [s].
+        failed: where processes tell each other of cells that cannot be filled.
+    """
+    missing = [one for one in prepared if one.found() is None]
+    log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(missing))
+    started = time.monotonic()
+    broken, late = set[str](), set[str]()  # cells
+
+    def cannot(one: Prepared) -> bool:
+        return str(one.cell) in broken or (failed is not None and failed.has(one.folder.name))
+
+    def done(one: Prepared) -> bool:
+        return one.found() is not None or str(one.cell) in late or cannot(one)
+
+    def work(one: Prepared) -> None:
+        if limit_s is not None and time.monotonic() - started + one.expected_s > limit_s:
+            log.warning("max_hours: %s is not started", one.cell)
+            late.add(str(one.cell))
+            return
+        left = sum(other.expected_s for other in missing if not done(other))
+        number = prepared.index(one) + 1
+        log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
+        try:
+            _log_filled(fill(one))
+        except KeyboardInterrupt:
+            kept = "interrupted; finished cells are kept: the same command goes on with the others"
+            raise KeyboardInterrupt(kept) from None
+        except Exception as error:  # any error of a plugin: the other methods' table comes nevertheless
+            if no_room(error):  # the others would be trained in vain
+                raise
+            unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
+            log.warning("%s cannot be filled: %s", one.cell, one_line(error), exc_info=unforeseen)
+            broken.add(str(one.cell))
+            if failed is not None:
+                failed.add(one.folder.name, one_line(error))
+
+    if train:
+        here = [one for one in missing if one.problem.data is not None]
+        each_once(here, lambda one: one.lock, done, work)
+    found = [one.found() or (None if cannot(one) else one.found_earlier()) for one in prepared]
+    return [one for one in found if one is not None]
+
+
+def _log_filled(found: Filled) -> None:
+    scored = found.scored()
+    score = f"{score_db(found.facts['dataset/kind'], found.facts):.2f} dB" if scored else "-"
+    log.info("%s: %s after %.1f s", found.cell, score, found.facts["time/train_s"])

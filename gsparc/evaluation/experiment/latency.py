@@ -1,0 +1,107 @@
+"""Single-query latency of all methods of a problem, in turns, on one processor, after all training."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.data.files import whole_file
+from gsparc.evaluation.experiment.fitting import Filled
+from gsparc.evaluation.experiment.problem import Problem
+from gsparc.models import loading
+from gsparc.models.method import Method
+from gsparc.prediction.timing import (
+    COPY,
+    ClockSettings,
+    cycling,
+    interleaved,
+    percentiles,
+    queries,
+    reference_copy,
+)
+
+log = logging.getLogger(__name__)
+
+SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
+ENDLESS_MS = 10_000.0  # from here on it is timed once
+FAST = ClockSettings(rounds=60, budget_s=30.0)
+SLOW = ClockSettings(rounds=5, least=1, warmup=0, budget_s=20.0)
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Of one method, one query end to end.
+
+    Attributes:
+        p50_ms, p95_ms: [ms].
+        to_copy: p50 in units of a 16 MiB copy timed in the same rounds.
+        rounds: how often it was timed.
+    """
+
+    p50_ms: float
+    p95_ms: float
+    to_copy: float
+    rounds: int
+
+
+def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
+    """One row per method, from the first of its checkpoints."""
+    data, split = problem.present()
+    methods: dict[str, Method] = {}
+    for one in filled:
+        if one.cell.method not in methods:
+            methods[one.cell.method] = loading.load(one.checkpoint)[0]
+    calls = cycling(methods, queries(data, split.folds[0].test))
+    once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
+    endless = {name for name in calls if once[name][0] > ENDLESS_MS}
+    cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}
+    warm = interleaved(cold, replace(SLOW, rounds=1))  # a first call may make what later ones keep
+    slow = {name for name in cold if warm[name][0] > SLOW_MS}
+    found = {name: latency for name, latency in _summaries(once).items() if name in endless}
+    for group, clock in ((set(calls) - slow - endless, FAST), (slow, SLOW)):
+        if group:
+            timed = interleaved({**{n: calls[n] for n in calls if n in group}, COPY: reference_copy()}, clock)
+            found |= _summaries(timed)
+    return {name: found[name] for name in methods}
+
+
+def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:
+    copy = float(np.median(times[COPY]))
+    return {
+        name: Latency(*percentiles(values), float(np.median(values)) / copy, len(values))
+        for name, values in times.items()
+        if name != COPY
+    }
+
+
+def timed_here(
+    filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem], kept: Path, measure: bool
+) -> dict[str, dict[str, Latency]]:
+    """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
+    found: dict[str, dict[str, Latency]] = {}
+    for dataset in dict.fromkeys(one.cell.dataset for one in filled):
+        here = [one for one in filled if one.cell.dataset == dataset]
+        split, file = here[0].cell.split, kept / f"latency-{dataset}.json"
+        first = [one for one in here if one.cell.split == split]
+        present = [one for one in first if one.checkpoint.exists()]
+        absent = {o.cell.method for o in first} - {o.cell.method for o in present}
+        stored = json.loads(file.read_text()) if file.exists() else {}
+        if measure and absent and stored:
+            log.warning(
+                "%s: timings are kept ones; models of %s are not here (cells=EMPTY_FOLDER trains all)",
+                dataset, ", ".join(sorted(absent)),
+            )  # fmt: skip
+        elif measure and present and problems[dataset, split].data is not None:
+            log.info("%s: timing single queries of every method in turns", dataset)
+            found[dataset] = latencies(present, problems[dataset, split])
+            rows = {name: asdict(one) for name, one in found[dataset].items()}
+            with whole_file(file) as partial:  # another comparison may read it
+                partial.write_text(json.dumps(rows, indent=2), encoding="utf-8")
+            continue
+        found[dataset] = {name: Latency(**values) for name, values in stored.items()}
+    return found

@@ -1,0 +1,174 @@
+"""Comparisons and studies drawn: accuracy against cost, error bars over draws, accuracy against an error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+
+from gsparc.evaluation.drawing import logarithmic, look, panels, save
+from gsparc.evaluation.experiment.study import Row as StudyRow
+from gsparc.evaluation.experiment.table import SCORE, Row, mean_behind
+from gsparc.evaluation.figures import axis_of, lower_is_better
+
+LEAST_S = 1e-3  # faster fits are drawn here
+PANEL = 2.4  # inches
+
+
+def draw_budgets(rows: Sequence[Row], path: Path, ours: str) -> None:
+    """A method looks the same in all panels; a line joins its budgets.
+
+    Args:
+        rows: of the splits that are not drawn several times.
+        path: PNG file.
+        ours: the method with the largest mark.
+    """
+    datasets = list(dict.fromkeys(row.dataset for row in rows))
+    splits = {name: list(dict.fromkeys(r.split for r in rows if r.dataset == name)) for name in datasets}
+    columns = max(map(len, splits.values())) + any(row.query_ms for row in rows)
+    size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(datasets) + 0.9)
+    figure, grid = panels(*size, len(datasets), columns, sharey="row")
+    for line, dataset in zip(grid, datasets, strict=True):
+        here = [row for row in rows if row.dataset == dataset]
+        for axis, split in zip(line, splits[dataset], strict=False):
+            _panel(axis, [row for row in here if row.split == split], "train_cpu_s", ours)
+            axis.set(title=f"{dataset}, {split}", xlabel="training, CPU [s]")
+        line[0].set_ylabel(SCORE[here[0].figure])
+        free = line[len(splits[dataset]) :]
+        timed = [row for row in here if row.split == splits[dataset][0] and row.query_ms is not None]
+        if timed:
+            _panel(free[0], timed, "query_ms", ours)
+            free[0].set(title=f"{dataset}, {splits[dataset][0]}", xlabel="one query [ms]")
+        for axis in free[1 if timed else 0 :]:
+            axis.set_visible(False)
+    handles: dict[str, Artist] = {}
+    for axis in grid.flat:
+        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    figure.legend(
+        list(handles.values()), list(handles), loc="outside lower center", ncols=min(6, 2 * columns)
+    )
+    save(figure, path)
+
+
+def _panel(axis: Any, rows: Sequence[Row], horizontal: str, ours: str) -> None:
+    for name in dict.fromkeys(row.method for row in rows):
+        own: Iterable[Row] = sorted((r for r in rows if r.method == name), key=lambda r: r.budget_s or 0)
+        known = [(getattr(r, horizontal), r.score_db, r.spread_db or 0.0) for r in own]
+        points = [(max(x, LEAST_S), *rest) for x, *rest in known if x is not None]
+        if points:
+            style = look(name).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
+            axis.errorbar(*zip(*points, strict=True), label=name, **style)
+    logarithmic(axis, fine=False)
+
+
+LINE = 0.34  # height of a method [inch]
+
+
+def draw_splits(rows: Sequence[Row], path: Path) -> None:
+    """A panel per split of one dataset: mean and standard error over draws, training and query beside it.
+
+    Args:
+        rows: of one dataset, all of drawn splits.
+        path: PNG file.
+    """
+    splits = list(dict.fromkeys(row.split for row in rows))
+    names = sorted(dict.fromkeys(row.method for row in rows), key=lambda name: mean_behind(rows, name))
+    figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
+    for axis, split in zip(grid[0], splits, strict=True):
+        here = {row.method: row for row in rows if row.split == split}
+        most = max(row.value + (row.value_error or 0.0) for row in here.values())
+        best = min(here.values(), key=lambda row: -row.score_db)
+        for number, name in enumerate(names):
+            if name not in here:
+                axis.text(0.02 * most, number, "not possible", va="center", fontsize=8, color="0.5")
+                continue
+            row = here[name]
+            axis.barh(
+                number,
+                row.value,
+                xerr=row.value_error or 0.0,
+                color=look(name).colour,
+                alpha=1.0 if row is best else 0.45,
+                capsize=2.5,
+            )
+            axis.text(
+                min(row.value + (row.value_error or 0.0) + 0.02 * most, 1.02 * most), number,
+                f"{row.value:.3g}, fit {_seconds(row.train_s)}", va="center", fontsize=7.5,
+            )  # fmt: skip
+        draws = max(row.seeds for row in here.values())
+        axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
+        axis.set_xlabel(axis_of(best.figure))
+        axis.set_yticks(np.arange(len(names)), names)
+        axis.grid(axis="y", visible=False)
+    grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
+    figure.suptitle(f"{rows[0].dataset}: mean and standard error over draws of the split; the best is dark")
+    save(figure, path)
+
+
+def _seconds(value: float) -> str:
+    if value < 0.1:
+        return f"{1e3 * value:.2g} ms"
+    return f"{value:.2g} s" if value < 10 else f"{value:.0f} s"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Attributes:
+        what: condition whose rows are drawn.
+        label: of the horizontal axis.
+        x: horizontal coordinate of a row.
+        y: vertical coordinate; None: the accuracy.
+    """
+
+    what: str
+    label: str
+    x: Callable[[StudyRow], float]
+    y: Callable[[StudyRow], float] | None = None
+
+
+TRAINING = "training of one model [s]"
+PANELS = (
+    Panel("query", "position error in queries [cm]", lambda row: 100 * row.amount),
+    Panel("train", "position error in training [cm]", lambda row: 100 * row.amount),
+    Panel("directions", "error of directions of arrival [degrees]", lambda row: row.amount),
+    Panel("keep", "measurements learned from", lambda row: row.rows),
+    Panel("keep", "measurements learned from", lambda row: row.rows, lambda row: row.train_s),
+)
+COSTS = (
+    Panel("none", TRAINING, lambda row: row.train_s),
+    Panel("none", "one query, median [ms]", lambda row: row.query_ms),
+)
+
+
+def draw_study(rows: Sequence[StudyRow], title: str, path: Path) -> None:
+    """Save the figure as PNG; a dotted line is the variant's accuracy on undisturbed data."""
+    drawn = {row.what for row in rows}
+    wanted = [panel for panel in PANELS if panel.what in drawn] or list(COSTS)
+    figure, grid = panels(5 * len(wanted), 4, 1, len(wanted))
+    figure.suptitle(title, fontsize=11)
+    for axes, panel in zip(grid[0], wanted, strict=True):
+        for name in dict.fromkeys(row.variant for row in rows):
+            own = [row for row in rows if row.variant == name and row.what == panel.what]
+            if not own:
+                continue
+            x, y = [panel.x(row) for row in own], [panel.y(row) if panel.y else row.value for row in own]
+            spread = None if panel.y else [row.spread or 0.0 for row in own]
+            (line, *_) = axes.errorbar(x, y, spread, marker="o", capsize=2, label=name)
+            clean = [row.value for row in rows if row.variant == name and row.what == "none"]
+            if clean and panel.what != "none":
+                axes.axhline(clean[0], color=line.get_color(), linestyle=":", linewidth=1)
+        logarithmic(axes)
+        axes.set_xlabel(panel.label)
+        axes.set_ylabel(TRAINING if panel.y else rows[0].figure)
+        if panel.y:
+            axes.set_yscale("log")
+        elif lower_is_better(rows[0].figure):
+            axes.invert_yaxis()
+    grid[0, 0].legend(fontsize=8)
+    save(figure, path)

@@ -1,0 +1,238 @@
+"""What a comparison is about: measurements, and which rows of them learn and test."""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.assemble import identity
+from gsparc.data.load import load, split_for
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
+from gsparc.evaluation.console import plain
+from gsparc.simulate.scenes.build import names_scene
+
+log = logging.getLogger(__name__)
+
+RESULT = "cell.json"
+
+
+@dataclass(frozen=True)
+class SplitChoice:
+    """A split as the comparison's configuration names it.
+
+    Attributes:
+        name: in tables.
+        choose: overrides of train.yaml that select it; empty: `split=<name>`.
+        datasets: that are cut so; empty for all.
+        draws: how often it is drawn, by `split.seed` from 0; 0: once, with the seed it has.
+    """
+
+    name: str
+    choose: tuple[str, ...] = ()
+    datasets: tuple[str, ...] = ()
+    draws: int = 0
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """Overrides of train.yaml, but for the draw."""
+        return self.choose or (f"split={self.name}",)
+
+    @property
+    def numbers(self) -> tuple[int | None, ...]:
+        """Every draw, or None for the only one."""
+        return tuple(range(self.draws)) or (None,)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One dataset under one draw of a split; its measurements may be absent, then kept results say what they
+    were.
+
+    Attributes:
+        dataset, split: names.
+        kind: of the measurements.
+        hashes: of the measurements alone, of the folds, and of the former with every fact of their site.
+        draw: number of the split's draw; None where it is not drawn again.
+        stations: whether there are several.
+        scene: whether they name a scene that a ray tracer loads.
+        chosen: overrides of train.yaml for dataset and split, but for the draw.
+        data: measurements; None where they are not here.
+        folds: which rows learn and which test.
+    """
+
+    dataset: str
+    split: str
+    kind: str
+    hashes: tuple[str, str, str]
+    draw: int | None = None
+    stations: bool = False
+    scene: bool = False
+    chosen: tuple[str, ...] = ()
+    data: Measurements | None = None
+    folds: Split | None = None
+
+    def present(self) -> tuple[Measurements, Split]:
+        """Measurements and folds.
+
+        Raises:
+            ValueError: they are not here.
+        """
+        if self.data is None or self.folds is None:
+            raise ValueError(f"{self.dataset}/{self.split}: the measurements are not here")
+        return self.data, self.folds
+
+
+def split_choices(config: Mapping[str, Any]) -> dict[str, SplitChoice]:
+    """The group `splits` of conf/compare.yaml; an entry without settings means the split of its name.
+
+    Raises:
+        ValueError: an entry with an unknown setting.
+    """
+    found = {}
+    for name, entry in config.items():
+        lists: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in dict(entry or {}).items()
+        }
+        unknown = sorted(set(lists) - {"choose", "datasets", "draws"})
+        if unknown:
+            raise ValueError(f"splits.{name}: unknown {unknown[0]!r}; there are choose, datasets and draws")
+        found[str(name)] = SplitChoice(str(name), **lists)
+    return found
+
+
+def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[SplitChoice]) -> list[Problem]:
+    """Load what `conf/dataset` names, with the given settings, once for all draws of all splits."""
+    data: Measurements | None = None
+    problems = []
+    for split in splits:
+        chosen = (f"dataset={settings.get('dataset', name)}", *split.overrides)
+        for draw in split.numbers:
+            config = compose(settings, chosen, draw)
+            data = load(plain(config.dataset)) if data is None else data
+            folds = split_for(plain(config.split), data)
+            hashes = (data.site.sha256, folds.sha256, identity(data))
+            several = data.site.stations is not None and folds.name != "stations"
+            known = names_scene(data.provenance)
+            problems.append(
+                Problem(name, split.name, data.site.kind, hashes, draw, several, known, chosen, data, folds)
+            )
+    return problems
+
+
+def facts_of(result: Path) -> dict[str, Any] | None:
+    """What a kept result says; None where there is none, or no whole one."""
+    try:
+        found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found
+
+
+def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> list[Problem]:
+    """The problems of a dataset that most kept results are of, one per draw of a split."""
+    found = []
+    for split in splits:
+        files = sorted(kept.glob(f"{dataset}-{split.name}-*/{RESULT}"))
+        facts = [one for file in files if (one := facts_of(file)) is not None]
+        for draw in split.numbers:
+            known = Counter(
+                (
+                    *(f[of] for of in ("dataset/kind", "dataset/sha256", "split/sha256")),
+                    f.get("dataset/identity", ""),  # earlier versions kept none
+                    *(bool(f.get(f"problem/{of}")) for of in ("stations", "scene")),
+                )
+                for f in facts
+                if draw is None or f["seed"] == draw
+            )
+            if known:
+                kind, data, folds, whole, several, scene = known.most_common(1)[0][0]
+                found.append(Problem(dataset, split.name, kind, (data, folds, whole), draw, several, scene))
+    return found
+
+
+def compose(
+    settings: Mapping[str, Any], overrides: Sequence[str], draw: int | None = None, seed: int | None = None
+) -> DictConfig:
+    """The configuration `train.py` would see.
+
+    Args:
+        settings: of its dataset; `dataset` is the choice itself, and left out.
+        overrides: of train.yaml.
+        draw: `split.seed`; None: as the split has it.
+        seed: None: 0.
+    """
+    config = deepcopy(_composed(tuple(overrides)))
+    own = {name: value for name, value in settings.items() if name != "dataset"}
+    OmegaConf.update(config, "dataset", own, merge=True)
+    OmegaConf.update(config, "seed", seed or 0)
+    if draw is not None:
+        OmegaConf.update(config, "split.seed", draw)
+    return config
+
+
+@functools.cache
+def _composed(overrides: tuple[str, ...]) -> DictConfig:
+    """Composing takes half a second, and draws differ in numbers only."""
+    chosen = ["logger=none", "~callbacks.pictures", *overrides]
+    return hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
+
+
+def problems_of(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
+    """Every dataset under every split that is meant for it, first draws first: the best-known come first.
+
+    Without its path a dataset is there as far as results were kept, for the table alone.
+    """
+    wanted = [str(pattern) for pattern in settings["only"]]
+    splits = split_choices(settings["splits"])
+    problems: list[Problem] = []
+    absent: dict[str, list[str]] = {"here as far as results were kept": [], "left out": []}
+    paths = {
+        name: [path for key, path in (of or {}).items() if key in ("root", "file")]
+        for name, of in settings["datasets"].items()
+    }
+    here = {name: not of or any(of) for name, of in paths.items()}  # a plugin's dataset may need no path
+    for name, own in settings["datasets"].items():
+        meant = [
+            split
+            for split in splits.values()
+            if (not split.datasets or name in split.datasets)
+            and (not wanted or any(_may_match(p, name, split.name) for p in wanted))
+        ]
+        if here[name]:
+            problems += load_problems(name, own, meant) if meant else []
+            continue
+        stored = stored_problems(kept, name, meant)
+        problems += stored
+        absent["here as far as results were kept" if stored else "left out"].append(name)
+    for how, names in absent.items():
+        if names:
+            log.warning("%s %s: say datasets.NAME.root=DIR or .file=FILE", ", ".join(names), how)
+    order = list(splits)
+    problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
+    if not problems and not any(here.values()):
+        raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
+    if not problems:
+        raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
+    return problems
+
+
+def _may_match(pattern: str, dataset: str, split: str) -> bool:
+    """Whether a pattern of cells can match this problem, so that others need not be loaded."""
+    for part, name in zip(pattern.split("/"), (dataset, split), strict=False):
+        if "*" in part:  # it may stand for what follows, too
+            return fnmatchcase(name, part.partition("*")[0] + "*")
+        if not fnmatchcase(name, part):
+            return False
+    return True

@@ -1,0 +1,300 @@
+"""Combinations of knobs scored on the test rows and timed in turns, and their front drawn."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.drawing import logarithmic, look, panels
+from gsparc.evaluation.evaluate import paired_differences
+from gsparc.evaluation.figures import DECIDING, axis_of, lower_is_better, score_of
+from gsparc.evaluation.open_runs import Opened, trained_on
+from gsparc.evaluation.scores import Scores, rows_of, score
+from gsparc.models import loading
+from gsparc.models.method import Method, Prediction
+from gsparc.models.pareto import Point, Settings, cost_of_halving
+from gsparc.models.reduced import View
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import (
+    Call,
+    ClockSettings,
+    interleaved,
+)
+
+log = logging.getLogger(__name__)
+
+CLOSEST_DB = 100.0  # the precision of float32
+PAIRED = {"nmse": "snr_db"}  # an NMSE is of a whole set; its samples are compared by their own ratios
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way of answering, before it is measured.
+
+    Attributes:
+        label: in words.
+        settings: what it is reduced by.
+        method: answers so.
+        threads: CPU threads to be timed with.
+    """
+
+    label: str
+    settings: Settings
+    method: Method
+    threads: tuple[int, ...]
+
+
+def sweep(
+    candidates: Sequence[Candidate], data: Measurements, fold: Fold, *, eval_on: str, clock: ClockSettings,
+    others: Mapping[str, Call],
+) -> tuple[list[Point], dict[str, np.ndarray]]:  # fmt: skip
+    """Measure the candidates; the first is the full model, which the others are compared with.
+
+    Args:
+        candidates: to be measured.
+        data, fold: as the model was trained with.
+        eval_on: rows whose figures are shown.
+        clock: how long to measure.
+        others: further contenders for the clock alone (a copy of memory), by name.
+
+    Returns:
+        A point per candidate and number of threads, and the times [ms] of `others`.
+    """
+    figure, split = DECIDING[data.site.kind], Split("tradeoff", (fold,), "")
+    scored: list[tuple[Scores, float]] = []
+    whole = None
+    places = data.moving[rows_of(fold, eval_on)] + data.site.origin
+    for number, candidate in enumerate(candidates):
+        recorded = Recorded(candidate.method)
+        there = score([recorded], data, split, eval_on)
+        answers = torch.cat(recorded.means)
+        whole = answers if whole is None else whole
+        scored.append((there, closeness(answers, whole)))
+        if number % 10 == 9:
+            log.info("%d of %d combinations scored", number + 1, len(candidates))
+    calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
+    threads: dict[tuple[int, int] | str, int] = dict.fromkeys(others, 1)
+    for index, candidate in enumerate(candidates):
+        ask = Predictor(candidate.method, data.site).cycling(places)
+        for count in candidate.threads:
+            calls[index, count], threads[index, count] = ask, count
+    times = interleaved(calls, clock, threads)
+    points = []
+    for key, ms in times.items():
+        if isinstance(key, str):
+            continue
+        index, count = key
+        candidate, (scores, close) = candidates[index], scored[index]
+        label = f"{candidate.label}, {count} thread{'s' if count > 1 else ''}"
+        points.append(
+            Point(
+                label, candidate.settings, count, scores.figures(), close, ms,
+                candidate.method.size(), _difference(scores, scored[0][0], figure),
+            )
+        )  # fmt: skip
+    return points, {name: times[name] for name in others}
+
+
+class Recorded(View):
+    """A method whose answers are kept while it is scored.
+
+    Attributes:
+        means: of every batch that was asked.
+    """
+
+    def __init__(self, inner: Method) -> None:
+        super().__init__(inner)
+        self.means: list[Tensor] = []
+
+    def answer(self, batch: Batch) -> Prediction:
+        """See `Method.answer`."""
+        found = self.inner.answer(batch)
+        self.means.append(found.mean)
+        return found
+
+
+def closeness(answers: Tensor, whole: Tensor) -> float:
+    """How near answers (n, ...) are to those of the full model [dB]: decides without a single measurement."""
+    apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
+    return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
+
+
+def _difference(scores: Scores, full: Scores, figure: str) -> tuple[float | None, float | None]:
+    found = paired_differences(scores, full, "full")
+    stem = f"paired/full/{PAIRED.get(figure, figure)}"
+    return found.get(stem), found.get(f"{stem}_se")
+
+
+@dataclass(frozen=True)
+class Other:
+    """Another method on the same axes: its accuracy and median latency [ms]."""
+
+    value: float
+    p50: float
+    p95: float
+
+
+def beaten_by(point: Point, others: Mapping[str, Other], figure_name: str) -> str | None:
+    """The most accurate other that is neither slower nor worse than a point; None when there is none."""
+    own = score_of(figure_name, point.value(figure_name))
+    better = {n: score_of(figure_name, r.value) for n, r in others.items() if r.p50 <= point.p50}
+    best = max(better, key=lambda name: better[name], default=None)
+    return best if best is not None and better[best] >= own else None
+
+
+def draw_front(
+    points: Sequence[Point],
+    on_front: Sequence[int],
+    others: Mapping[str, Other],
+    figure_name: str,
+    method: str,
+    title: str,
+) -> Figure:
+    """The picture.
+
+    Args:
+        points: all of them.
+        on_front: indices of the front, fastest first.
+        others: baselines and peers by name.
+        figure_name: key of the accuracy.
+        method: whose points they are.
+        title: what was measured.
+    """
+    lines = 0.16 * (len(on_front) + 1)  # inches of the legend
+    figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))
+    value = [p.value(figure_name) for p in points]
+    inside = [i for i in range(len(points)) if i not in on_front]
+    axes.scatter([points[i].p50 for i in inside], [value[i] for i in inside], s=9, c="0.75", label="beaten")
+
+    x, y = [points[i].p50 for i in on_front], [value[i] for i in on_front]
+    reach = [[0.0] * len(x), [points[i].p95 - points[i].p50 for i in on_front]]
+    own, label = look(method).colour, "not beaten (to 95th percentile)"
+    axes.errorbar(x, y, xerr=reach, fmt="o-", color=own, capsize=2, lw=1, ms=4, label=label)
+    for number, place in enumerate(zip(x, y, strict=True), 1):
+        above = (-9, 5 if number % 2 else -13)  # or below: near points would cover each other's numbers
+        axes.annotate(str(number), place, above, textcoords="offset points", color=own, fontsize=9)
+    for name, other in others.items():
+        axes.plot([other.p50], [other.value], ms=6, **look(name).marked)
+        place = other.p50, other.value
+        axes.annotate(name, place, (6, -4), textcoords="offset points", color=look(name).colour)
+    logarithmic(axes)
+    worst, best = min(y), max(y)  # far-off others would flatten the front
+    if lower_is_better(figure_name):
+        axes.set_yscale("log")
+        axes.invert_yaxis()
+    else:
+        axes.set_ylim(worst - 0.4 * (best - worst) - 0.5, best + 0.15 * (best - worst) + 0.1)
+        below = [name for name, other in others.items() if other.value < axes.get_ylim()[0]]
+        if below:
+            axes.text(0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, fontsize=8)
+    axes.set(xlabel="one query end to end, median [ms]", ylabel=axis_of(figure_name))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", fontsize=8)
+    axes.set_title(title, fontsize=10)
+    winner = {i: beaten_by(points[i], others, figure_name) for i in on_front}
+    told = [
+        f"{number:2d}  {points[i].p50:7.3g} ms  {value[i]:7.4g}  {points[i].label}"
+        + (f" ({winner[i]} is better)" if winner[i] else "")
+        for number, i in enumerate(on_front, 1)
+    ]
+    legend.axis("off")
+    text = "\n".join(["       median  accuracy  settings", *told])
+    legend.text(0, 1, text, va="top", family="monospace", fontsize=7.5)
+    return figure
+
+
+def others_of(
+    run: Opened, baselines: Sequence[str], peers: Sequence[str], ckpt: str, eval_on: str, cache: Path
+) -> dict[str, tuple[Method, float | None]]:
+    """Baselines and the methods in other checkpoints, with the deciding figure of each."""
+    figure, data = DECIDING[run.data.site.kind], run.data
+    whole = Split("tradeoff", (run.split.folds[0],), "")
+    found: dict[str, tuple[Method, float | None]] = {}
+    for name in baselines:
+        fitted = baseline(name, data, run.split, eval_on, cache)
+        found[name] = (fitted.methods[0], fitted.scores.figures()[figure])
+    for path in peers:
+        method, other = loading.load(path)
+        if trained_on([other], replace(run.split, folds=run.split.folds[:1])) is False:
+            raise ValueError(f"peers: {path} was trained on another split than {ckpt}")
+        names = (method.name, f"{method.name} ({Path(path).parent.name})", path)
+        name = next(name for name in names if name not in found)
+        found[name] = (method, score([method], data, whole, eval_on).figures()[figure])
+    return found
+
+
+def columns_of(
+    points: list[Point], shown: list[int], chosen: list[int], copy_ms: float
+) -> dict[str, list[Any]]:
+    """Columns of `tradeoff.csv`, fastest point first."""
+    order = sorted(range(len(points)), key=lambda i: points[i].p50)
+    rows = [points[i] for i in order]
+    knobs = list(dict.fromkeys(knob for p in points for knob in p.settings))
+    return {
+        "label": [p.label for p in rows],
+        "render_ms_p50": [p.p50 for p in rows],
+        "render_ms_p95": [p.p95 for p in rows],
+        "ratio_to_copy": [p.p50 / copy_ms for p in rows],
+        **{figure: [p.figures[figure] for p in rows] for figure in points[0].figures},
+        "difference_to_full": [p.difference[0] for p in rows],
+        "difference_se": [p.difference[1] for p in rows],
+        "closeness_db": [p.closeness_db for p in rows],
+        "front": [int(i in shown) for i in order],
+        "kept_with_model": [int(i in chosen) for i in order],
+        "threads": [p.threads for p in rows],
+        "num_gaussians": [p.size for p in rows],
+        **{f"set/{knob}": [_cell(p.settings.get(knob)) for p in rows] for knob in knobs},
+    }
+
+
+def _cell(value: Any) -> Any:
+    return "+".join(map(str, value)) if isinstance(value, (list, tuple)) else value
+
+
+def facts_of(
+    points: list[Point], best: list[Point], figure: str, others: dict[str, Other], copy_ms: float
+) -> dict[str, Any]:
+    """`tradeoff/*`, `front/<number>/*`, `baseline/<name>/*` and the full model's time and accuracy."""
+    full = min((p for p in points if not p.settings), key=lambda p: p.p50)
+    useful = [p for p in best if beaten_by(p, others, figure) is None]  # a slope of points that others beat
+    halving = cost_of_halving([p.p50 for p in useful], [score_of(figure, p.value(figure)) for p in useful])
+    facts: dict[str, Any] = {
+        "tradeoff/points": len(points),
+        "tradeoff/front": len(best),
+        "tradeoff/span": best[-1].p50 / best[0].p50,
+        "tradeoff/per_halving": halving,
+        "tradeoff/figure": figure,
+        "tradeoff/front_beaten_by_others": sum(beaten_by(p, others, figure) is not None for p in best),
+        "time/copy_ms": copy_ms,
+        "time/render_ms_p50": full.p50,
+        "time/render_ms_p95": full.p95,
+        f"test/{figure}": full.value(figure),
+    }
+    for number, p in enumerate(best, 1):
+        own = {"render_ms_p50": p.p50, "render_ms_p95": p.p95, "label": p.label, **p.figures}
+        facts |= {f"front/{number}/{name}": value for name, value in own.items()}
+    for name, other in others.items():
+        facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
+    return facts
+
+
+def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows of the table of points."""
+    rows = []
+    for p in best:
+        gap, error = p.difference
+        apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
+        rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
+    return ["point", "ms p50", "ms p95", figure, "difference to full"], rows

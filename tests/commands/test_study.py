@@ -1,0 +1,60 @@
+"""`gsparc study`: each kind leaves its table, figure and summary."""
+
+from __future__ import annotations
+
+import csv
+import json
+from types import SimpleNamespace
+
+import pytest
+from campaigns import compose, spectra
+from hydra.core.hydra_config import HydraConfig
+
+from gsparc.commands.study import study_of, task
+from gsparc.models.terms import EffectSettings
+
+PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
+LINES = {
+    "effects": (["base=plain"], ["none"], "study/plain/psnr_db"),
+    "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train"], "study/mean/query/0.1/psnr_db"),
+    "measurements": (["kind.keep=[1,0.5]", "rounds=1"], ["keep", "keep"], "study/mean/keep/0.5/train_s"),
+}
+
+
+@pytest.mark.parametrize("kind", LINES)
+def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        HydraConfig, "get", lambda: SimpleNamespace(runtime=SimpleNamespace(output_dir=tmp_path))
+    )
+    more, conditions, key = LINES[kind]
+    config = compose(
+        "dataset=own", f"dataset.file='{spectra(tmp_path / 'own.npz')}'", f"kind={kind}", "threads=1",
+        "~variants", f"+variants={{plain: {PLAIN}}}", "baselines=[mean]", "query_s=0.5",
+        "trainer.max_steps=6", "trainer.val_check_interval=3", *more, config="study",
+    )  # fmt: skip
+    rows = task(config)
+    assert [row.what for row in rows] == 2 * conditions
+    facts = json.loads((tmp_path / "summary.json").read_text())
+    assert isinstance(facts[key], float) and facts["dataset/name"] == "own" and facts["seed"] == 0
+    assert all(row.train_s > 0 and row.query_ms > 0 for row in rows)
+    with (tmp_path / "study.csv").open() as file:
+        stored = list(csv.DictReader(file))
+    assert [float(row["value"]) for row in stored] == [row.value for row in rows]
+    assert (tmp_path / "study.png").stat().st_size > 10_000
+
+
+def test_each_kind_has_its_variants_and_baselines():
+    effects, positions, measured = (study_of(compose(f"kind={kind}", config="study")) for kind in LINES)
+    names = [variant.name for variant in effects.variants]
+    assert names[0] == effects.base == "plain" and {"array", "phase", "power", "gp"} <= set(names)
+    assert [v.name for v in positions.variants] == [v.name for v in measured.variants]
+    assert len(positions.conditions) == 13 and len(measured.conditions) == 4 and measured.rounds == 3
+
+
+def test_variants_join_the_models_settings_where_they_are_interpolations():
+    """Both studies of the pages ended after 8 s: `error: visibility: Missing key visibility`."""
+    variants = {v.name: v.make() for v in study_of(compose("kind=effects", config="study")).variants}
+    switches = {name: method.switches for name, method in variants.items() if name != "gp"}
+    assert len(switches) == 9 and all(isinstance(one, EffectSettings) for one in switches.values())
+    assert (switches["plain"].image, switches["plain"].phase) == (True, False)
+    assert (switches["all"].image, switches["plain"].visibility) == ("auto", "auto")

@@ -1,0 +1,128 @@
+"""Which cells there are, in which order, and when a kept one is still the same."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from campaigns import compose
+from omegaconf import OmegaConf
+
+import gsparc.models.peers
+from gsparc.evaluation.experiment.cells import Budget, Contender, code_version, contenders, key, plan
+from gsparc.evaluation.experiment.problem import Problem, split_choices
+
+METHODS = {
+    "gp": Contender("gp", ("model=gp",)),
+    "fast": Contender("fast", ("model=gsrf",), ("model.budget_s={budget_s}",)),
+    "slow": Contender("slow", ("model=nerf2",), ("model.budget_s={budget_s}",), only_longest=True),
+    "waves": Contender("waves", ("model=ngrf",), ("model.budget_s={budget_s}",), ("csi",)),
+}
+BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
+
+
+def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> Problem:
+    return Problem(dataset, split, kind, ("", ""), **others)
+
+
+def names(*only: str, kind: str = "spectrum") -> list[str]:
+    return [str(cell) for _, cell in plan([problem("rfid", kind=kind)], METHODS, BUDGETS, only)]
+
+
+def test_a_whole_table_comes_before_further_seeds_and_budgets():
+    assert names() == [
+        "rfid/random/gp/any/any", "rfid/random/fast/60/0",
+        "rfid/random/fast/300/0", "rfid/random/slow/300/0", "rfid/random/fast/60/1",
+    ]  # fmt: skip
+    assert "rfid/random/waves/60/1" in names(kind="csi")
+
+
+def test_every_room_has_its_first_table_before_any_has_a_second():
+    rooms = [problem("a"), problem("b"), problem("a", "grouped")]
+    budgets = [Budget(60, (0, 1), ("random",)), Budget(12, (0,), ("grouped",))]
+    found = [str(cell) for _, cell in plan(rooms, METHODS, budgets)]
+    assert found == [
+        "a/random/gp/any/any", "b/random/gp/any/any", "a/grouped/gp/any/any",
+        "a/random/fast/60/0", "a/random/slow/60/0", "b/random/fast/60/0", "b/random/slow/60/0",
+        "a/grouped/fast/12/0", "a/random/fast/60/1", "b/random/fast/60/1",
+    ]  # fmt: skip
+
+
+def test_a_draw_of_a_split_is_the_seed_of_every_method():
+    draws = [problem("a", "blocks", draw=n) for n in range(2)]
+    found = [(p.draw, str(cell)) for p, cell in plan(draws, METHODS, [Budget(60, (5, 6))])]
+    assert found == [
+        (0, "a/blocks/gp/any/0"), (1, "a/blocks/gp/any/1"),
+        (0, "a/blocks/fast/60/0"), (0, "a/blocks/slow/60/0"),
+        (1, "a/blocks/fast/60/1"), (1, "a/blocks/slow/60/1"),
+    ]  # fmt: skip
+
+
+def test_all_stations_together_are_learned_where_there_are_several():
+    methods = {"one": Contender("one", ("model=gp",), stations=True)}
+    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", stations=True)], methods, [])]
+    assert found == ["b"]
+
+
+def test_a_ray_tracer_takes_part_where_a_scene_is_known():
+    methods = {"one": Contender("one", ("model=calibrated_raytracer",), scene=True)}
+    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", scene=True)], methods, [])]
+    assert found == ["b"]
+
+
+def test_only_filters_and_a_pattern_of_nothing_is_an_error():
+    assert names("*/gp/*", "*/fast/300/*") == ["rfid/random/gp/any/any", "rfid/random/fast/300/0"]
+    with pytest.raises(ValueError, match="only: 'rfid/rndom/\\*' matches no cell"):
+        names("rfid/rndom/*")
+
+
+def test_budgets_leave_room_for_what_they_do_not_count():
+    contender = Contender("x", ("model=gsparc",), ("model.b={budget_s}",), reserve_s=10)
+    assert contender.overrides(60) == ["model=gsparc", "model.b=50"]
+    assert contender.overrides(None) == ["model=gsparc"]
+
+
+def test_every_method_of_the_default_comparison_composes():
+    config = OmegaConf.to_container(compose(config="compare"), resolve=True)
+    for contender in contenders(config["methods"]).values():
+        assert compose(*contender.overrides(60)).model
+    assert config["ours"] in config["methods"]
+    for split in split_choices(config["splits"]).values():
+        assert set(split.datasets) <= set(config["datasets"])
+        assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
+    with pytest.raises(ValueError, match=r"methods\.x: .*chose"):
+        contenders({"x": {"chose": ["model=gp"]}})
+
+
+MODULE = '''"""{doc}"""
+from gsparc.models.baselines.mean import Mean
+
+
+class Toy(Mean):
+    """{doc}"""
+    VALUE = {value}
+'''
+
+
+def test_words_do_not_make_another_method_and_numbers_do(tmp_path, monkeypatch):
+    monkeypatch.setattr("gsparc.models.peers.__path__", [*gsparc.models.peers.__path__, str(tmp_path)])
+    versions = []
+    for doc, value in (("One.", 1), ("Other words.  # and a comment", 1), ("One.", 2)):
+        (tmp_path / "toy.py").write_text(MODULE.format(doc=doc, value=value))
+        monkeypatch.delitem(sys.modules, "gsparc.models.peers.toy", raising=False)
+        versions.append(code_version({"_target_": "gsparc.models.peers.toy.Toy"}))
+    assert versions[0] == versions[1] != versions[2]
+    assert code_version({"_target_": "gsparc.models.peers.gsrf.GSRF"}) != code_version(
+        {"_target_": "gsparc.models.baselines.mean.Mean"}
+    )
+
+
+def test_a_key_names_data_split_and_settings():
+    model = {"_target_": "gsparc.models.baselines.mean.Mean"}
+    base = key(model, {}, "data", "split")
+    assert base == key(dict(model), {}, "data", "split")
+    others = [
+        key(model, {}, "data2", "split"), key(model, {}, "data", "split2"),
+        key({**model, "x": 1}, {}, "data", "split"), key(model, {"max_steps": 1}, "data", "split"),
+    ]  # fmt: skip
+    assert len({base, *others}) == 5

@@ -1,0 +1,130 @@
+"""Each variant's accuracy, seconds and milliseconds beside the base's, under every condition of the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clocks import WoundClock
+from invented import divide, invent
+
+from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
+from gsparc.evaluation.experiment.study import Measured, Positions, Study, Variant
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.baselines.mean import Mean
+from gsparc.models.baselines.nearest import Nearest
+from gsparc.prediction import timing
+from gsparc.prediction.timing import ClockSettings
+from gsparc.training.context import FitContext, FitReport
+
+CONTEXT = FitContext(Path("not-written"), seed=5, budget_s=7.0)
+CLOCK = ClockSettings(rounds=10, budget_s=2)
+WATCH = WoundClock()
+
+
+class Slow(Nearest):
+    """Answers as the nearest does, after a while; says that it took three times as long to train."""
+
+    effects = "sleep"
+    seconds, query_s = 3.0, 0.004
+
+    def fit(self, data, fold, context):
+        super().fit(data, fold, context)
+        self.context = context
+        return FitReport(self.seconds)
+
+    def predict(self, tx, rx):
+        WATCH.wind(self.query_s)
+        return super().predict(tx, rx)
+
+
+class Quick(Slow):
+    effects = None
+    seconds, query_s = 1.0, 0.001
+
+
+class Impossible(Mean):
+    def fit(self, data, fold, context):
+        raise ValueError("model.effects.array=true is not possible: no array")
+
+
+class NeedsUplink(Quick):
+    def predict(self, tx, rx):
+        raise ValueError("answers snapshots with their uplink")
+
+    def answer(self, batch):
+        return Quick.predict(self, batch.tx, batch.rx)
+
+
+def variants(**makers):
+    return [Variant(name, make) for name, make in makers.items()]
+
+
+def test_times_are_ratios_to_the_base(monkeypatch):
+    monkeypatch.setattr(timing.time, "perf_counter", WATCH)
+    made = variants(plain=Quick, slow=Slow, impossible=Impossible, needs=NeedsUplink)
+    rows = Study(made, base="plain", rounds=2, clock=CLOCK).run(invent("csi"), divide(48), CONTEXT)
+    found = {row.variant: row for row in rows}
+    assert list(found) == ["plain", "slow", "needs"]
+    assert found["plain"].query_ratio == found["plain"].train_ratio == 1
+    assert found["slow"].train_ratio == pytest.approx(3) and found["slow"].query_ms >= 4
+    assert 3 < found["slow"].query_ratio < 4 and found["slow"].effects == "sleep"  # 4.1 ms to 1.1
+    assert found["slow"].value == found["needs"].value == pytest.approx(found["plain"].value)
+    assert found["plain"].spread == 0 and found["plain"].rows == 36
+    facts = found["slow"].facts()
+    assert facts["study/slow/train_s"] == 3 and {"study/slow/nmse", "study/slow/query_ms"} <= set(facts)
+
+
+def test_the_base_must_be_there():
+    with pytest.raises(ValueError, match="no such variant; there are mean"):
+        Study(variants(mean=Mean), base="plain")
+    for base in ("plain", None):
+        with pytest.raises(ValueError, match="not possible"):
+            Study(variants(plain=Impossible), base=base).run(invent("csi"), divide(48), CONTEXT)
+
+
+def test_every_fit_gets_the_context_and_every_round_another_seed():
+    found = []
+
+    def make():
+        found.append(Quick())
+        return found[-1]
+
+    Study(variants(quick=make), rounds=2, seed=3, clock=CLOCK).run(invent(), divide(48, 2), CONTEXT)
+    assert [m.context.seed for m in found] == [3, 3, 4, 4] and {m.context.budget_s for m in found} == {7.0}
+    assert len({m.context.run_dir for m in found}) == 4
+
+
+def test_errors_cost_an_interpolator_and_not_the_mean():
+    data, split = invent(), divide(48)
+    conditions = Positions([0.001, 0.3]).conditions()
+    rows = Study(variants(gp=GaussianProcess, mean=Mean), conditions, clock=CLOCK).run(data, split, CONTEXT)
+    value = {(r.variant, r.what, r.amount): r.value for r in rows}
+    assert len(value) == 10
+    for what in ("query", "train"):
+        assert value["gp", what, 0.3] < value["gp", "none", 0.0] - 1
+        assert abs(value["mean", what, 0.3] - value["mean", "none", 0.0]) < 1e-6
+    clean, asked = (next(r for r in rows if r.what == what) for what in ("none", "query"))
+    assert (clean.train_s, clean.query_ms) == (asked.train_s, asked.query_ms)  # trained and timed once
+
+
+def test_more_measurements_are_better_and_are_counted():
+    conditions = Measured([1, 0.5, 9]).conditions()
+    rows = Study(variants(gp=GaussianProcess), conditions, clock=CLOCK).run(invent(), divide(48), CONTEXT)
+    assert [row.rows for row in rows] == [36, 18, 9]
+    values = [row.value for row in rows]
+    assert values == sorted(values, reverse=True) and values[0] > values[-1] + 1
+    assert "study/gp/keep/0.5/psnr_db" in rows[1].facts()
+    with pytest.raises(ValueError, match="keep="):
+        Measured([0.0])
+
+
+def test_folds_are_pooled_and_each_fit_is_handed_on():
+    data, split = invent("csi"), divide(48, 3)
+    kept = []
+    found = fit_and_score(Nearest, data, split, in_folders(CONTEXT), keep=lambda *given: kept.append(given))
+    assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3
+    assert found.figures["samples"] == 48 and found.score_s > 0
+    unscored = fit_and_score(Nearest, data, split, in_folders(CONTEXT), eval_on=None)
+    assert unscored.figures == {} and np.isfinite(unscored.train_cpu_s).all()
