@@ -12,7 +12,7 @@ from gsparc.processes.features import correlation, farthest, with_places
 
 
 @torch.no_grad()
-def tell_with_fewer(model: GaussianModel, share: float) -> None:
+def distil_features(model: GaussianModel, share: float) -> None:
     """Keep the `share` of the places behind the emission's features that lie farthest apart.
 
     The emissions of the whole field at all its places, with their noise, are what the fewer features are

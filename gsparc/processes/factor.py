@@ -18,7 +18,7 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-from gsparc.processes.worker import ask
+from gsparc.processes.worker import raise_if_cancelled
 
 # Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
 # covariance is at most its trace; entries that are sums are rounded several times.
@@ -61,7 +61,7 @@ class Factor:
         Raises:
             NotPositiveDefiniteError: it has no factor, nor with the largest ridge.
         """
-        ask()
+        raise_if_cancelled()
         lower, failed = _factored(covariance)
         if not failed or failing == "ignore":
             return cls(lower)

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 _asked = threading.local()
 
 
-class Ended(BaseException):
+class Cancelled(BaseException):
     """Raised in a thread whose work is no longer wanted."""
 
 
@@ -24,16 +24,16 @@ def _within(name: str, said: Callable[[], bool]) -> Iterator[None]:
         setattr(_asked, name, before)
 
 
-def ended_by(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Within, `ask` raises `Ended` in this thread as soon as `unwanted`, or who surrounds it, says so."""
+def cancelled_by(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Within, `raise_if_cancelled` does so as soon as `unwanted`, or who surrounds it, says so."""
     return _within("unwanted", unwanted)
 
 
-def ask() -> None:
-    """Raise `Ended` if this thread's work is unwanted; called wherever a tenth of a second has gone by."""
+def raise_if_cancelled() -> None:
+    """Raise `Cancelled` if this thread's work is unwanted; called every tenth of a second."""
     unwanted = getattr(_asked, "unwanted", None)
     if unwanted is not None and unwanted():
-        raise Ended
+        raise Cancelled
 
 
 def late_when(over: Callable[[], bool]) -> AbstractContextManager[None]:

@@ -77,7 +77,7 @@ def total_steps(context: FitContext) -> int:
     return steps
 
 
-class BringHome(L.Callback):
+class ReturnMetrics(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
@@ -186,7 +186,7 @@ def run_stage(
         options["strategy"] = processes
     trainer = make(
         max_epochs=-1,
-        callbacks=[*callbacks, BringHome(), stop],
+        callbacks=[*callbacks, ReturnMetrics(), stop],
         logger=list(context.loggers) or False,
         plugins=[checkpoints],
         default_root_dir=folder,

@@ -32,7 +32,7 @@ LEAST_RATIO = 1e-6  # of a mean square error, where PSNR ends
 
 
 @dataclass(frozen=True)
-class Way:
+class OperatingPoint:
     """One way of answering.
 
     Attributes:
@@ -84,7 +84,7 @@ class Viewed:
     """
 
     name: str
-    ways: tuple[Way, ...]
+    ways: tuple[OperatingPoint, ...]
     data: Measurements | None
     test: np.ndarray
     stations: tuple[str | None, ...]
@@ -218,13 +218,15 @@ def open_viewed(
             whole, sure = lean, Trusted()
         predictor = Predictor(lean, site, whole, point, sure, None, stored.extra)
         ways.append(
-            Way(point.label, predictor, point.threads, (point.figure[1], point.p50_ms), point.figure[0])
+            OperatingPoint(
+                point.label, predictor, point.threads, (point.figure[1], point.p50_ms), point.figure[0]
+            )
         )
     complete = [(point.figure[1], point.p50_ms) for point in points if not point.settings]
     figure = points[0].figure[0] if points else ""
     known = min(complete, key=lambda one: one[1]) if complete else None
     trained = Predictor(method, site, trusted=trusted, extra=stored.extra)
-    ways.append(Way("as trained", trained, None, known, figure))
+    ways.append(OperatingPoint("as trained", trained, None, known, figure))
     return Viewed(
         str(path), tuple(ways), data, test, _stations(ways[-1].predictor, station), tuple(notes),
         unit or site.level_unit,

@@ -22,7 +22,7 @@ from gsparc.maps import map_of
 from gsparc.maps.pictures import layers
 from gsparc.models.reduced import reduced
 from gsparc.view.site_view import SiteView, grid_for
-from gsparc.view.viewed import Way, open_viewed
+from gsparc.view.viewed import OperatingPoint, open_viewed
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -30,7 +30,7 @@ import msgspec  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from gsparc.view.newest import Newest  # noqa: E402
+from gsparc.view.latest_job import LatestJobQueue  # noqa: E402
 from gsparc.view.server.page import page  # noqa: E402
 from gsparc.view.server.serve import Server  # noqa: E402
 from gsparc.view.server.session import CLOUD, Session  # noqa: E402
@@ -39,7 +39,7 @@ from gsparc.view.server.session import CLOUD, Session  # noqa: E402
 @pytest.fixture
 def visit():
     """`visit(view)`: a session of a client on a server that nobody else visits."""
-    server, work = viser.ViserServer(host="127.0.0.1", port=0, verbose=False), Newest()
+    server, work = viser.ViserServer(host="127.0.0.1", port=0, verbose=False), LatestJobQueue()
 
     def come(view, number=0):
         client = SimpleNamespace(
@@ -167,7 +167,7 @@ def test_operating_points_are_steps_with_their_accuracy_and_live_milliseconds(vi
     trained = spectrum_view.viewed.ways[-1]
     coarse = gsparc.load(spectrum_view.viewed.name)
     coarse.method = reduced(coarse.method, {"stride": 2}, {})
-    ways = Way("stride 2", coarse, 1, (20.0, 0.5), "psnr_db"), replace(trained, swept=(25.0, 2.0))
+    ways = OperatingPoint("stride 2", coarse, 1, (20.0, 0.5), "psnr_db"), replace(trained, swept=(25.0, 2.0))
     session = visit(SiteView(replace(spectrum_view.viewed, ways=ways)))
     settle(session)
     assert re.search(r"as trained.*\*\*[\d.]+ ms\*\*", session.speed.content)

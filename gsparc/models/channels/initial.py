@@ -40,7 +40,7 @@ from gsparc.models.channels.settings import ChannelSettings
 from gsparc.models.haste import factor_s
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
-from gsparc.processes.worker import Ended, ended_by
+from gsparc.processes.worker import Cancelled, cancelled_by
 from gsparc.training.time_budget import TimeBudget
 
 COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on at most
@@ -218,9 +218,9 @@ class _Search:
         reserve = WEIGHTS * len(self.every) * factor_s(longest)  # for the weights in the end
         end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
         try:
-            with ended_by(partial(budget.over, end)):
+            with cancelled_by(partial(budget.over, end)):
                 self._grow(kept, notes, budget)
-        except Ended:
+        except Cancelled:
             notes.append("waves: the seconds ended the search for terms")
         return kept[-1], notes
 

@@ -20,7 +20,7 @@ from gsparc.models.image_sources.gp_likelihood import steering
 from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.worker import ask
+from gsparc.processes.worker import raise_if_cancelled
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
 CANDIDATES, EXACT, POLISHED = 150_000, 1_500, 40  # points drawn in the box, scored exactly, moved by ascent
@@ -68,7 +68,7 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
     parts = [(torch.nonzero(element == e).flatten(), image) for e, image in enumerate(images)]
     scores = []
     for start in range(0, candidates.shape[-2], BLOCK):
-        ask()
+        raise_if_cancelled()
         count = len(parts[0][1][start : start + BLOCK])
         real, imag = torch.zeros(2, count, alpha.shape[1])
         power = torch.zeros(count)
@@ -120,7 +120,7 @@ def ascend(values: list[Tensor], scores: Callable[..., Tensor], rates: list[floa
     leaves = [value.clone().requires_grad_() for value in values]
     optimizer = torch.optim.Adam(leaves, betas=(0.8, 0.95))
     for rate in rates:
-        ask()
+        raise_if_cancelled()
         optimizer.param_groups[0]["lr"] = rate
         optimizer.zero_grad()
         (-scores(*leaves).log().sum()).backward()

@@ -17,7 +17,7 @@ from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.processes.worker import Ended, ended_by
+from gsparc.processes.worker import Cancelled, cancelled_by
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -88,9 +88,9 @@ def search_many(
         if unwanted() or (number > 0 and budget.over(LAST_START)):
             return None
         try:
-            with ended_by(unwanted):
+            with cancelled_by(unwanted):
                 member = made(number)
-        except Ended:
+        except Cancelled:
             return None
         scene = member.phased.scene
         log.info(

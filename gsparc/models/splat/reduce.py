@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.field import edit
-from gsparc.field.fewer_features import tell_with_fewer
+from gsparc.field.fewer_features import distil_features
 from gsparc.field.frozen import FrozenArray, frozen_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.field.response import ArrayResponse
@@ -92,7 +92,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
     model.settings = replace(model.settings, raster=raster)
     by_places = through_array(model) and model.tells_unknown
     if "keep" in settings and by_places:
-        tell_with_fewer(model, float(settings["keep"]))
+        distil_features(model, float(settings["keep"]))
     elif "keep" in settings:
         share, total = float(settings["keep"]), len(model.gaussians)
         if _linear(model):

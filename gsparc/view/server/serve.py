@@ -11,7 +11,7 @@ import torch
 import viser
 
 from gsparc.data.errors import DataError
-from gsparc.view.newest import Newest
+from gsparc.view.latest_job import LatestJobQueue
 from gsparc.view.server.session import Session
 from gsparc.view.site_view import SiteView
 
@@ -31,7 +31,7 @@ class Server:
     """
 
     def __init__(self, view: SiteView, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.view, self.work = view, Newest()
+        self.view, self.work = view, LatestJobQueue()
         self.sessions: dict[int, Session] = {}
         self._lock, self._threads = threading.Lock(), torch.get_num_threads()
         self._gone: set[int] = set()  # clients that left before their session was there

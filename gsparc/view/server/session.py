@@ -26,7 +26,7 @@ from gsparc.view.building import (
     cloud_of,
     rays_of,
 )
-from gsparc.view.newest import Newest
+from gsparc.view.latest_job import LatestJobQueue
 from gsparc.view.panel import response_db, spectrum_image, tones_mhz
 from gsparc.view.plane import Plane, beyond_distance, lifted, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
@@ -51,7 +51,7 @@ LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
 
 
 class Session:
-    """Everything of one client; callbacks only note what is wanted, `Newest` does it in its own thread.
+    """Everything of one client; callbacks only note what is wanted, a `LatestJobQueue` does it.
 
     Args:
         client: of viser.
@@ -59,7 +59,7 @@ class Session:
         work: does what is asked.
     """
 
-    def __init__(self, client: Any, view: SiteView, work: Newest, threads: int) -> None:
+    def __init__(self, client: Any, view: SiteView, work: LatestJobQueue, threads: int) -> None:
         self.client, self.view, self.work, self.threads = client, view, work, threads
         self.site = view.viewed.site
         self.station = self.chosen_station = view.viewed.stations[0]

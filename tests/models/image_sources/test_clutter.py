@@ -24,7 +24,7 @@ from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import all_sequences
-from gsparc.processes.worker import Ended, ended_by
+from gsparc.processes.worker import Cancelled, cancelled_by
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
@@ -247,7 +247,7 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         spent.append(time.thread_time())
         return spent[-1] > spent[0] + 0.5
 
-    with ended_by(unwanted), pytest.raises(Ended):
+    with cancelled_by(unwanted), pytest.raises(Cancelled):
         find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 4 * _room(), 3)
     assert max(np.diff([*spent, time.thread_time()])) < 0.5
     room, cells = 20 * _room(), []
@@ -275,7 +275,7 @@ def test_clutter_found_before_the_clock_is_kept_and_an_unwanted_search_ends():
     late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
     found = find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
     assert isinstance(found, PhasedScene) and len(looks) < 60
-    with ended_by(lambda: True), pytest.raises(Ended):
+    with cancelled_by(lambda: True), pytest.raises(Cancelled):
         find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
 
 

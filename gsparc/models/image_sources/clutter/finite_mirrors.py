@@ -21,7 +21,7 @@ from gsparc.models.image_sources.clutter.unfold import Paths
 from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import Reflections, reflect
 from gsparc.physics.waves import LIGHT, NEAR_M, wave
-from gsparc.processes.worker import ask
+from gsparc.processes.worker import raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
@@ -118,7 +118,7 @@ def find_mirrors(
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
     and before each wall) are collected in a raster of where it is met; integral images give every rectangle.
     Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
-    `MOST_CELLS` are larger. Whether to go on is asked (`ask`) after each size of rectangle.
+    `MOST_CELLS` are larger. Whether to go on is asked (`raise_if_cancelled`) after each size of rectangle.
 
     Args:
         rows: n.
@@ -191,7 +191,7 @@ def _raster(
     low, cells = (room @ along.T).amin(0), _cells(room, along, cell)
     tables = []
     for arriving, met in _sources(rows, transmitter, candidates, known):
-        ask()
+        raise_if_cancelled()
         at = ((met @ along.T - low) / cell).floor().long()
         inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
         index = (at[..., 0] * cells[1] + at[..., 1]).clamp(0, cells[0] * cells[1] - 1)
@@ -205,7 +205,7 @@ def _raster(
     # a few cells, or all there are: a wall that was missed
     sizes = [sorted({*range(1, min(MAX_SPAN, count) + 1), count}) for count in cells]
     for wide, high_by in product(*sizes):
-        ask()
+        raise_if_cancelled()
         if high_by == sizes[1][0]:
             strips = [s[..., wide:, :] - s[..., :-wide, :] for s in sums]
         real, imag, energy, count = (s[..., high_by:] - s[..., :-high_by] for s in strips)

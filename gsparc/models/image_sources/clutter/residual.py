@@ -18,7 +18,7 @@ from gsparc.models.image_sources.gp_likelihood import JITTER
 from gsparc.models.image_sources.phased_gp import PhasedGains, PhasedScene, shares, stacked
 from gsparc.models.image_sources.rows import Rows
 from gsparc.processes.factor import Factor
-from gsparc.processes.worker import ask
+from gsparc.processes.worker import raise_if_cancelled
 
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
@@ -153,7 +153,7 @@ class CandidateScorer:
         """Nats (m,) of adding waves (n, K), each times its `share` (b, K, n) under b of m candidates."""
         scores = []
         for part in candidates.split(BLOCK):
-            ask()
+            raise_if_cancelled()
             each = share(part)
             change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
             scores.append(self.score(torch.complex(*change)))
@@ -188,7 +188,7 @@ def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
 
     Entries of C^T C are rows over noise, 1e7 where there is hardly any: float32 would round the I away.
     """
-    ask()
+    raise_if_cancelled()
     exact = columns.double()
     return exact.T @ exact + torch.eye(columns.shape[1], dtype=torch.float64), exact.T @ white.double()
 

@@ -30,7 +30,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import Ended, ask, ended_by
+from gsparc.processes.worker import Cancelled, cancelled_by, raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
@@ -151,7 +151,7 @@ class _ClutterSearcher:
         start = self.nll
         best = self.whole = start, self.phased
         try:
-            with ended_by(late):  # within a step, too
+            with cancelled_by(late):  # within a step, too
                 for epoch in range(EPOCHS):
                     before = self.nll
                     self._improve(SOFT_EDGES[min(epoch, len(SOFT_EDGES) - 1)])
@@ -164,8 +164,8 @@ class _ClutterSearcher:
                     )  # fmt: skip
                     if self.nll > before - PROGRESS:
                         break
-        except Ended:
-            ask()  # by the clock alone: what was found so far is the result
+        except Cancelled:
+            raise_if_cancelled()  # by the clock alone: what was found so far is the result
             best = min(best, self.whole, key=lambda b: b[0])
         return best[1]
 

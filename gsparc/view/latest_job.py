@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 Job = Callable[[], Iterator[object]]
 
 
-class Newest:
+class LatestJobQueue:
     """Runs jobs one step at a time; a job of a key replaces the one before, also in the midst of it.
 
     A job is a function that returns an iterator: after each `yield` another job may have its turn. Those that

@@ -7,12 +7,12 @@ import time
 
 import pytest
 
-from gsparc.view.newest import Newest
+from gsparc.view.latest_job import LatestJobQueue
 
 
 @pytest.fixture
 def work():
-    running = Newest()
+    running = LatestJobQueue()
     yield running
     running.close()
 
