@@ -217,11 +217,8 @@ def open_viewed(
         if point.settings.get("confidence") is False:
             whole, sure = lean, Trusted()
         predictor = Predictor(lean, site, whole, point, sure, None, stored.extra)
-        ways.append(
-            OperatingPoint(
-                point.label, predictor, point.threads, (point.figure[1], point.p50_ms), point.figure[0]
-            )
-        )
+        spent = point.figure[1], point.p50_ms
+        ways.append(OperatingPoint(point.label, predictor, point.threads, spent, point.figure[0]))
     complete = [(point.figure[1], point.p50_ms) for point in points if not point.settings]
     figure = points[0].figure[0] if points else ""
     known = min(complete, key=lambda one: one[1]) if complete else None
