@@ -161,7 +161,8 @@ def _alone(*parts: Tensor) -> bool:
     grows = torch.is_grad_enabled() and any(part.requires_grad for part in parts)
     fits = all(part.dim() == 2 and part.device.type == "cpu" for part in parts)
     fits = fits and parts[0].dtype not in (torch.float16, torch.bfloat16)
-    return fits and not grows and (len(parts[0]) <= ALONE or torch.get_num_threads() == 1)
+    few = len(parts[0]) <= ALONE or torch.get_num_threads() == 1
+    return fits and not grows and few and len(parts[0]) > 0  # LAPACK prints a complaint of none
 
 
 def _one_thread(matrix: Tensor) -> AbstractContextManager[object]:

@@ -35,7 +35,7 @@ def test_a_typo_gets_the_nearest_name():
 def test_a_config_becomes_a_method():
     method = build({"_target_": "gsparc.models.baselines.gp.GaussianProcess", "components": 7})
     assert isinstance(method, GaussianProcess) and method.limit == 7
-    with pytest.raises(ValueError, match=r"not a gsparc\.methods\.method\.Method"):
+    with pytest.raises(ValueError, match=r"not a gsparc\.models\.method\.Method"):
         build({"_target_": "pathlib.Path"})
     with pytest.raises(ValueError, match="_target_"):
         build({"components": 7})

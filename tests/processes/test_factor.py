@@ -79,3 +79,12 @@ def test_rows_left_out_are_predictions_of_the_rest(kind, grouped):
         torch.testing.assert_close(variance[own], (given[own][:, own] - known).diagonal().real)
         torch.testing.assert_close(missed[own], values[own] - signal[own][:, rest] @ weights)
     assert (spread is None) == grouped
+
+
+def test_a_factor_of_nothing_says_nothing(capfd):
+    """LAPACK printed a complaint for each of hundreds of empty factors."""
+    none = torch.zeros(0, 0, dtype=torch.float64)
+    factor = Factor.of(none)
+    assert factor.whitened(torch.zeros(0, 3).double()).shape == (0, 3)
+    assert factor.solved(torch.zeros(0, 3).double()).shape == (0, 3)
+    assert "".join(capfd.readouterr()) == ""
