@@ -29,7 +29,7 @@ ARROWS = {
     "field": "data ops physics processes",
     "training": "data field ops processes",
     "models": "data field ops physics processes simulate training",
-    "prediction": "data models ops processes",
+    "prediction": "data models ops processes training",
     "evaluation": "conf data models prediction simulate training",
     "maps": "data evaluation models prediction processes training",
     "view": "data evaluation maps models ops prediction",

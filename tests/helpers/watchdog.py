@@ -40,9 +40,9 @@ class Looks:
 
 @contextmanager
 def watched() -> Iterator[Looks]:
-    """Watch the block: budgets read, `ask` in worker threads, signals in this, which must be the main one."""
+    """Watch the block: budgets read, workers that ask whether to end, signals in this, the main thread."""
     looks = Looks()
-    counted, ask = TimeBudget.counted.fget, worker.ask
+    counted, ask = TimeBudget.counted.fget, worker.raise_if_cancelled
 
     def reads(budget: TimeBudget):
         looks.look("clock")
@@ -53,13 +53,13 @@ def watched() -> Iterator[Looks]:
             looks.look("interrupt")
         ask()
 
-    modules = [m for m in list(sys.modules.values()) if getattr(m, "ask", None) is ask]
+    modules = [m for m in list(sys.modules.values()) if getattr(m, "raise_if_cancelled", None) is ask]
     before = signal.signal(signal.SIGALRM, lambda signum, frame: looks.look("interrupt", frame))
     signal.setitimer(signal.ITIMER_REAL, OFTEN_S, OFTEN_S)
     try:
         with mock.patch.object(TimeBudget, "counted", property(reads)):
             for module in modules:
-                module.ask = asks
+                module.raise_if_cancelled = asks
             looks.look("clock")
             yield looks
             looks.look("clock")
@@ -67,4 +67,4 @@ def watched() -> Iterator[Looks]:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
         for module in modules:
-            module.ask = ask
+            module.raise_if_cancelled = ask

@@ -288,9 +288,9 @@ def test_an_interrupt_ends_all_searches_and_names_the_checkpoint(tmp_path, monke
     assert SearchCache(None, tmp_path / "last.ckpt").spent.wall > 0
 
 
-def test_a_worker_ends_when_asked():
-    worker.ask()
-    with worker.ended_by(lambda: True), pytest.raises(worker.Ended):
+def test_a_cancelled_worker_ends():
+    worker.raise_if_cancelled()
+    with worker.cancelled_by(lambda: True), pytest.raises(worker.Cancelled):
         Factor.of(torch.eye(2))
     Factor.of(torch.eye(2))
 
