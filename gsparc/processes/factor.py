@@ -1,13 +1,13 @@
 """Cholesky factors of covariances, and all that is solved with them.
 
-A single matrix without gradients goes to LAPACK (OpenBLAS) in place, which takes half the time of torch and a
-quarter for inverses of factors; batches, gradients and matrices worth several threads go to torch.
+A single matrix without gradients is factored, and solved with for many columns, by LAPACK in place, which takes
+.4 to .9 of torch's time from some hundred rows on. Few rows, single columns, inverses, batches, gradients and
+matrices worth several threads go to torch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -25,7 +25,7 @@ from gsparc.processes.worker import raise_if_cancelled
 ROUNDING = torch.finfo(torch.float32).eps
 RIDGES = (0.01, 0.1, 1.0, 16.0)  # of that bound, tried in turn
 ALONE = 2_000  # rows up to which one thread is as good as several
-SMALL = 100  # rows below which OpenBLAS takes one thread by itself
+FEW = 128  # rows below which torch is as quick
 # Two threads of OpenBLAS beside other work took 10 to 400 times as long as one.
 BLAS = ThreadpoolController().select(user_api="blas")
 
@@ -87,7 +87,7 @@ class Factor:
         """`L^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
             return as_pairs(self.whitened, values)
-        if not _alone(self.lower, values):
+        if values.shape[-1] == 1 or not _alone(self.lower, values):
             return torch.linalg.solve_triangular(self.lower, values, upper=False)
         return self._triangular(values.to(self.lower.dtype), adjoint=False)
 
@@ -95,20 +95,16 @@ class Factor:
         """`K^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
             return as_pairs(self.solved, values)
-        if not _alone(self.lower, values):
+        if values.shape[-1] == 1 or not _alone(self.lower, values):
             return torch.cholesky_solve(values, self.lower)
         return self._triangular(self.whitened(values), adjoint=True)
 
     def _triangular(self, values: Tensor, adjoint: bool) -> Tensor:
-        """`L^-1 V`, or `L^-H V`; a single column takes a fifth of the time by itself."""
-        upper, right = _array(self.lower).T, _array(values)
-        if right.shape[1] == 1:
-            trtrs, one = get_lapack_funcs("trtrs", (upper,)), right.conj() if adjoint else right
-            found = trtrs(upper, one, lower=0, trans=0 if adjoint else 1)[0]
-            return torch.from_numpy(found.conj() if adjoint else found)
-        trsm, rows = get_blas_funcs("trsm", (upper,)), np.ascontiguousarray(right).T
-        with _one_thread(self.lower):
-            return torch.from_numpy(trsm(1.0, upper, rows, side=1, lower=0, trans_a=2 if adjoint else 0).T)
+        """`L^-1 V`, or `L^-H V`."""
+        upper, right = _array(self.lower).T, np.ascontiguousarray(_array(values))
+        trsm = get_blas_funcs("trsm", (upper,))
+        with BLAS.limit(limits=1):
+            return torch.from_numpy(trsm(1.0, upper, right.T, side=1, lower=0, trans_a=2 if adjoint else 0).T)
 
     def bordered(self, cross: Tensor, own: Tensor) -> Factor:
         """Of the covariance with more rows: `cross` (n, m) with these, and `own` (m, m)."""
@@ -124,18 +120,13 @@ class Factor:
             eye = torch.eye(self.lower.shape[-1], dtype=self.lower.dtype, device=self.lower.device)
             return torch.linalg.solve_triangular(self.lower, eye, upper=False)
         upper = _array(self.lower).T
-        with _one_thread(self.lower):
+        with BLAS.limit(limits=1):
             return torch.from_numpy(get_lapack_funcs("trtri", (upper,))(upper, lower=0)[0].T)
 
     @cached_property
     def inverse(self) -> Tensor:
         """`K^-1` (..., n, n)."""
-        if not _alone(self.lower):
-            return torch.cholesky_inverse(self.lower)
-        upper = _array(self.lower).T
-        with _one_thread(self.lower):
-            found = torch.from_numpy(get_lapack_funcs("potri", (upper,))(upper, lower=0)[0].T)
-        return found.tril_().add_(found.tril(-1).mH)
+        return torch.cholesky_inverse(self.lower)
 
     @cached_property
     def precision(self) -> Tensor:
@@ -161,13 +152,8 @@ def _alone(*parts: Tensor) -> bool:
     grows = torch.is_grad_enabled() and any(part.requires_grad for part in parts)
     fits = all(part.dim() == 2 and part.device.type == "cpu" for part in parts)
     fits = fits and parts[0].dtype not in (torch.float16, torch.bfloat16)
-    few = len(parts[0]) <= ALONE or torch.get_num_threads() == 1
-    return fits and not grows and few and len(parts[0]) > 0  # LAPACK prints a complaint of none
-
-
-def _one_thread(matrix: Tensor) -> AbstractContextManager[object]:
-    """Within, OpenBLAS works on a matrix with one thread."""
-    return nullcontext() if len(matrix) < SMALL else BLAS.limit(limits=1)
+    many = len(parts[0]) > ALONE and torch.get_num_threads() > 1
+    return fits and not grows and not many and len(parts[0]) >= FEW
 
 
 def _array(values: Tensor) -> np.ndarray:
@@ -181,6 +167,6 @@ def _factored(covariance: Tensor) -> tuple[Tensor, bool]:
         return lower, bool(info.any())
     transposed = _array(covariance).T  # in LAPACK's order of columns as it lies, its conjugate
     potrf = get_lapack_funcs("potrf", (transposed,))
-    with _one_thread(covariance):
+    with BLAS.limit(limits=1):
         upper, info = potrf(np.array(transposed, order="F"), lower=0, clean=1, overwrite_a=1)
     return torch.from_numpy(upper.T), bool(info)
