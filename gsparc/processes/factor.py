@@ -1,7 +1,7 @@
 """Cholesky factors of covariances, and all that is solved with them.
 
-A single matrix without gradients is factored, and solved with for many columns, by LAPACK in place, which takes
-.4 to .9 of torch's time from some hundred rows on. Few rows, single columns, inverses, batches, gradients and
+LAPACK in place factors a single matrix without gradients, and solves for many columns, in .4 to .9 of torch's
+time from some hundred rows on. Few rows, single columns, inverses, batches, gradients and
 matrices worth several threads go to torch.
 """
 
