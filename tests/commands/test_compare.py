@@ -26,7 +26,7 @@ from gsparc.evaluation.experiment.problem import (
 )
 from gsparc.models.checkpoint import CheckpointError
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 
 
 def compare(tmp_path, *more: str) -> subprocess.CompletedProcess:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from releases import REAL
 
 import gsparc
 from gsparc.data.own import from_arrays
@@ -110,7 +111,7 @@ def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
 
 
 def test_real_city(tmp_path):
-    file = Path(__file__).parents[2] / ".." / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
+    file = REAL / "real" / "powder-rss-462mhz.npz"
     if not file.is_file():
         pytest.skip(f"{file.name} is not here")
     with np.load(file) as stored:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from campaigns import channels, powers, spectra
+from releases import REAL
 
 from gsparc.commands.check import main as check
 from gsparc.data.checks.outliers import outliers, too_far, too_strong
@@ -145,7 +144,7 @@ def test_a_robot_that_waits_makes_no_outliers():
 
 def test_passing_a_station_is_no_outlier():
     """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
-    file = Path(__file__).parents[3] / ".." / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
+    file = REAL / "real" / "powder-rss-462mhz.npz"
     if not file.is_file():
         pytest.skip(f"{file.name} is not here")
     with np.load(file) as stored:

@@ -1,9 +1,9 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from releases import REAL
 from rooms import nmse, shoebox
 
 from gsparc.data.own import from_arrays
@@ -18,7 +18,7 @@ from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.training.context import FitContext
 
-CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"
+CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
 
 
 def _dense():

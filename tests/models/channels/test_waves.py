@@ -1,11 +1,11 @@
 """The closed-form field of complex channels."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from releases import REAL
 from rooms import WAVELENGTH, nmse, shoebox
 
 from gsparc.data.own import from_arrays
@@ -352,7 +352,7 @@ def test_what_it_cannot_do():
         field(torch.zeros(1, 3), Pose(torch.zeros(3), torch.eye(3)))
 
 
-CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"
+CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
 
 
 @pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")

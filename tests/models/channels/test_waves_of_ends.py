@@ -1,11 +1,11 @@
 """Channels of several static ends in one field."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from releases import REAL
 from rooms import WAVELENGTH, nmse
 
 from gsparc.data.own import from_arrays
@@ -200,7 +200,7 @@ def test_methods_of_one_end_are_refused_as_before():
         )
 
 
-CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"
+CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
 
 
 @pytest.mark.slow

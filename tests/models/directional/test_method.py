@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from releases import REAL
 from rooms import directed
 from scenes import error
 
@@ -21,7 +22,7 @@ from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityG
 from gsparc.processes.kernel import matern32_of_squares
 from gsparc.training.context import FitContext
 
-REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
+ROOM = REAL / "newrf-conference.npz"
 
 
 @pytest.fixture(scope="module")
@@ -233,9 +234,9 @@ def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
 
 def test_the_conference_room_from_43_receivers():
     """A search finds nothing there: NMSE 1.1; a network along the rays leaves 0.17."""
-    if not REAL.exists():
-        pytest.skip(f"real data not found at {REAL}")
-    data = load_newrf(REAL)
+    if not ROOM.exists():
+        pytest.skip(f"real data not found at {ROOM}")
+    data = load_newrf(ROOM)
     fold = make_split(data.moving, SplitSettings(name="sparse")).folds[0]
     method = DirectionalGP()
     method.fit(data, fold, FitContext(Path()))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from releases import REAL
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
@@ -16,7 +15,7 @@ from gsparc.models.powers.waves import basis_of, decibels_of, fit_waves
 from gsparc.ops import Pose
 
 LIGHT, WAVELENGTH = 299_792_458.0, 0.3
-PLANE = Path(__file__).parents[4] / "shared" / "data" / "real" / "techtile-power-reci-rf-1.npz"
+PLANE = REAL / "real" / "techtile-power-reci-rf-1.npz"
 
 
 def plane(count: int, seed: int = 0) -> Measurements:

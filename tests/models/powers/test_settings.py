@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from releases import REAL
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
@@ -21,7 +21,7 @@ from gsparc.models.reduced import reduced
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 
-CITY = Path(__file__).parents[3] / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
+CITY = REAL / "real" / "powder-rss-462mhz.npz"
 
 
 def town(count: int, exponent: float = 3.0, shadowing_db: float = 4.0, seed: int = 0) -> Measurements:
