@@ -140,7 +140,7 @@ class PerStation(Method):
                 share = max(even, LEAST_SHARE * whole / len(numbers))
             resume = None if left is None else left / folder
             own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
-            name = self._name_of(number)
+            name = "all stations" if numbers == [UNHEARD] else self._name_of(number)
             if self.wrapped.takes_budget and len(numbers) > 1:
                 log.info(
                     "station %d of %d: %s%s", turn + 1, len(numbers), name, _rest(turn, len(numbers), budget)
@@ -196,7 +196,7 @@ class PerStation(Method):
         assert self.site is not None and self.site.stations is not None
         if number != UNHEARD:
             return self.site.stations.name[number]
-        return "all stations" if self._shared or not self._copies else "stations never heard"
+        return "stations never heard"
 
     def _part(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
         """Rows of the copy of a station, and the measurements as it sees them."""

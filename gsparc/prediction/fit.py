@@ -53,7 +53,7 @@ def fit(
         budget_s: seconds of training; None: the model's own.
         seed: of whatever is random.
         save: a checkpoint to write, for `gsparc.load` and all commands.
-        settings: of the model, by their names in `conf/model/NAME.yaml`.
+        settings: arguments of the model's class.
         **arrays: anything else of the schema of `docs/own-data.md`: `carrier_hz`, `frequency_hz`,
             `array_position`, `station_position`, ...
 

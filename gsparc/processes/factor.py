@@ -87,14 +87,16 @@ class Factor:
         """`L^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
             return as_pairs(self.whitened, values)
+        values = values.to(self.lower.dtype)
         if values.shape[-1] == 1 or not _alone(self.lower, values):
             return torch.linalg.solve_triangular(self.lower, values, upper=False)
-        return self._triangular(values.to(self.lower.dtype), adjoint=False)
+        return self._triangular(values, adjoint=False)
 
     def solved(self, values: Tensor) -> Tensor:
         """`K^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
             return as_pairs(self.solved, values)
+        values = values.to(self.lower.dtype)
         if values.shape[-1] == 1 or not _alone(self.lower, values):
             return torch.cholesky_solve(values, self.lower)
         return self._triangular(self.whitened(values), adjoint=True)

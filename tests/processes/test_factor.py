@@ -88,3 +88,13 @@ def test_a_factor_of_nothing_says_nothing(capfd):
     assert factor.whitened(torch.zeros(0, 3).double()).shape == (0, 3)
     assert factor.solved(torch.zeros(0, 3).double()).shape == (0, 3)
     assert "".join(capfd.readouterr()) == ""
+
+
+@pytest.mark.parametrize("rows", [20, 200])
+@pytest.mark.parametrize("columns", [1, 3])
+def test_values_of_another_precision_are_taken_as_the_factors(rows, columns):
+    """Single columns and few rows go to torch, which refuses what LAPACK converted."""
+    gram = covariance(torch.float64, rows)
+    values = torch.randn(rows, columns)
+    found = Factor.of(gram).solved(values)
+    torch.testing.assert_close(gram @ found, values.double())
