@@ -32,7 +32,7 @@ class Call(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("twice", "threads", "device", "built_for", "driver")),
-        ("sizes", ctypes.c_int32 * 8),
+        ("sizes", ctypes.c_int32 * 12),
         ("settings", _Settings),
         ("numbers", ctypes.c_double * 8),
         ("tensors", ctypes.c_uint64 * 32),

@@ -22,7 +22,7 @@ ROOMS += ["evaluation", "maps", "view", "commands", "callbacks", "conf"]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
-    "processes": "",
+    "processes": "ops",
     "physics": "ops",
     "data": "conf ops processes",
     "simulate": "data ops physics",

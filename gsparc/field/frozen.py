@@ -13,10 +13,9 @@ from gsparc.field import edit
 from gsparc.field.encoding import unknown_share
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.response import ArrayResponse
-from gsparc.ops import FrozenPlan, Pose, StalePlan
+from gsparc.ops import FrozenPlan, Pose, StalePlan, queries
 from gsparc.physics.bartlett import SpectrumRenderer
-
-IN_CACHE = 4  # spectra rendered at a time: they stay in the CPU cache
+from gsparc.processes.features import parts_of
 
 
 @dataclass(frozen=True)
@@ -75,21 +74,20 @@ class FrozenArray:
             emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
             unknown = model.unknown(tx, rx)
             return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)
-        moving = model.site.moving(tx, rx)
+        moving, encoding = model.site.moving(tx, rx), model.emission.encoding
+        if model.tells_unknown and queries.served(moving, self.weights):
+            mean, unknown = queries.array_spectrum(
+                moving, (encoding.anchors, encoding.whitening), (self.weights, self.offset),
+                self.renderer.tables, self.renderer.square, parts_of(encoding.length, encoding.kernel),
+            )  # fmt: skip
+            return Rendered(mean, None, unknown)
+        encoded = encoding(moving)
+        parts = torch.addmm(self.offset, encoded, self.weights).view(len(encoded), -1, 2)
         if not model.tells_unknown:
-            encoded = model.emission.encoding(moving)
-            parts = torch.addmm(self.offset, encoded, self.weights).view(len(encoded), -1, 2)
             return Rendered(response.spectra(torch.view_as_complex(parts)[:, :-1]), None)
-        mean, unknown = tx.new_empty(len(tx), *self.renderer.square.shape), tx.new_empty(len(tx))
-        with torch.inference_mode():  # the results are ordinary tensors, made before
-            encoded = model.emission.encoding(moving)
-            parts = torch.addmm(self.offset, encoded, self.weights)
-            torch.sqrt(unknown.copy_(unknown_share(encoded)), out=parts[:, -2])
-            vectors = torch.view_as_complex(parts.view(len(tx), -1, 2))
-            for start in range(0, len(tx), IN_CACHE):
-                part = slice(start, start + IN_CACHE)
-                self.renderer.draw(vectors[part], mean[part])
-        return Rendered(mean, None, unknown)
+        unknown = unknown_share(encoded)
+        parts[:, -1, 0] = unknown.sqrt()
+        return Rendered(self.renderer(torch.view_as_complex(parts)).clamp(max=1), None, unknown)
 
 
 @torch.no_grad()

@@ -56,16 +56,11 @@ class SpectrumRenderer(nn.Module):
         share = vectors[:, -1].real.square()[:, None, None]
         return (square + share * self.square).clamp_min(TINY).sqrt()
 
-    def draw(self, vectors: Tensor, out: Tensor) -> None:
-        """The same, cut off at 1, written to `out` (B, H, W) in as few passes over it as there can be."""
-        parts, half = self._parts(vectors), out.shape[2] // 2
-        if self.half_turn:
-            torch.add(*parts, out=out[:, :, :half])
-            torch.sub(*parts, out=out[:, :, half:])
-        else:
-            out.copy_(parts[0])
-        share = vectors[:, -1].real.square()[:, None, None]
-        out.addcmul_(share, self.square).clamp_(TINY, 1).sqrt_()
+    @property
+    def tables(self) -> list[Tensor]:
+        """Those of the constructor, as `gsparc.ops.queries.array_spectrum` takes them."""
+        names = [f"{name}{number}" for number in range(len(self.spans)) for name in ("table", "waves")]
+        return [self.pairs, *(getattr(self, name) for name in names)]
 
     def _parts(self, vectors: Tensor) -> list[Tensor]:
         """The coherent square (B, H, W), or what of it stays and what flips half a turn on (B, H, W / 2)."""

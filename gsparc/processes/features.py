@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import apart, matern32, smooth_rough
+from gsparc.processes.kernel import ROUGH_RATIO, ROUGH_SHARE, apart, matern32, smooth_rough
 
 Correlation = Literal["matern32", "smooth_rough"]
 
@@ -35,6 +35,13 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
     if name != "smooth_rough":
         raise ValueError(f"correlation {name!r} is none of {', '.join(get_args(Correlation))}")
     return smooth_rough(apart(a, b), length)
+
+
+def parts_of(length: float, name: Correlation) -> tuple[float, float, float, float]:
+    """Share and length [m] of its Matern-5/2, share and length of its Matern-3/2."""
+    if name == "matern32":
+        return 0.0, length, 1.0, length
+    return 1 - ROUGH_SHARE, length, ROUGH_SHARE, ROUGH_RATIO * length
 
 
 @dataclass(frozen=True)

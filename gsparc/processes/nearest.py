@@ -11,6 +11,7 @@ density of rows given their nearest ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
+from gsparc.ops.queries import nearest_weights, served
+from gsparc.processes.answer import Answer, Posterior
 from gsparc.processes.covering import covering
 from gsparc.processes.density import walked
-from gsparc.processes.factor import Factor
+from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, WaveKernel, apart, bounds_of, matern_sum, unpacked
 from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood
-from gsparc.processes.posterior import Answer, Posterior
 from gsparc.processes.prior import Prior
 
 COVER = 20_000  # rows that weigh the mean law
@@ -140,18 +142,30 @@ class Nearest(Posterior):
         return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
 
     def _answer(self, queries: Tensor, without: np.ndarray | None) -> Answer:
-        row = self.near.nearest(queries.detach().numpy(), without, self.most)
-        near, index = torch.from_numpy(self.near.places[row]), torch.from_numpy(row)
-        weights, known = weights_of(self.prior.kernel, queries, near, self.noise[index])
-        mean = torch.einsum("bk,bkp->bp", weights.to(self.rest.dtype), self.rest[index])
+        index = torch.from_numpy(self.near.nearest(queries.detach().numpy(), without, self.most))
+        weights, known = self._weights(queries, index)
+        mean = torch.bmm(weights[:, None].to(self.rest.dtype), self.rest[index])[:, 0]
         left = 1 + self.prior.kernel.noise - known
         if self.prior.trend is not None:
-            own = self.prior.columns(queries)
-            about = self.prior.columns(near.flatten(0, 1)).view(*near.shape[:2], -1)
-            unsure = own - torch.einsum("bk,bkp->bp", weights, about)
+            unsure = self.prior.columns(queries) - torch.bmm(weights[:, None], self._columns[index])[:, 0]
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
             left = left + ((unsure @ self.spread) * unsure).sum(1)
         return Answer(mean, left.clamp_min(0.0))
+
+    def _weights(self, queries: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Of rows (B, k), see `weights_of`."""
+        kernel = self.prior.kernel
+        if isinstance(kernel, Kernel) and served(queries):
+            noise = self.noise + JITTER
+            found = nearest_weights(queries, self.places, noise, index, kernel.lengths, kernel.shares)
+            if found is None:
+                raise NotPositiveDefiniteError("a covariance of near rows is not positive definite")
+            return found
+        return weights_of(kernel, queries, self.places[index], self.noise[index])
+
+    @cached_property
+    def _columns(self) -> Tensor:
+        return self.prior.columns(self.places)
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""

@@ -6,70 +6,23 @@ kernel's amplitude.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsparc.processes.answer import Answer, Posterior
 from gsparc.processes.conditioned import weighted
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.left_out import left_out
+from gsparc.processes.nearest import Nearest
+from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.prior import Prior
 
-
-@dataclass(frozen=True)
-class Answer:
-    """What is said of B places.
-
-    Attributes:
-        mean: (B, P) float64 or complex128.
-        left: (B,) variance of a measurement.
-    """
-
-    mean: Tensor
-    left: Tensor
-
-
-class Posterior(ABC):
-    """What rows say; see `Exact` and `gsparc.processes.nearest.Nearest`."""
-
-    approximation: ClassVar[str | None] = None  # how, where it is not exact
-    prior: Prior
-
-    @property
-    @abstractmethod
-    def places(self) -> Tensor:
-        """Of the rows (n, D) float64 [m]."""
-
-    @abstractmethod
-    def answer(self, queries: Tensor) -> Answer:
-        """Of places (B, D) float64 [m]."""
-
-    @abstractmethod
-    def mean_at(self, queries: Tensor) -> Tensor:
-        """The mean alone (B, P), with autograd for places (B, D) float64 [m]."""
-
-    @abstractmethod
-    def left_out(self) -> tuple[Tensor, Tensor]:
-        """Mean (n, P) and variance of a measurement (n,) at each row's place without its own."""
-
-    @abstractmethod
-    def distance(self, queries: Tensor) -> Tensor:
-        """From places (B, D) to the nearest row (B,) [m]."""
-
-    @abstractmethod
-    def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `read` needs."""
-
-    @cached_property
-    def extent(self) -> float:
-        """Diagonal of the rows' places [m]."""
-        size = self.places.amax(0) - self.places.amin(0)
-        return float(torch.linalg.vector_norm(size))
+MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many of the nearest
 
 
 @dataclass(frozen=True)
@@ -133,8 +86,21 @@ class Exact(Posterior):
         """See `Posterior`."""
         own = self.prior.columns(queries)
         cross, prior = self._cross(queries, own), self.prior.variance(own)
+        if self._near is not None:
+            return Answer(self._mean(queries, cross), self._near.answer(queries).left.minimum(prior))
         known = self.factor.whitened(cross.T).square().sum(0)
         return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
+
+    @cached_property
+    def _near(self) -> Nearest | None:
+        """What states the variance of many rows: exactly it costs their number squared for each place."""
+        if len(self.rows) <= MANY or not isinstance(self.prior.kernel, Kernel):
+            return None
+        terms = self.factor.whitened(self._columns)
+        spread = torch.eye(terms.shape[1], dtype=terms.dtype) - terms.T @ terms
+        none, noise = self.rows.new_zeros(len(self.rows), 1), self.prior.kernel.noise + self.extra
+        near = Neighbourhood.of(self.rows.numpy(), 0)
+        return Nearest(self.prior, near, none, noise, none[: len(spread)], spread, NEAR)
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""

@@ -6,6 +6,7 @@
 #include "frozen.h"
 #include "networks.h"
 #include "project.h"
+#include "query.h"
 #include "similarity.h"
 #include "machine_limits.h"
 

@@ -72,7 +72,7 @@ template <class S> struct Model {
 struct Call {
     int32_t twice, threads, device;
     int32_t built_for, driver;  // CUDA versions
-    int32_t sizes[8];
+    int32_t sizes[12];
     KernelSettings<double> settings;
     double numbers[8];
     uint64_t tensors[32];

@@ -8,12 +8,13 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
+from gsparc.processes import posterior
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import Kernel, WaveKernel
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
-from gsparc.processes.trend import Trend
+from gsparc.processes.trend import Law, Trend
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -87,3 +88,21 @@ def test_more_rows_and_fewer_are_a_fit_to_those(kernel):
             torch.testing.assert_close(one.answer(queries).mean, expected.answer(queries).mean)
             torch.testing.assert_close(one.answer(queries).left, expected.answer(queries).left)
             torch.testing.assert_close(one.left_out()[0], expected.left_out()[0])
+
+
+@pytest.mark.parametrize("trend", [Trend(-70.0), Trend(0.0, Law(-40.0, 3.0, 0.1, 5.0, (0.5, 0.5, 3.0)))])
+def test_variance_of_many_rows_is_of_the_nearest(trend, monkeypatch):
+    """Within 2 % at places among the rows and far from all; means are the exact ones."""
+    rng = np.random.default_rng(0)
+    places = torch.from_numpy(np.c_[rng.uniform(0, 10, (1_500, 2)), np.zeros(1_500)])
+    kernel = Kernel((0.4, 3.0), (0.4, 0.6), 0.05, 20.0)
+    values = -60 + 3 * torch.sin(places[:, :1]) + torch.from_numpy(rng.normal(size=(1_500, 1)))
+    many = Exact.of(Prior(kernel, trend), places, values)
+    inside = torch.from_numpy(np.c_[rng.uniform(0, 10, (200, 2)), np.zeros(200)])
+    queries = torch.cat([inside, inside + torch.tensor([300.0, 0.0, 0.0])])
+    near = many.answer(queries)
+    monkeypatch.setattr(posterior, "MANY", 10_000)
+    exact = Exact.of(Prior(kernel, trend), places, values).answer(queries)
+    assert torch.equal(near.mean, exact.mean)
+    assert float((near.left / exact.left - 1)[:200].abs().max()) < 0.02
+    assert float((near.left / exact.left - 1)[200:].abs().max()) < 0.02

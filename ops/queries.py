@@ -1,0 +1,82 @@
+"""Single places answered in one call: an array's spectrum, and weights of the nearest rows of a process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsparc.ops import built, calls
+from gsparc.ops.operators import contiguous
+from gsparc.ops.transforms import beyond_kernels
+
+
+def served(*tensors: Tensor) -> bool:
+    """Whether the kernels answer: CPU tensors that neither autograd nor `torch.func` follows."""
+    plain = all(part.device.type == "cpu" for part in tensors) and not beyond_kernels(*tensors)
+    follows = torch.is_grad_enabled() and any(part.requires_grad for part in tensors)
+    return plain and not follows and built.kernels() is not None
+
+
+def array_spectrum(
+    places: Tensor,
+    features: tuple[Tensor, Tensor],
+    read_out: tuple[Tensor, Tensor],
+    tables: Sequence[Tensor],
+    square: Tensor,
+    numbers: tuple[float, float, float, float],
+) -> tuple[Tensor, Tensor]:
+    """Spectra (B, H, W) in [0, 1] of an array, and unknown shares (B,), of places (B, D) [m]; all float32.
+
+    Args:
+        places: where the moving end is.
+        features: anchors (E, D) [m], and whitening (E, F) of their correlations.
+        read_out: features to real and imaginary parts of array vectors, and an unused pair: (F, 2 M + 2),
+            and what is added to them (2 M + 2,).
+        tables: pairs of elements to lag numbers (2 M M, L); for pixels that stay half a turn on, lag numbers
+            to harmonics of each row (l, H K) and these to pixels (K, columns); the same for those that flip,
+            or nothing.
+        square: (H, W) of the background that an unknown share shows.
+        numbers: share and length [m] of a Matern-5/2, share and length of a Matern-3/2.
+    """
+    pairs, *rest = tables
+    sizes = [(len(table), len(waves)) for table, waves in zip(rest[::2], rest[1::2], strict=True)]
+    sizes += [(0, 0)] * (2 - len(sizes))
+    height, columns = square.shape[0], rest[1].shape[1]
+    image, unknown = places.new_empty(len(places), *square.shape), places.new_empty(len(places))
+    absent = (None,) * (4 - len(rest))
+    inputs = contiguous((places, *features, *read_out, pairs, *rest))
+    calls.run(
+        "array_spectrum", places, *inputs, *absent, square, image, unknown, numbers=numbers,
+        sizes=(*places.shape, *features[1].shape, read_out[1].numel() // 2 - 1, height, columns,
+               *sizes[0], *sizes[1]),
+    )  # fmt: skip
+    return image, unknown
+
+
+def nearest_weights(
+    queries: Tensor,
+    places: Tensor,
+    noise: Tensor,
+    rows: Tensor,
+    lengths: Sequence[float],
+    shares: Sequence[float],
+) -> tuple[Tensor, Tensor] | None:
+    """Weights (B, k) of near rows in the mean of a process, and what they take off its variance of 1 (B,).
+
+    None where a covariance has no Cholesky factor.
+
+    Args:
+        queries, places: (B, D) and (n, D) float64 [m].
+        noise: (n,) float64, variance of each row's value.
+        rows: (B, k) int64, the near ones.
+        lengths, shares: of one or two Matern-3/2 [m].
+    """
+    weights, known = queries.new_empty(rows.shape), queries.new_empty(len(queries))
+    two = [*shares, 0.0][:2] + [*lengths, 1.0][:2]
+    inputs = contiguous((queries, places, noise, rows))
+    sizes = (*queries.shape, rows.shape[1])
+    numbers = (*two, float(len(lengths)))
+    failed = calls.run("nearest_weights", queries, *inputs, weights, known, sizes=sizes, numbers=numbers)
+    return None if failed >= 0 else (weights, known)

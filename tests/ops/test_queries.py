@@ -1,0 +1,69 @@
+"""Single places answered by the kernels are what plain PyTorch answers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsparc.data.datasets.rfid import planar_array
+from gsparc.ops import SphereGrid
+from gsparc.ops.queries import array_spectrum, nearest_weights, served
+from gsparc.physics.bartlett import SpectrumRenderer
+from gsparc.processes.features import correlation, parts_of
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import JITTER, weights_of
+
+
+@pytest.mark.parametrize("grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)])
+@pytest.mark.parametrize("height", [0.0, 0.07])
+@pytest.mark.parametrize("name", ["smooth_rough", "matern32"])
+def test_spectra_of_an_array(grid, height, name):
+    """With and without the half-turn shortcut, of one place and of several, at a trained place and afar."""
+    torch.manual_seed(0)
+    array = planar_array()
+    array[3, 2] = height
+    renderer = SpectrumRenderer(array, grid, 0.3, torch.rand(grid.height, grid.width))
+    anchors, whitening = torch.rand(37, 3), torch.randn(37, 21) / 40
+    weights, offset = torch.randn(21, 34) / 30, torch.randn(34) / 300
+    weights[:, -2:], offset[-2:] = 0, 0
+    places = torch.cat([torch.rand(4, 3), anchors[:1], torch.full((1, 3), 1e4)])
+    features = correlation(places, anchors, 0.4, name) @ whitening
+    parts = torch.addmm(offset, features, weights).view(len(places), -1, 2)
+    share = (1 - features.square().sum(1)).clamp(0, 1)
+    parts[:, -1, 0] = share.sqrt()
+    expected = renderer(torch.view_as_complex(parts)).clamp(max=1)
+    for rows in (slice(None), slice(2, 3)):
+        image, unknown = array_spectrum(
+            places[rows], (anchors, whitening), (weights, offset), renderer.tables, renderer.square,
+            parts_of(0.4, name),
+        )  # fmt: skip
+        torch.testing.assert_close(image, expected[rows], atol=2e-5, rtol=1e-4)
+        torch.testing.assert_close(unknown, share[rows], atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("near", [1, 5, 64])
+@pytest.mark.parametrize("kernel", [Kernel((0.3,), (1.0,), 0.1), Kernel((0.05, 2.0), (0.3, 0.7), 0.01)])
+def test_weights_of_the_nearest_rows(near, kernel):
+    torch.manual_seed(1)
+    places, queries = torch.rand(200, 3, dtype=torch.float64), torch.rand(7, 3, dtype=torch.float64)
+    queries[0] = places[3]
+    noise = kernel.noise * (1 + torch.rand(200, dtype=torch.float64))
+    rows = torch.cdist(queries, places).topk(near, largest=False).indices
+    expected = weights_of(kernel, queries, places[rows], noise[rows])
+    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.lengths, kernel.shares)
+    assert found is not None
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-10, rtol=1e-9)
+
+
+def test_rows_without_a_factor_are_said():
+    places = torch.zeros(3, 3, dtype=torch.float64)
+    noise, rows = torch.full((3,), -0.5, dtype=torch.float64), torch.tensor([[0, 1, 2]])
+    assert nearest_weights(places[:1], places, noise, rows, (1.0,), (1.0,)) is None
+
+
+def test_followed_tensors_are_left_to_autograd():
+    assert served(torch.ones(2))
+    assert not served(torch.ones(2, requires_grad=True))
+    with torch.no_grad():
+        assert served(torch.ones(2, requires_grad=True))
