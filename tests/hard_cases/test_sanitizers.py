@@ -93,6 +93,7 @@ def test_nothing_is_found(module, isa):
     files = [f"tests/hard_cases/test_{case}.py" for case in CASES]
     files += ["tests/ops/test_kernels.py", "tests/ops/test_face.py", "tests/ops/test_channels.py"]
     files += ["tests/ops/test_networks.py", "tests/ops/test_similarity.py", "tests/ops/test_at_once.py"]
+    files += ["tests/ops/test_queries.py"]
     done = watched(module, isa, *files, "-m", "not slow", "-k", "not reference and not shim and not forked")
     if done.returncode == 99:
         pytest.skip(f"this machine has no {isa}")
