@@ -13,20 +13,19 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
+from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.censored import heard
 from gsparc.models.channels import field as channels
 from gsparc.models.channels import initial as waves
 from gsparc.models.channels.settings import ChannelSettings
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.haste import factor_s
-from gsparc.models.image_sources import source_field
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.known.mirrors import counted
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.source_field import RayField, SourceField
-from gsparc.models.mixture import process_field
+from gsparc.models.method_field import ProcessField
 from gsparc.models.mixture.mixture import Mixture, residuals
-from gsparc.models.moving_array import bearing_field
 from gsparc.models.moving_array.bearing_field import BearingField
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
@@ -137,6 +136,15 @@ def bearings(
     return BearingField(method, heard(data, rows)), report
 
 
+def process(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """The plain process on whole targets; `init` and `clutter` mean nothing to it."""
+    method = GaussianProcess()
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    return ProcessField(method), report
+
+
 def _searching(data: Measurements, context: FitContext) -> FitContext:
     """The seconds of a search: without those for `_completed`."""
     share = 1.0 if context.budget_s is None or data.target[0].size > 1 else 1 - COMPLETION_SHARE
@@ -179,18 +187,17 @@ INITIALISERS: dict[str, Callable[..., tuple[ConditionalField, FitReport]]] = {
     "powers": powers,
     "joint_powers": joint_powers,
     "bearings": bearings,
-    "process": process_field.initialise,
+    "process": process,
 }
 # `(site, state) -> field` by the kind that a state names.
 RESTORED: dict[str, Callable[[Site, dict[str, Any]], ConditionalField]] = {
-    "sources": source_field.restored_sources,
-    "scene": source_field.restored_sources,
-    "rays": source_field.restored_rays,
+    "sources": SourceField.restored,
+    "rays": RayField.restored,
     "diffuse": channels.restored,
     "powers": power_field.restored,
     "joint_powers": joint_field.restored,
-    "bearings": bearing_field.restored,
-    "process": process_field.restored,
+    "bearings": BearingField.restored,
+    "process": ProcessField.restored,
 }
 
 
