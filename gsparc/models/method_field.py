@@ -42,7 +42,6 @@ class MethodField(ConditionalField):
         """Of nothing that could be learned: `ValueError`."""
         raise ValueError(f"{self.kind}: it has nothing that gradient steps move")
 
-    @torch.no_grad()
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`."""
         self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())

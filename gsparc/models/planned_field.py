@@ -31,7 +31,7 @@ from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.mixture import process_average, solutions
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.mixture.process_average import Summed, averaged, mean_alone
+from gsparc.models.mixture.process_average import Blended, averaged, mean_alone
 from gsparc.models.mixture.weights import comparable
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import contributions, knobs, reduced
@@ -419,7 +419,9 @@ class PlannedField(LearnedField):
         if method is None or self._several:
             return self
         found = reduced(method, settings, measured)
-        return Summed(found, self.field) if isinstance(self.field, Mixture) else found
+        whole = self.field
+        more = isinstance(whole, Mixture) and whole.residual is not None
+        return Blended(found, whole.residual, whole.share) if more else found  # type: ignore[union-attr, arg-type]
 
     # -- storing -----------------------------------------------------------------------------------
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,10 +18,9 @@ from gsparc.models.coarse_grid import Filled
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import weights as solution_weights
-from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.pareto import Settings
-from gsparc.models.reduced import View
+from gsparc.models.reduced import View, reduced
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 
@@ -52,30 +53,24 @@ def weigh(
     process = GaussianProcess()
     process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
     if not field.size() or (left is None and len(fold.val) < LEAST_HELD):
-        why = (
-            f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
-            if field.size()
-            else "no Gaussians"
-        )
-        log.info("%s: a Gaussian process alone", why)
+        few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
+        log.info("%s: a Gaussian process alone", few if field.size() else "no Gaussians")
         return (process, 1.0), None
-    held, explained = [], None
+    rows, explained, weight = [], None, 0.0
     val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
     if len(val):
         batch = data.batch(val)
-        target = comparable(batch.target, data.site)
-        own, plain = (
-            comparable(found.mean, data.site)
-            for found in (field.predict(batch.tx, batch.rx), process.predict(batch.tx, batch.rx))
-        )
-        held.append((own, plain, target))
+        means = (method.predict(batch.tx, batch.rx).mean for method in (field, process))
+        own, plain, target = (comparable(values, data.site) for values in (*means, batch.target))
         explained = solution_weights.explained(own, target, data.site.kind != "csi")
+        if spectra:
+            rows.append(Rows(*(part.detach().double().flatten(1).numpy() for part in (own, plain, target))))
+        else:
+            weight = solution_weights.weights([own, plain], target, np.arange(len(val)))[1]
+    if left is not None:
+        rows.append(_left_out(left, distance))
     if spectra:
-        rows = [Rows(*(_flat(values) for values in triple)) for triple in held]
-        rows += [] if left is None else [_left_out(left, distance)]
         weight = solution_weights.share_of_second(rows)
-    else:
-        weight = solution_weights.weights(list(held[0][:2]), held[0][2], np.arange(len(val)))[1]
     log.info(
         "held out, %d rows and %d of training without their neighbours: a Gaussian process weighs %.2f",
         len(val), 0 if left is None else len(left.centres), weight,
@@ -83,30 +78,33 @@ def weigh(
     return ((process, weight) if weight > 0 else None), explained
 
 
-class Averaged(View):
-    """The field's answer with a mean that lies between its own and the process's.
+class Blended(View):
+    """A field's answer with a mean that another one's has a part in.
 
     Args:
         inner: answers for the field; its confidence and variance stay.
-        process: fitted, of the same targets.
-        weight: of the process, in [0, 1].
+        other: what has the other mean, at tx (B, 3) [m] and receiver poses.
+        weight: of the other mean.
+        own: of the field's.
     """
 
-    def __init__(self, inner: Method, process: Method, weight: float) -> None:
+    def __init__(
+        self, inner: Method, other: Callable[[Tensor, Pose], Any], weight: float, own: float = 1.0
+    ) -> None:
         super().__init__(inner)
-        self.process, self.weight = process, weight
+        self.other, self.weight, self.own = other, weight, own
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
         found = self.inner.predict(tx, rx)
-        return replace(found, mean=torch.lerp(found.mean, self.process.predict(tx, rx).mean, self.weight))
+        mean = self.own * found.mean + self.weight * self.other(tx, rx).mean
+        return replace(found, mean=mean)
 
 
 def mean_alone(process: Method, settings: Settings | None = None) -> Method:
     """The process without its variance, which costs most of its answer and which the field has of its own."""
-    spared = {"confidence": False, **(settings or {})}
-    return process.reduced(spared, {}) if isinstance(process, GaussianProcess) else process
+    return reduced(process, {"confidence": False, **(settings or {})}, {})
 
 
 def averaged(own: Method, process: Method, weight: float) -> Method:
@@ -119,31 +117,10 @@ def averaged(own: Method, process: Method, weight: float) -> Method:
         process: fitted.
         weight: of the process.
     """
-    if not isinstance(own, Filled):
-        return Averaged(own, mean_alone(process), weight)
-    lean = mean_alone(process, {"stride": own.stride})
-    if isinstance(lean, Filled):
-        return Filled(Averaged(own.inner, lean.inner, weight), own.grid, own.stride)
-    return Averaged(own, lean, weight)
-
-
-class Summed(View):
-    """A reduced field with the residual of the whole one."""
-
-    def __init__(self, inner: Method, whole: Mixture) -> None:
-        super().__init__(inner)
-        self.whole = whole
-
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`."""
-        found = self.inner.predict(tx, rx)
-        if self.whole.residual is None:
-            return found
-        return replace(found, mean=found.mean + self.whole.share * self.whole.residual(tx, rx).mean)
-
-
-def _flat(values: Tensor) -> np.ndarray:
-    return values.detach().double().flatten(1).numpy()
+    lean = mean_alone(process, {"stride": own.stride} if isinstance(own, Filled) else None)
+    if isinstance(own, Filled) and isinstance(lean, Filled):
+        return Filled(Blended(own.inner, lean.inner.predict, weight, 1 - weight), own.grid, own.stride)
+    return Blended(own, lean.predict, weight, 1 - weight)
 
 
 def _left_out(left: LeftOut, distance: float | None) -> Rows:
