@@ -28,13 +28,12 @@ from gsparc.models.fields import INITIALISERS, restored, stored
 from gsparc.models.haste import factor_s
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
-from gsparc.models.mixture import process_average, solutions
+from gsparc.models.mixture import solutions
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.mixture.process_average import Blended, averaged, mean_alone
 from gsparc.models.mixture.weights import comparable
 from gsparc.models.pareto import Settings
-from gsparc.models.reduced import contributions, knobs, reduced
+from gsparc.models.reduced import Blended, averaged, contributions, knobs, mean_alone, reduced
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
@@ -162,7 +161,7 @@ class PlannedField(LearnedField):
         self._reserve_s = 0.0
         if self.plan is not None and self.plan.plain:
             watch = TimeBudget()
-            self._average, explained = process_average.weigh(self, data, fold, self._left_out, self._apart)
+            self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
             self.explained = self.explained if explained is None else explained
             self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
 

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import POSITIVE, Checked, setting, switch, whole
 from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
 from gsparc.models.channels.columns import Group, ends_of, gather, run_factors_of, thinned
@@ -35,8 +36,7 @@ from gsparc.models.channels.evidence import (
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.kernels import cells, directions, plain
 from gsparc.models.channels.mirrors import find_mirrors
-from gsparc.models.channels.offset import best_offset
-from gsparc.models.channels.settings import ChannelSettings
+from gsparc.models.channels.probe import best_offset
 from gsparc.models.haste import factor_s
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
@@ -63,6 +63,35 @@ WEIGHTS = 2.0  # factors of all rows that the weights in the end take
 LENGTHS_SHARE = 0.5  # of the seconds, after which no further length is tried
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
+
+
+@dataclass(frozen=True)
+class ChannelSettings(Checked):
+    """Terms that are tried beside the isotropic diffuse field, and what they are learned on.
+
+    Attributes:
+        constant: what does not depend on the place (leakage).
+        direct: the wave of the static end, with a fixed gain and one that varies over places.
+        directions: unequal powers of the diffuse field's directions.
+        correlated: noise that is correlated over the order of rows.
+        angles: directions of the diffuse field, of a half sphere where all places are in one plane.
+        rows: measurements that powers are learned on at most.
+        tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
+        narrow: concentration of each of these.
+        knots: in that angle.
+        mirrors: planes that several static ends share, at most; 0 for none.
+    """
+
+    constant: bool = setting(True, switch())
+    direct: bool = setting(True, switch())
+    directions: bool = setting(True, switch())
+    correlated: bool = setting(True, switch())
+    angles: int = setting(24, whole(4, 200))
+    rows: int = setting(400, whole(8))
+    tied: int = setting(64, whole(4, 500))
+    narrow: float = setting(16.0, POSITIVE)
+    knots: int = setting(9, whole(2, 100))
+    mirrors: int = setting(8, whole(0, 32))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Interpolator
-from gsparc.models.censored import heard
 from gsparc.models.method import Prediction
 from gsparc.models.moving_array import reduce
 from gsparc.models.moving_array.checks import MAX_UNEXPLAINED, site_problem, unexplained_energy
@@ -29,7 +28,7 @@ from gsparc.models.moving_array.power_gp import Trend, TrendSettings, fit_trend
 from gsparc.models.moving_array.query import Array, Query
 from gsparc.models.moving_array.residual import Residual, fit_residual, left_out_error
 from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, powers
-from gsparc.models.target_rows import to_real, training_targets
+from gsparc.models.target_rows import heard, to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.lags import BLOCK, Lags
 from gsparc.physics.separable import Separable, separable

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gsparc.models.coarse_grid import Filled
 from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.query import Query
 from gsparc.models.pareto import Settings
-from gsparc.models.reduced import View
+from gsparc.models.reduced import Filled, View
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:

@@ -18,17 +18,21 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.models.baselines.distance_law import law_of
-from gsparc.models.censored import silent
 from gsparc.models.haste import haste
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.likelihood import Covariance, left_out_losses
 from gsparc.models.powers.settings import choose_about, choose_prior
-from gsparc.models.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
+from gsparc.models.target_rows import (
+    TINY_POWER,
+    entry_variance,
+    from_real,
+    rows_of,
+)
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import PowerProcess, Rows, conditioned, trend_of_rows
+from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.trend import Trend, trend_of
 from gsparc.processes.wall_count import Walls
 from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
@@ -213,12 +217,6 @@ class PowerField(ConditionalField):
 
     def _power(self, decibels: Tensor) -> Tensor:
         return from_real(decibels[:, None].float(), "rssi", (1,))
-
-
-def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
-    """Powers of rows (n,) in decibels, levels where nothing was heard."""
-    decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
-    return Rows(data.moving[rows], decibels, silent(data, rows))
 
 
 def initialise(
