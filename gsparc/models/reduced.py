@@ -109,8 +109,8 @@ class MeanOnly(View):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the mean alone."""
         inner = self.inner
-        alone = isinstance(inner, Differentiable)
-        return Prediction(inner.mean_at(tx, rx) if alone else inner.predict(tx, rx).mean)
+        mean = inner.mean_at(tx, rx) if isinstance(inner, Differentiable) else inner.predict(tx, rx).mean
+        return Prediction(mean)
 
 
 def coarser(grid: SphereGrid, stride: int) -> SphereGrid:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import count, pairwise
 from typing import Any, ClassVar
@@ -111,7 +111,7 @@ class TrainedPeer(Method):
 
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     kinds: ClassVar[tuple[Kind, ...]]
-    makes: ClassVar[Callable[[Scene, Any], Network]]  # from a scene and these settings
+    makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
     budget_s: float | None = None
@@ -132,7 +132,8 @@ class TrainedPeer(Method):
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """The untrained network of a scene; `found` is what was computed before training."""
-        return self.makes(scene, self)
+        network: Network = self.makes(scene, self)
+        return network
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Tensors computed from the training rows (n,) before training; stored with the weights."""
