@@ -383,13 +383,7 @@ class _Search:
 
     def _with_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
-        group = max(self.groups, key=len)
-        angles = directions(group.places, group.slot.wavenumber, self.settings.angles)
-        shape = replace(before.shape, angles=angles, concentration=CONCENTRATION)
-        old = before.values.power
-        level = float(before.shape.of("isotropic", old)[0])
-        power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
-        values = replace(before.values, power=torch.cat([power, old[1:]]))
+        shape, values = self._directed(before, self.settings.angles, CONCENTRATION)
         parts = self._compressed(shape, values)
         errors = self._crossed(parts, shape, values)
         values, _ = fit_powers(parts, shape, values, SHRINKAGE, 2 * SHORT)
@@ -408,15 +402,18 @@ class _Search:
 
     def _with_tied(self, before: Candidate) -> Candidate:
         """With powers of directions that depend on room and angle to the end, all equal at first."""
-        group, old, wanted = max(self.groups, key=len), before.shape, self.settings
-        angles = directions(group.places, group.slot.wavenumber, wanted.tied)
-        shape = replace(old, angles=angles, concentration=wanted.narrow)
-        power = before.values.power
-        level = float(power[: 1 + len(old.angles)].sum())
+        shape, values = self._directed(before, self.settings.tied, self.settings.narrow)
+        towards = torch.zeros(self.settings.knots, dtype=torch.float64)
+        return self._fitted(shape, replace(values, towards=towards))
+
+    def _directed(self, before: Candidate, count: int, concentration: float) -> tuple[Shape, Values]:
+        """With so many directions in place of those there are, of equal powers."""
+        group, old, power = max(self.groups, key=len), len(before.shape.angles), before.values.power
+        angles = directions(group.places, group.slot.wavenumber, count)
+        level = float(power[: 1 + old].sum())
         fresh = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
-        power = torch.cat([fresh, power[1 + len(old.angles) :]])
-        towards = torch.zeros(wanted.knots, dtype=torch.float64)
-        return self._fitted(shape, replace(before.values, power=power, towards=towards))
+        values = replace(before.values, power=torch.cat([fresh, power[1 + old :]]))
+        return replace(before.shape, angles=angles, concentration=concentration), values
 
     def _crossed(self, parts: tuple[Compressed, ...], shape: Shape, values: Values) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
