@@ -19,8 +19,8 @@ from gsparc.models.channels import initial as waves
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.haste import factor_s
+from gsparc.models.image_sources.known.images import counted
 from gsparc.models.image_sources.known.method import KnownWallsGP
-from gsparc.models.image_sources.known.mirrors import counted
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.source_field import RayField, SourceField
 from gsparc.models.method_field import ProcessField
@@ -50,8 +50,7 @@ def sources(
         max_sources=init.max_sources, order=init.order, clutter=clutter,
         offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
-    return _completed(SourceField(method), data, report, budget)
+    return _completed(method, data, rows, context, budget)
 
 
 def scene(
@@ -69,8 +68,7 @@ def scene(
         read_walls(init.file), search_rows=init.search_rows, rows=init.rows, max_sources=init.max_sources,
         order=init.order, clutter=clutter, offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
-    return _completed(SourceField(method), data, report, budget)
+    return _completed(method, data, rows, context, budget)
 
 
 def rays(
@@ -145,17 +143,16 @@ def process(
     return ProcessField(method), report
 
 
-def _searching(data: Measurements, context: FitContext) -> FitContext:
-    """The seconds of a search: without those for `_completed`."""
-    share = 1.0 if context.budget_s is None or data.target[0].size > 1 else 1 - COMPLETION_SHARE
-    return replace(context, budget_s=None if context.budget_s is None else share * context.budget_s)
-
-
 def _completed(
-    field: ConditionalField, data: Measurements, report: FitReport, budget: TimeBudget
+    method: ImageSourceGP, data: Measurements, rows: np.ndarray, context: FitContext, budget: TimeBudget
 ) -> tuple[ConditionalField, FitReport]:
-    """With a process on what the sources leave, where leaving rows out says that it pays."""
-    if data.target[0].size > 1:
+    """The sources, and a process on what they leave where leaving rows out says that it pays."""
+    several = data.target[0].size > 1
+    if context.budget_s is not None and not several:
+        context = replace(context, budget_s=(1 - COMPLETION_SHARE) * context.budget_s)
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    field = SourceField(method)
+    if several:
         return field, report
     began = budget.counted.wall
     left = field.left_out()

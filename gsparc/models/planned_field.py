@@ -379,17 +379,10 @@ class PlannedField(LearnedField):
         """See `TrainsByGradient`."""
         return True
 
-    @property
-    def _several(self) -> bool:
-        """Whether several solutions are averaged."""
-        return isinstance(self.field, Mixture) and len(self.field.members) > 1
-
     def _method(self) -> Method | None:
-        """The method inside the heaviest member, where there is one."""
-        field = self.field
-        if isinstance(field, Mixture):
-            _, field = max(field.parts(), key=lambda part: part[0])
-        return getattr(field, "method", None)
+        """The method inside the only solution, where there is one."""
+        parts = [*self.field.parts()] if isinstance(self.field, Mixture) else [(1.0, self.field)]
+        return getattr(parts[0][1], "method", None) if len(parts) == 1 else None
 
     # -- reductions --------------------------------------------------------------------------------
 
@@ -398,7 +391,7 @@ class PlannedField(LearnedField):
         if self.field is None:
             return super().knobs()
         method = self._method()
-        return () if method is None or self._several else knobs(method)
+        return () if method is None else knobs(method)
 
     def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
         """See `Reducible`."""
@@ -409,16 +402,15 @@ class PlannedField(LearnedField):
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
-        method = self._method()
         if self.field is None:
             twin = copy.copy(self)
             twin._average = None
             found = LearnedField.reduced(twin, settings, measured)
             return found if self._average is None else averaged(found, *self._average)
-        if method is None or self._several:
+        method, whole = self._method(), self.field
+        if method is None:
             return self
         found = reduced(method, settings, measured)
-        whole = self.field
         more = isinstance(whole, Mixture) and whole.residual is not None
         return Blended(found, whole.residual, whole.share) if more else found  # type: ignore[union-attr, arg-type]
 

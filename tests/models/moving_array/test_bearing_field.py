@@ -10,7 +10,7 @@ from boxes import room_of_spectra
 from gsparc.field.initial import InitSettings
 from gsparc.models.fields import bearings
 from gsparc.models.moving_array.bearing_field import BearingField
-from gsparc.models.moving_array.checks import site_problem
+from gsparc.models.moving_array.triangulate import site_problem
 from gsparc.training.context import FitContext
 
 ROWS = np.arange(0, 160, 2)
