@@ -13,25 +13,24 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
-from gsparc.models.censored import heard
+from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.channels import field as channels
 from gsparc.models.channels import initial as waves
-from gsparc.models.channels.settings import ChannelSettings
+from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.haste import factor_s
-from gsparc.models.image_sources import source_field
+from gsparc.models.image_sources.known.images import counted
 from gsparc.models.image_sources.known.method import KnownWallsGP
-from gsparc.models.image_sources.known.mirrors import counted
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.source_field import RayField, SourceField
-from gsparc.models.mixture import process_field
+from gsparc.models.method_field import ProcessField
 from gsparc.models.mixture.mixture import Mixture, residuals
-from gsparc.models.moving_array import bearing_field
 from gsparc.models.moving_array.bearing_field import BearingField
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.powers import field as power_field
 from gsparc.models.powers.together import field as joint_field
+from gsparc.models.target_rows import heard
 from gsparc.training.conditional import ConditionalField
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget, less_repeatable
@@ -51,8 +50,7 @@ def sources(
         max_sources=init.max_sources, order=init.order, clutter=clutter,
         offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
-    return _completed(SourceField(method), data, report, budget)
+    return _completed(method, data, rows, context, budget)
 
 
 def scene(
@@ -70,8 +68,7 @@ def scene(
         read_walls(init.file), search_rows=init.search_rows, rows=init.rows, max_sources=init.max_sources,
         order=init.order, clutter=clutter, offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), _searching(data, context))
-    return _completed(SourceField(method), data, report, budget)
+    return _completed(method, data, rows, context, budget)
 
 
 def rays(
@@ -137,17 +134,25 @@ def bearings(
     return BearingField(method, heard(data, rows)), report
 
 
-def _searching(data: Measurements, context: FitContext) -> FitContext:
-    """The seconds of a search: without those for `_completed`."""
-    share = 1.0 if context.budget_s is None or data.target[0].size > 1 else 1 - COMPLETION_SHARE
-    return replace(context, budget_s=None if context.budget_s is None else share * context.budget_s)
+def process(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """The plain process on whole targets; `init` and `clutter` mean nothing to it."""
+    method = GaussianProcess()
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    return ProcessField(method), report
 
 
 def _completed(
-    field: ConditionalField, data: Measurements, report: FitReport, budget: TimeBudget
+    method: ImageSourceGP, data: Measurements, rows: np.ndarray, context: FitContext, budget: TimeBudget
 ) -> tuple[ConditionalField, FitReport]:
-    """With a process on what the sources leave, where leaving rows out says that it pays."""
-    if data.target[0].size > 1:
+    """The sources, and a process on what they leave where leaving rows out says that it pays."""
+    several = data.target[0].size > 1
+    if context.budget_s is not None and not several:
+        context = replace(context, budget_s=(1 - COMPLETION_SHARE) * context.budget_s)
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    field = SourceField(method)
+    if several:
         return field, report
     began = budget.counted.wall
     left = field.left_out()
@@ -179,18 +184,17 @@ INITIALISERS: dict[str, Callable[..., tuple[ConditionalField, FitReport]]] = {
     "powers": powers,
     "joint_powers": joint_powers,
     "bearings": bearings,
-    "process": process_field.initialise,
+    "process": process,
 }
 # `(site, state) -> field` by the kind that a state names.
 RESTORED: dict[str, Callable[[Site, dict[str, Any]], ConditionalField]] = {
-    "sources": source_field.restored_sources,
-    "scene": source_field.restored_sources,
-    "rays": source_field.restored_rays,
+    "sources": SourceField.restored,
+    "rays": RayField.restored,
     "diffuse": channels.restored,
     "powers": power_field.restored,
     "joint_powers": joint_field.restored,
-    "bearings": bearing_field.restored,
-    "process": process_field.restored,
+    "bearings": BearingField.restored,
+    "process": ProcessField.restored,
 }
 
 

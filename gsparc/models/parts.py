@@ -1,21 +1,49 @@
-"""Runs of many parts, stations or folds: a part that an interrupted run has finished is not done again."""
+"""Runs of many parts, stations or folds: what an interrupted run has finished is not done again.
+
+Nothing else goes on from it than what learns from the same rows with the same settings (`Origin`).
+"""
 
 from __future__ import annotations
 
+import logging
 import re
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
+import numpy as np
+import yaml
+
+from gsparc.data.assemble import content_hash
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold, indices_hash
 from gsparc.models import checkpoint
+from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
-from gsparc.models.origin import Origin
 from gsparc.training.context import FitContext, FitReport
+
+log = logging.getLogger(__name__)
 
 FOLDS, STATIONS = r"fold\d+", r"station\d+|unheard"  # names of parts' folders
 LAST = ("refit/last.ckpt", "last.ckpt")  # what an interrupted part leaves, the later stage first
+# Settings that a run must share with what it goes on from.
+DECIDING = ("model", "dataset.batch_size", "init_from", "stations")
+CHANGEABLE = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
+"""Settings that may change on the way, and are then named."""
+UNHASHED = (
+    "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
+    "uplink_array", "uplink_hz", "antennas",
+)  # fmt: skip
+"""Facts of a site that the content hash of its measurements leaves out."""
+
+# What is hashed, the group of settings that names it, in words.
+_HASHED = (
+    ("data", "dataset", "data"),
+    ("auxiliary", "dataset", "directions or uplink"),
+    ("rows", "split", "rows"),
+)
 
 
 def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -54,3 +82,93 @@ def _taken(method: Method, data: Measurements, fold: Fold, context: FitContext, 
     method.restore(data.site, stored.state)
     extra = stored.extra
     return FitReport(float(extra["train_s"]), tuple(extra.get("notes", ())), extra.get("limited_by"))
+
+
+def common_label(name: str, methods: Sequence[Method]) -> str:
+    """Their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
+    found = Counter(method.label for method in methods)
+    if not found:
+        return name
+    label, count = found.most_common(1)[0]
+    inner = label.removeprefix(name).strip(" ()")
+    return label if count == len(methods) or not inner else f"{name} ({inner} in {count} of {len(methods)})"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What is learned from, the seed, and the whole configuration as text.
+
+    Attributes:
+        site: of the measurements.
+        auxiliary: hash of their directions and uplink, which their content hash leaves out.
+        rows: hash of the fold's indices.
+        seed: of the run.
+        config: YAML text; "" from Python without one.
+    """
+
+    site: Site
+    auxiliary: str
+    rows: str
+    seed: int
+    config: str = ""
+
+    @classmethod
+    def of(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
+        """Of a fit that begins."""
+        directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
+        auxiliary = content_hash({**directions, "uplink": data.uplink})
+        return cls(data.site, auxiliary, indices_hash((fold,)), context.seed, context.config_yaml)
+
+    def marks(self) -> dict[str, Any]:
+        """For the `extra` of a checkpoint, which holds the configuration itself."""
+        return {"origin": {**self._hashes(), "seed": self.seed}}
+
+    def _hashes(self) -> dict[str, str]:
+        return {"data": self.site.sha256, "auxiliary": self.auxiliary, "rows": self.rows}
+
+    def refuse_other(self, stored: Stored) -> None:
+        """Whether training may go on from `stored`; settings of its schedule that changed are logged.
+
+        Raises:
+            ValueError: it is of other data, rows, seed or settings, which are named.
+        """
+        before, now = stored.configuration, yaml.safe_load(self.config) or {}
+        own, found = self._hashes(), []
+        kept = stored.extra.get("origin")
+        if kept is None:
+            raise ValueError(f"ckpt_path={stored.path}: does not say what it learned from; start without it")
+        for name, group, what in _HASHED:
+            if kept[name] != own[name]:
+                found.append(", ".join(_differences(before, now, (group,))) or f"other {what}")
+        if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
+            facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}
+            found += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
+        if kept["seed"] != self.seed:
+            found.append(f"seed={kept['seed']} (here {self.seed})")
+        found += _differences(before, now, DECIDING)
+        if found:
+            raise ValueError(
+                f"ckpt_path={stored.path}: was trained with {'; '.join(found)}: "
+                "go on with the same, or start again without ckpt_path"
+            )
+        changed = _differences(before, now, CHANGEABLE)
+        if changed:
+            log.warning("going on from %s, which had %s", stored.path, "; ".join(changed))
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:
+    """`key=value (here other)` for every setting under `keys` that differs; none without a configuration."""
+    if not before or not now:
+        return []
+    one, two = dict(_leaves(before)), dict(_leaves(now))
+    under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
+    under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
+    return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
+
+
+def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in node.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

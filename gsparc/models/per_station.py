@@ -24,10 +24,10 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, parts
-from gsparc.models.censored import heard
-from gsparc.models.label import common_label
 from gsparc.models.method import Method, Prediction, Reconditions
+from gsparc.models.parts import common_label
 from gsparc.models.reduced import View
+from gsparc.models.target_rows import heard
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable

@@ -28,13 +28,12 @@ from gsparc.models.fields import INITIALISERS, restored, stored
 from gsparc.models.haste import factor_s
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
-from gsparc.models.mixture import process_average, solutions
+from gsparc.models.mixture import solutions
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.mixture.process_average import Summed, averaged, mean_alone
 from gsparc.models.mixture.weights import comparable
 from gsparc.models.pareto import Settings
-from gsparc.models.reduced import contributions, knobs, reduced
+from gsparc.models.reduced import Blended, averaged, contributions, knobs, mean_alone, reduced
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
@@ -162,7 +161,7 @@ class PlannedField(LearnedField):
         self._reserve_s = 0.0
         if self.plan is not None and self.plan.plain:
             watch = TimeBudget()
-            self._average, explained = process_average.weigh(self, data, fold, self._left_out, self._apart)
+            self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
             self.explained = self.explained if explained is None else explained
             self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
 
@@ -380,17 +379,10 @@ class PlannedField(LearnedField):
         """See `TrainsByGradient`."""
         return True
 
-    @property
-    def _several(self) -> bool:
-        """Whether several solutions are averaged."""
-        return isinstance(self.field, Mixture) and len(self.field.members) > 1
-
     def _method(self) -> Method | None:
-        """The method inside the heaviest member, where there is one."""
-        field = self.field
-        if isinstance(field, Mixture):
-            _, field = max(field.parts(), key=lambda part: part[0])
-        return getattr(field, "method", None)
+        """The method inside the only solution, where there is one."""
+        parts = [*self.field.parts()] if isinstance(self.field, Mixture) else [(1.0, self.field)]
+        return getattr(parts[0][1], "method", None) if len(parts) == 1 else None
 
     # -- reductions --------------------------------------------------------------------------------
 
@@ -399,7 +391,7 @@ class PlannedField(LearnedField):
         if self.field is None:
             return super().knobs()
         method = self._method()
-        return () if method is None or self._several else knobs(method)
+        return () if method is None else knobs(method)
 
     def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
         """See `Reducible`."""
@@ -410,16 +402,17 @@ class PlannedField(LearnedField):
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
-        method = self._method()
         if self.field is None:
             twin = copy.copy(self)
             twin._average = None
             found = LearnedField.reduced(twin, settings, measured)
             return found if self._average is None else averaged(found, *self._average)
-        if method is None or self._several:
+        method, whole = self._method(), self.field
+        if method is None:
             return self
         found = reduced(method, settings, measured)
-        return Summed(found, self.field) if isinstance(self.field, Mixture) else found
+        more = isinstance(whole, Mixture) and whole.residual is not None
+        return Blended(found, whole.residual, whole.share) if more else found  # type: ignore[union-attr, arg-type]
 
     # -- storing -----------------------------------------------------------------------------------
 

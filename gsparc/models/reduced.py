@@ -1,20 +1,22 @@
-"""Trained methods that answer faster: with which settings, and as what."""
+"""Trained methods that answer faster or along with others: with which settings, and as what."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any, NoReturn
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
-from gsparc.models.method import Method, Prediction, Reducible
+from gsparc.models.method import Differentiable, Method, Prediction, Reducible
 from gsparc.models.pareto import Settings
-from gsparc.ops import Pose
+from gsparc.ops import Pose, SphereGrid
 
 log = logging.getLogger(__name__)
 
@@ -103,6 +105,101 @@ class View(Method):
 class MeanOnly(View):
     """Leaves confidence and variance out of the answer."""
 
+    @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the mean alone."""
-        return Prediction(self.inner.predict(tx, rx).mean)
+        inner = self.inner
+        mean = inner.mean_at(tx, rx) if isinstance(inner, Differentiable) else inner.predict(tx, rx).mean
+        return Prediction(mean)
+
+
+def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
+    """Every `stride`-th pixel of the grid, the first row and column among them.
+
+    Raises:
+        ValueError: the columns cannot be divided so.
+    """
+    if grid.width % stride:
+        raise ValueError(f"stride={stride} does not divide the {grid.width} columns of the grid")
+    height, width = (grid.height - 1) // stride + 1, grid.width // stride
+    steps = {"elevation_step": grid.elevation_step * stride, "azimuth_step": grid.azimuth_step * stride}
+    return replace(grid, height=height, width=width, **steps)
+
+
+class Filled(View):
+    """A method that answers on a coarser grid, its images interpolated to the full one.
+
+    Args:
+        inner: answers on `coarser(grid, stride)`.
+        grid: the full one.
+        stride: pixels per rendered pixel, along both axes.
+    """
+
+    def __init__(self, inner: Method, grid: SphereGrid, stride: int) -> None:
+        super().__init__(inner)
+        self.grid, self.stride = grid, stride
+        height, width = (grid.height - 1) // stride + 1, grid.width // stride
+        self._height = grid.height
+        self._below = torch.arange(1, height + 1).clamp_max(height - 1)  # rows past the last repeat it
+        self._next = torch.arange(1, width + 1)
+        self._next[-1] = 0 if grid.periodic else width - 1
+        self._between = torch.arange(stride) / stride
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; images (B, H, W) of the full grid."""
+        found = self.inner.predict(tx, rx)
+        return Prediction(self.fill(found.mean), found.confidence, found.variance)
+
+    def fill(self, image: Tensor) -> Tensor:
+        """(B, h, w) -> (B, H, W)."""
+        beside = image.index_select(2, self._next)
+        wide = torch.lerp(image[..., None], beside[..., None], self._between).flatten(2)
+        below = wide.index_select(1, self._below)
+        tall = torch.lerp(wide[:, :, None], below[:, :, None], self._between[:, None])
+        return tall.flatten(1, 2)[:, : self._height]
+
+
+class Blended(View):
+    """A field's answer with a mean that another one's has a part in.
+
+    Args:
+        inner: answers for the field; its confidence and variance stay.
+        other: what has the other mean, at tx (B, 3) [m] and receiver poses.
+        weight: of the other mean.
+        own: of the field's.
+    """
+
+    def __init__(
+        self, inner: Method, other: Callable[[Tensor, Pose], Any], weight: float, own: float = 1.0
+    ) -> None:
+        super().__init__(inner)
+        self.other, self.weight, self.own = other, weight, own
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        found = self.inner.predict(tx, rx)
+        mean = self.own * found.mean + self.weight * self.other(tx, rx).mean
+        return replace(found, mean=mean)
+
+
+def mean_alone(process: Method, settings: Settings | None = None) -> Method:
+    """The process without its variance, which costs most of its answer and which the field has of its own."""
+    return reduced(process, {"confidence": False, **(settings or {})}, {})
+
+
+def averaged(own: Method, process: Method, weight: float) -> Method:
+    """A reduced field averaged with as many pixels of the process.
+
+    Interpolation is linear: the mean is taken on the coarse grid, and filled in once.
+
+    Args:
+        own: the field, reduced; `Filled` where it answers on a coarser grid.
+        process: fitted.
+        weight: of the process.
+    """
+    lean = mean_alone(process, {"stride": own.stride} if isinstance(own, Filled) else None)
+    if isinstance(own, Filled) and isinstance(lean, Filled):
+        return Filled(Blended(own.inner, lean.inner.predict, weight, 1 - weight), own.grid, own.stride)
+    return Blended(own, lean.predict, weight, 1 - weight)

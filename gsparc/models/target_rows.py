@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsparc.data.blocks import taken
 from gsparc.data.schema import Kind, Measurements
+from gsparc.processes.powers import Rows
 
 TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 
@@ -64,3 +65,25 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     if kind == "rssi":
         return variance * (math.log(10) / 10 * mean.flatten(1).mean(1)) ** 2
     return variance
+
+
+def silent(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Where of rows (n,) nothing was heard, (n,) bool."""
+    return np.zeros(len(rows), bool) if data.censored is None else data.censored[rows]
+
+
+def heard(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Those of rows (n,) where something was heard, in their order."""
+    return rows[~silent(data, rows)]
+
+
+def left_out_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
+    """What a reader must know of a fit to `heard(data, rows)`; nothing where all of rows (n,) were heard."""
+    count = int(silent(data, rows).sum())
+    return (f"{count} rows where nothing was heard are not learned from",) if count else ()
+
+
+def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
+    """Powers of rows (n,) in decibels, levels where nothing was heard."""
+    decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
+    return Rows(data.moving[rows], decibels, silent(data, rows))

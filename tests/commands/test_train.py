@@ -26,7 +26,7 @@ from gsparc.commands.train import Objects, main, train
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.origin import Origin
+from gsparc.models.parts import Origin
 from gsparc.models.splat.method import LearnedField
 from gsparc.training.context import FitContext
 

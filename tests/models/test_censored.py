@@ -12,9 +12,9 @@ from scipy.spatial.distance import cdist
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.censored import heard, left_out_note
 from gsparc.models.powers.settings import fit_powers
 from gsparc.models.registry import build
+from gsparc.models.target_rows import heard, left_out_note
 from gsparc.processes.powers import Rows
 from gsparc.training.context import FitContext
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from gsparc.models.label import common_label
+from gsparc.models.parts import common_label
 from gsparc.models.registry import method_class
 
 

@@ -10,13 +10,13 @@ from small_worlds import LAW, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
 from gsparc.models.powers import waves
-from gsparc.models.powers.field import PowerField
-from gsparc.models.powers.likelihood import Covariance, left_out_losses
+from gsparc.models.powers.field import PowerField, left_out_losses
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.learning import Own
 from gsparc.models.powers.together.rows import link_rows
 from gsparc.models.powers.together.terms import Terms
 from gsparc.ops import Pose
+from gsparc.processes.density import gram_of
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
@@ -54,10 +54,9 @@ def density_of_powers() -> Arrays:
     places = spread(40, 1)
     told, about = rows(places), trend(places)
     at = torch.from_numpy(places)
-    kernel = Covariance.of(TWO)
-    gram = kernel.gram(torch.cdist(at, at), about.terms(at))
+    gram = gram_of(torch.from_numpy(TWO.parameters()), torch.cdist(at, at), about.terms(at))
     values = torch.from_numpy(told.decibels) - about.mean(at)
-    return {"density": left_out_losses(gram, values, kernel.log_amplitude).numpy()}
+    return {"density": left_out_losses(gram, values, torch.tensor(TWO.amplitude).double().log()).numpy()}
 
 
 def _stations(quiet: bool) -> object:

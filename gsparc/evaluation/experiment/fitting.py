@@ -25,8 +25,8 @@ from gsparc.evaluation.experiment.problem import RESULT, Problem, compose, facts
 from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint
-from gsparc.models.label import common_label
 from gsparc.models.method import Method
+from gsparc.models.parts import common_label
 from gsparc.models.registry import build
 from gsparc.prediction.timing import machine_facts
 from gsparc.training.context import FitReport

@@ -65,26 +65,23 @@ class Learned:
     time_limited: bool
 
 
-class ThroughArray:
-    """Gaussians whose emissions through the array are the posterior of its vectors; see `Initialiser`."""
+def through_array(task: InitTask) -> Start:
+    """Gaussians whose emissions through the array are the posterior of its vectors.
 
-    def __call__(self, task: InitTask) -> Start:
-        """Retrieve the vectors of the training rows and fit their process.
-
-        Raises:
-            ValueError: no array, no rows, or an emission that is not linear in its features.
-        """
-        assert task.receiver is not None
-        if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
-            raise ValueError(
-                "init=vectors solves a linear read-out: set model.emission.hidden=0 and "
-                "model.attenuation.inverse_distance=false"
-            )
-        found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
-        return Start(
-            found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
-            astuple(found.elapsed), found.time_limited, found.left_out,
-        )  # fmt: skip
+    Raises:
+        ValueError: no array, no rows, or an emission that is not linear in its features.
+    """
+    assert task.receiver is not None
+    if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
+        raise ValueError(
+            "init=vectors solves a linear read-out: set model.emission.hidden=0 and "
+            "model.attenuation.inverse_distance=false"
+        )
+    found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
+    return Start(
+        found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
+        astuple(found.elapsed), found.time_limited, found.left_out,
+    )  # fmt: skip
 
 
 def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Learned:

@@ -88,6 +88,18 @@ def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray
         reach *= 4
 
 
+def matched(
+    vector: np.ndarray, expected: np.ndarray, partner: np.ndarray | None, margin: float = 1.0
+) -> np.ndarray:
+    """A vector (M,), or its twin whose overlap with the expected one is larger by a margin, in its phase."""
+    overlap = np.vdot(vector, expected)
+    if partner is not None:
+        other = twin(vector, partner)
+        if abs(of_other := np.vdot(other, expected)) > margin * abs(overlap):
+            vector, overlap = other, of_other
+    return vector * (overlap / abs(overlap)) if abs(overlap) > 0 else vector
+
+
 def refine_alignment(
     vectors: np.ndarray, inverse: np.ndarray, partner: np.ndarray | None, sweeps: int = SWEEPS
 ) -> np.ndarray:
@@ -106,14 +118,7 @@ def refine_alignment(
         for i in range(len(aligned)):
             old = aligned[i].copy()
             expected = old - (inverse[i] @ parts).view(np.complex128) / diagonal[i]
-            new, overlap = old, np.vdot(old, expected)
-            if partner is not None:
-                other = twin(old, partner)
-                other_overlap = np.vdot(other, expected)
-                if abs(other_overlap) > TWIN_MARGIN * abs(overlap):
-                    new, overlap = other, other_overlap
-            if abs(overlap) > 0:
-                new = new * (overlap / abs(overlap))
+            new = matched(old, expected, partner, TWIN_MARGIN)
             change += float(np.linalg.norm(new - old))
             aligned[i] = new
         if change < TOLERANCE * size:
@@ -159,12 +164,5 @@ def aligned_to(
     gram.diagonal(dim1=-2, dim2=-1).add_(kernel.noise)
     weights, _ = solved(gram, kernel.between(torch.from_numpy(positions)[:, None], around)[:, 0])
     for i, rows in enumerate(near):
-        expected = weights[i].numpy() @ known[rows]
-        overlap = np.vdot(aligned[i], expected)
-        if partner is not None:
-            other = twin(aligned[i], partner)
-            if abs(np.vdot(other, expected)) > abs(overlap):
-                aligned[i], overlap = other, np.vdot(other, expected)
-        if abs(overlap) > 0:
-            aligned[i] *= overlap / abs(overlap)
+        aligned[i] = matched(aligned[i], weights[i].numpy() @ known[rows], partner)
     return aligned

@@ -16,14 +16,12 @@ from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Interpolator
-from gsparc.models.censored import silent
-from gsparc.models.coarse_grid import Filled
 from gsparc.models.haste import CHOSEN_ON
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import MEANS, MeanName, fit_powers
-from gsparc.models.reduced import View
-from gsparc.models.target_rows import entry_variance, from_real, to_real, training_targets
+from gsparc.models.reduced import Filled, MeanOnly, View
+from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
 from gsparc.ops import Pose
 from gsparc.processes.covering import covering
 from gsparc.processes.density import by_left_out
@@ -185,10 +183,8 @@ class GaussianProcess(Interpolator):
         """See `Reconditions`; of powers alone."""
         if self.powers is None:
             return None
-        decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
         found = copy.copy(self)
-        seen = Rows(data.moving[rows], decibels, silent(data, rows))
-        found.powers, _ = conditioned(seen, self.powers.trend, self.powers.kernel, 0)
+        found.powers, _ = conditioned(rows_of(data, rows), self.powers.trend, self.powers.kernel, 0)
         return found
 
     @torch.no_grad()
@@ -229,7 +225,7 @@ class GaussianProcess(Interpolator):
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
         if not isinstance(self.scores, Exact):
-            return MeanAlone(self)
+            return MeanOnly(self)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
         kept: Tensor | slice = slice(
@@ -298,16 +294,6 @@ def kernel_given_nearest(
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
     said = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
     return replace(found, amplitude=found.amplitude * len(strong) / entries * share), said
-
-
-class MeanAlone(View):
-    """The mean, without its variance."""
-
-    @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`."""
-        assert isinstance(self.inner, GaussianProcess)
-        return Prediction(self.inner.mean_at(tx, rx))
 
 
 class ReducedMean(View):

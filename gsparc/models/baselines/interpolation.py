@@ -11,9 +11,8 @@ from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.censored import heard, left_out_note, silent
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import from_real, training_targets
+from gsparc.models.target_rows import from_real, heard, left_out_note, silent, training_targets
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 

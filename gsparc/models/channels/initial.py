@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import POSITIVE, Checked, setting, switch, whole
 from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
 from gsparc.models.channels.columns import Group, ends_of, gather, run_factors_of, thinned
@@ -35,8 +36,7 @@ from gsparc.models.channels.evidence import (
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.kernels import cells, directions, plain
 from gsparc.models.channels.mirrors import find_mirrors
-from gsparc.models.channels.offset import best_offset
-from gsparc.models.channels.settings import ChannelSettings
+from gsparc.models.channels.probe import best_offset
 from gsparc.models.haste import factor_s
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
@@ -63,6 +63,35 @@ WEIGHTS = 2.0  # factors of all rows that the weights in the end take
 LENGTHS_SHARE = 0.5  # of the seconds, after which no further length is tried
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
+
+
+@dataclass(frozen=True)
+class ChannelSettings(Checked):
+    """Terms that are tried beside the isotropic diffuse field, and what they are learned on.
+
+    Attributes:
+        constant: what does not depend on the place (leakage).
+        direct: the wave of the static end, with a fixed gain and one that varies over places.
+        directions: unequal powers of the diffuse field's directions.
+        correlated: noise that is correlated over the order of rows.
+        angles: directions of the diffuse field, of a half sphere where all places are in one plane.
+        rows: measurements that powers are learned on at most.
+        tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
+        narrow: concentration of each of these.
+        knots: in that angle.
+        mirrors: planes that several static ends share, at most; 0 for none.
+    """
+
+    constant: bool = setting(True, switch())
+    direct: bool = setting(True, switch())
+    directions: bool = setting(True, switch())
+    correlated: bool = setting(True, switch())
+    angles: int = setting(24, whole(4, 200))
+    rows: int = setting(400, whole(8))
+    tied: int = setting(64, whole(4, 500))
+    narrow: float = setting(16.0, POSITIVE)
+    knots: int = setting(9, whole(2, 100))
+    mirrors: int = setting(8, whole(0, 32))
 
 
 @dataclass(frozen=True)
@@ -354,13 +383,7 @@ class _Search:
 
     def _with_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
-        group = max(self.groups, key=len)
-        angles = directions(group.places, group.slot.wavenumber, self.settings.angles)
-        shape = replace(before.shape, angles=angles, concentration=CONCENTRATION)
-        old = before.values.power
-        level = float(before.shape.of("isotropic", old)[0])
-        power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
-        values = replace(before.values, power=torch.cat([power, old[1:]]))
+        shape, values = self._directed(before, self.settings.angles, CONCENTRATION)
         parts = self._compressed(shape, values)
         errors = self._crossed(parts, shape, values)
         values, _ = fit_powers(parts, shape, values, SHRINKAGE, 2 * SHORT)
@@ -379,15 +402,18 @@ class _Search:
 
     def _with_tied(self, before: Candidate) -> Candidate:
         """With powers of directions that depend on room and angle to the end, all equal at first."""
-        group, old, wanted = max(self.groups, key=len), before.shape, self.settings
-        angles = directions(group.places, group.slot.wavenumber, wanted.tied)
-        shape = replace(old, angles=angles, concentration=wanted.narrow)
-        power = before.values.power
-        level = float(power[: 1 + len(old.angles)].sum())
+        shape, values = self._directed(before, self.settings.tied, self.settings.narrow)
+        towards = torch.zeros(self.settings.knots, dtype=torch.float64)
+        return self._fitted(shape, replace(values, towards=towards))
+
+    def _directed(self, before: Candidate, count: int, concentration: float) -> tuple[Shape, Values]:
+        """With so many directions in place of those there are, of equal powers."""
+        group, old, power = max(self.groups, key=len), len(before.shape.angles), before.values.power
+        angles = directions(group.places, group.slot.wavenumber, count)
+        level = float(power[: 1 + old].sum())
         fresh = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
-        power = torch.cat([fresh, power[1 + len(old.angles) :]])
-        towards = torch.zeros(wanted.knots, dtype=torch.float64)
-        return self._fitted(shape, replace(before.values, power=power, towards=towards))
+        values = replace(before.values, power=torch.cat([fresh, power[1 + old :]]))
+        return replace(before.shape, angles=angles, concentration=concentration), values
 
     def _crossed(self, parts: tuple[Compressed, ...], shape: Shape, values: Values) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""

@@ -30,10 +30,17 @@ from gsparc.models.image_sources.gp_likelihood import Scene
 from gsparc.models.image_sources.phase_offsets import KINDS, Offsets, estimate
 from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.models.image_sources.query import Query
-from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at
+from gsparc.models.image_sources.rows import (
+    Rows,
+    SourceKind,
+    box_of,
+    gather,
+    kinds,
+    measured_places,
+    ranges_at,
+)
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.models.image_sources.source_types import SourceKind, box_of, kinds
 from gsparc.models.method import LeftOut, Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import MeanOnly

@@ -1,8 +1,13 @@
-"""Measured channels as rows of one regression: a place, a frequency and what was measured there."""
+"""Measured channels as rows of one regression: a place, a frequency and what was measured there.
+
+To a receiver all sources are fixed points: a mirror image of the static end, or a small object, whose leg to
+the static end is the same for every receiver and folds into the complex gain. They differ when it moves.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 import torch
@@ -150,3 +155,32 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
     if places.shape[1] > 3:
         sources = sources + torch.einsum("kij,mj->mki", turned, places[:, 3:])
     return ranges(places[:, :3], sources)
+
+
+class SourceKind(StrEnum):
+    """Propagation mechanism of a source."""
+
+    IMAGE = "image"
+    SCATTERER = "scatterer"
+
+
+def kinds(points: Tensor, box: Tensor, margin: float = 0.05) -> list[SourceKind]:
+    """Kinds of fixed points (K, 3) [m], the transmitter first.
+
+    A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands inside
+    the box (2, 3) [m] of receivers and transmitter, the transmitter itself apart, is a scatterer.
+
+    Args:
+        points: sources of one scene.
+        box: lower and upper corner of all places measured.
+        margin: by which the box is made smaller: images just behind a wall stay images [m].
+    """
+    inside = ((points > box[0] + margin) & (points < box[1] - margin)).all(1)
+    apart = torch.linalg.vector_norm(points - points[0], dim=1) > 0.1
+    return [SourceKind.SCATTERER if s else SourceKind.IMAGE for s in (inside & apart).tolist()]
+
+
+def box_of(rows: Rows, transmitter: Tensor) -> Tensor:
+    """Lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
+    places = torch.cat([rows.position, transmitter[None]])
+    return torch.stack([places.amin(0), places.amax(0)])

@@ -20,8 +20,7 @@ from gsparc.models.image_sources.reflection_orders import (
     prune,
     reassign,
 )
-from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.source_types import box_of
+from gsparc.models.image_sources.rows import Rows, box_of
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 from gsparc.physics.waves import LIGHT

@@ -14,42 +14,20 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.schema import Batch, Measurements
 from gsparc.data.site_objects import SiteObjects
-from gsparc.data.splits import Fold
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.gp_likelihood import correlations
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.phased_gp import PhasedPosterior
 from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows, gather
-from gsparc.ops import Pose
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
-from gsparc.training.context import FitContext
+from gsparc.models.method_field import MethodField
+from gsparc.training.conditional import LeftOutRows, leave_one_out_density
 
 
-class MethodField(ConditionalField):
-    """What a fitted method found.
-
-    Args:
-        method: fitted.
-    """
-
-    def __init__(self, method: ImageSourceGP | DirectionalGP) -> None:
-        super().__init__()
-        self.method = method
-
-    @property
-    def count(self) -> int:
-        """Sources, of the largest search."""
-        return self.method.size()
-
-    @torch.no_grad()
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
-        """See `ConditionalField`."""
-        found = self.method.predict(tx, rx)
-        assert found.variance is not None and found.confidence is not None
-        return Posterior(found.mean, found.variance, found.mean, 1 - found.confidence)
+class FramedField(MethodField):
+    """What a method that is fitted in a frame found."""
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of one channel per receiver."""
@@ -59,15 +37,12 @@ class MethodField(ConditionalField):
         mean = (rows.target * scale - left.residual)[:, :, None]
         return LeftOutRows(left.rows, mean, torch.full((len(left.rows),), float("nan")))
 
-    def state(self) -> dict[str, Any]:
-        """The method's."""
-        return {"method": self.method.state()}
 
-
-class SourceField(MethodField):
+class SourceField(FramedField):
     """The scenes of an ensemble of searches."""
 
     kind = "sources"
+    makes = ImageSourceGP
     method: ImageSourceGP
     rates: ClassVar[dict[str, float]] = {"planes": 1e-4}  # [m] of a plane's offset, and of its unit normal
 
@@ -133,39 +108,12 @@ class SourceField(MethodField):
         method.query = Query(method.members)
 
 
-class RayField(MethodField):
-    """Sources where measured directions of arrival meet."""
+class RayField(FramedField):
+    """Sources where measured directions of arrival meet; who sees one is measured, too."""
 
     kind = "rays"
-    method: DirectionalGP
-
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """Who sees a source is measured."""
-        return ("phase", "visibility")
-
-    def loss(self, batch: Batch) -> Tensor:
-        """Nothing is left to gradient steps: places and visibility are those of largest likelihood."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`; places are triangulated anew, which is quick."""
-        self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
-
-
-def restored_sources(site: Site, state: dict[str, Any]) -> SourceField:
-    """The field whose `state()` this was."""
-    method = ImageSourceGP()
-    method.restore(site, state["method"])
-    return SourceField(method)
-
-
-def restored_rays(site: Site, state: dict[str, Any]) -> RayField:
-    """The field whose `state()` this was."""
-    method = DirectionalGP()
-    method.restore(site, state["method"])
-    return RayField(method)
+    makes = DirectionalGP
+    terms = ("phase", "visibility")  # type: ignore[assignment]
 
 
 def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:

@@ -15,11 +15,14 @@ from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
+from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.fields import INITIALISERS
 from gsparc.models.haste import factor_s
+from gsparc.models.left_out_images import LeftOut
+from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.mixture.weights import LEAST_HELD, comparable
+from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
 from gsparc.training.conditional import ConditionalField, LeftOutRows
@@ -28,6 +31,7 @@ from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
+MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 GROUPS = 3  # of training rows, that solutions are weighed by
 FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
 CLOSED_SHARE = 0.3  # of the seconds, for what takes no more than it needs beside what does
@@ -182,3 +186,62 @@ def _held(
     field.condition(data, rows)
     mean, variance = (torch.cat([getattr(one, name) for one in found]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)
+
+
+log = logging.getLogger(__name__)
+
+
+def weigh(
+    field: Method, data: Measurements, fold: Fold, left: LeftOut | None, distance: float | None
+) -> tuple[tuple[Method, float] | None, float | None]:
+    """What a plain process on whole targets is worth next to a field, on rows that neither learned from.
+
+    Those are validation rows and, of spectra, training rows that both predict without their neighbours:
+    a dozen rows alone decide by chance.
+
+    Args:
+        field: fitted on the same rows, without a process.
+        data: measurements.
+        fold: training and validation rows.
+        left: training rows of spectra as the field's start predicts them, before any step.
+        distance: of validation rows from the nearest training row [m].
+
+    Returns:
+        The process with its weight in the mean, None where it gains nothing; and the share of the variance
+        of validation rows that the field explains, where that was found.
+    """
+    spectra = data.site.kind == "spectrum"
+    left = left if spectra else None
+    process = GaussianProcess()
+    process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
+    if not field.size() or (left is None and len(fold.val) < LEAST_HELD):
+        few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
+        log.info("%s: a Gaussian process alone", few if field.size() else "no Gaussians")
+        return (process, 1.0), None
+    rows, explained, weight = [], None, 0.0
+    val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
+    if len(val):
+        batch = data.batch(val)
+        means = (method.predict(batch.tx, batch.rx).mean for method in (field, process))
+        own, plain, target = (comparable(values, data.site) for values in (*means, batch.target))
+        explained = solution_weights.explained(own, target, data.site.kind != "csi")
+        if spectra:
+            rows.append(Rows(*(part.detach().double().flatten(1).numpy() for part in (own, plain, target))))
+        else:
+            weight = solution_weights.weights([own, plain], target, np.arange(len(val)))[1]
+    if left is not None:
+        rows.append(_left_out(left, distance))
+    if spectra:
+        weight = solution_weights.share_of_second(rows)
+    log.info(
+        "held out, %d rows and %d of training without their neighbours: a Gaussian process weighs %.2f",
+        len(val), 0 if left is None else len(left.centres), weight,
+    )  # fmt: skip
+    return ((process, weight) if weight > 0 else None), explained
+
+
+def _left_out(left: LeftOut, distance: float | None) -> Rows:
+    """Training rows as far from what is left as held-out rows are, as field and process predict them."""
+    gap = left.as_far_as(distance)
+    own, target = left.at(gap, left.predicted)
+    return Rows(own, left.at(gap, left.by_process())[0], target)

@@ -6,21 +6,23 @@ are the places. Powers, their trends over the receiver's place and the residual 
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.models.method_field import MethodField
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.ops import Pose
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.training.conditional import LeftOutRows, Posterior
 
 LEAST_POWER = 1e-6  # of a pixel in the loss: a square root has no slope at zero
 
 
-class BearingField(ConditionalField):
+class BearingField(MethodField):
     """The sources of one or several searches.
 
     A transmitter whose place is known stays there; its images and all others are parameters.
@@ -31,19 +33,14 @@ class BearingField(ConditionalField):
     """
 
     kind = "bearings"
+    makes = MovingArrayField
     rates: ClassVar[dict[str, float]] = {"places": 0.01}  # [m]
 
-    def __init__(self, method: MovingArrayField, rows: np.ndarray) -> None:
-        super().__init__()
-        assert method.site is not None
-        self.method, self.rows, self.site = method, rows, method.site
+    def __init__(self, method: MovingArrayField, rows: Sequence[int] | np.ndarray = ()) -> None:
+        super().__init__(method)
+        self.rows = np.asarray(rows, np.int64)
         self._fixed = 0 if self.site.static_position is None else 1
         self.places = nn.ParameterList([trend.sources[self._fixed :].clone() for trend in method.trends])
-
-    @property
-    def count(self) -> int:
-        """Sources of all searches."""
-        return self.method.size()
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -106,15 +103,12 @@ class BearingField(ConditionalField):
 
     def state(self) -> dict[str, Any]:
         """The method's, and the places."""
-        places = [place.detach() for place in self.places]
-        return {"method": self.method.state(), "places": places}
+        return {**super().state(), "places": [place.detach() for place in self.places]}
 
-
-def restored(site: Site, state: dict[str, Any]) -> BearingField:
-    """The field whose `state()` this was; it answers, and can be conditioned again."""
-    method = MovingArrayField()
-    method.restore(site, state["method"])
-    field = BearingField(method, np.zeros(0, np.int64))
-    for place, stored in zip(field.places, state["places"], strict=True):
-        place.data.copy_(stored)
-    return field
+    @classmethod
+    def restored(cls, site: Site, state: dict[str, Any]) -> Self:
+        """The field whose `state()` this was; it answers, and can be conditioned again."""
+        field = super().restored(site, state)
+        for place, stored in zip(field.places, state["places"], strict=True):
+            place.data.copy_(stored)
+        return field

@@ -20,16 +20,20 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Interpolator
-from gsparc.models.censored import heard
 from gsparc.models.method import Prediction
-from gsparc.models.moving_array import reduce
-from gsparc.models.moving_array.checks import MAX_UNEXPLAINED, site_problem, unexplained_energy
 from gsparc.models.moving_array.error_model import ErrorModel, fit_error_model, image_features
 from gsparc.models.moving_array.power_gp import Trend, TrendSettings, fit_trend
-from gsparc.models.moving_array.query import Array, Query
+from gsparc.models.moving_array.query import Array, Query, reduced
 from gsparc.models.moving_array.residual import Residual, fit_residual, left_out_error
-from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, powers
-from gsparc.models.target_rows import to_real, training_targets
+from gsparc.models.moving_array.triangulate import (
+    MAX_UNEXPLAINED,
+    SearchSettings,
+    find_sources,
+    powers,
+    site_problem,
+    unexplained_energy,
+)
+from gsparc.models.target_rows import heard, to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.lags import BLOCK, Lags
 from gsparc.physics.separable import Separable, separable
@@ -136,7 +140,7 @@ class MovingArrayField(Interpolator):
         """Nothing: the process itself holds what each component contributes."""
         return {}
 
-    reduced = reduce.reduced
+    reduced = reduced
 
     # -- learning ----------------------------------------------------------------------------------
 

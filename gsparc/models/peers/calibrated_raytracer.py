@@ -18,9 +18,8 @@ from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.censored import heard
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import to_real
+from gsparc.models.target_rows import heard, to_real
 from gsparc.ops import Pose
 from gsparc.simulate.calibration import (
     GENERIC,

@@ -30,35 +30,10 @@ from gsparc.models.peers.gaussians import (
     gaussians_of,
     rendering_of,
 )
-from gsparc.models.peers.trained import Network, Scene
+from gsparc.models.peers.trained import Scene
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
 
 TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
-
-
-@dataclass(eq=False, kw_only=True)
-class GSRF(GaussianPeer):
-    """Spectra and channels.
-
-    Args:
-        count: Gaussians.
-        degree, order: largest Legendre degree and Fourier order of the radiance.
-        ssim_weight, fourier_weight: shares of SSIM and of the frequency domain in the loss (spectra).
-        others: see `TrainedPeer`.
-    """
-
-    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
-    rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
-    name: str = "gsrf"
-    count: int = 500
-    degree: int = 3
-    order: int = 3
-    ssim_weight: float = 0.19
-    fourier_weight: float = 0.05
-
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
-        """See `TrainedPeer.build`."""
-        return ComplexGaussians(scene, self)
 
 
 class ComplexGaussians(GaussianNetwork):
@@ -132,6 +107,28 @@ class ComplexGaussians(GaussianNetwork):
             plan = make_plan(*geometry, rx, self.grid, **self.options)
             self._frozen = freeze(plan, *geometry, version=0)
         return _magnitude(self._frozen.render(self.radiance(tx, rx), 0))
+
+
+@dataclass(eq=False, kw_only=True)
+class GSRF(GaussianPeer):
+    """Spectra and channels.
+
+    Args:
+        count: Gaussians.
+        degree, order: largest Legendre degree and Fourier order of the radiance.
+        ssim_weight, fourier_weight: shares of SSIM and of the frequency domain in the loss (spectra).
+        others: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
+    rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
+    makes = ComplexGaussians
+    name: str = "gsrf"
+    count: int = 500
+    degree: int = 3
+    order: int = 3
+    ssim_weight: float = 0.19
+    fourier_weight: float = 0.05
 
 
 def _magnitude(image: Tensor) -> Tensor:

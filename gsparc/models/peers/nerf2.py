@@ -31,34 +31,6 @@ POINTS = 2**16  # evaluated at a time at inference
 TINY = 1e-8  # under the root of a magnitude
 
 
-@dataclass(eq=False, kw_only=True)
-class NeRF2(TrainedPeer):
-    """Spectra.
-
-    Args:
-        width, depth: of the attenuation network; the signal network's two layers have `width` and half of it.
-        samples: points per ray.
-        rays: pixels drawn per step, spread over the batch.
-        octaves, view_octaves: of the Fourier features of places and transmitters, and of directions.
-        far_m: where rays end [m]; None: one and a half times the extent of the scene.
-        others: see `TrainedPeer`.
-    """
-
-    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
-    name: str = "nerf2"
-    width: int = 64
-    depth: int = 4
-    samples: int = 32
-    rays: int = 1024
-    octaves: int = 6
-    view_octaves: int = 3
-    far_m: float | None = None
-
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
-        """See `TrainedPeer.build`."""
-        return MarchedField(scene, self)
-
-
 class MarchedField(Network):
     """The two networks and the march."""
 
@@ -126,3 +98,28 @@ class MarchedField(Network):
         if not rx.batched:
             return rx.position.expand(len(pixel), 3), local @ rx.rotation.T
         return rx.position[sample], (rx.rotation[sample] @ local.unsqueeze(-1)).squeeze(-1)
+
+
+@dataclass(eq=False, kw_only=True)
+class NeRF2(TrainedPeer):
+    """Spectra.
+
+    Args:
+        width, depth: of the attenuation network; the signal network's two layers have `width` and half of it.
+        samples: points per ray.
+        rays: pixels drawn per step, spread over the batch.
+        octaves, view_octaves: of the Fourier features of places and transmitters, and of directions.
+        far_m: where rays end [m]; None: one and a half times the extent of the scene.
+        others: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
+    makes = MarchedField
+    name: str = "nerf2"
+    width: int = 64
+    depth: int = 4
+    samples: int = 32
+    rays: int = 1024
+    octaves: int = 6
+    view_octaves: int = 3
+    far_m: float | None = None

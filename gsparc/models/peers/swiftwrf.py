@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.models.peers.gaussians import Deformation, DeformedPeer, GaussianNetwork, render_each
-from gsparc.models.peers.trained import Network, Scene
+from gsparc.models.peers.trained import Scene
 from gsparc.ops import Cutoff, Pose, SphereGrid
 
 CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
@@ -31,21 +31,6 @@ THIN = 1e-3  # opacity of every Gaussian; a hundred on top of each other lose a 
 CUTOFF = Cutoff(3e-3, relative=True)
 FLAT = 1e-4  # [m] of the third axis, at a metre
 SHIFT = 0.1  # [rad] per unit of the network's output
-
-
-@dataclass(eq=False, kw_only=True)
-class SwiftWRF(DeformedPeer):
-    """Spectra; settings as of `DeformedPeer`."""
-
-    rates: ClassVar[dict[str, float]] = {
-        "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
-    }  # fmt: skip
-    name: str = "swiftwrf"
-    count: int = 300
-
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
-        """See `TrainedPeer.build`."""
-        return PlanarGaussians(scene, self)
 
 
 class PlanarGaussians(GaussianNetwork):
@@ -117,6 +102,18 @@ class PlanarGaussians(GaussianNetwork):
             quats.as_quat(scalar_first=True), strengths.double().clamp(0, 1).numpy(),
             strengths.double().numpy(), "emission of a Gaussian",
         )  # fmt: skip
+
+
+@dataclass(eq=False, kw_only=True)
+class SwiftWRF(DeformedPeer):
+    """Spectra; settings as of `DeformedPeer`."""
+
+    rates: ClassVar[dict[str, float]] = {
+        "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
+    }  # fmt: skip
+    makes = PlanarGaussians
+    name: str = "swiftwrf"
+    count: int = 300
 
 
 def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:

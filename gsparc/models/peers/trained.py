@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import count, pairwise
@@ -112,6 +111,7 @@ class TrainedPeer(Method):
 
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     kinds: ClassVar[tuple[Kind, ...]]
+    makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
     budget_s: float | None = None
@@ -130,9 +130,10 @@ class TrainedPeer(Method):
                 f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
             )
 
-    @abstractmethod
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
-        """The untrained network of a scene."""
+        """The untrained network of a scene; `found` is what was computed before training."""
+        network: Network = self.makes(scene, self)
+        return network
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Tensors computed from the training rows (n,) before training; stored with the weights."""

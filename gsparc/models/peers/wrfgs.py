@@ -25,23 +25,11 @@ from gsparc.models.peers.gaussians import (
     render_each,
     rendering_of,
 )
-from gsparc.models.peers.trained import Network, Scene
+from gsparc.models.peers.trained import Scene
 from gsparc.ops import Pose
 
 CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
 SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
-
-
-@dataclass(eq=False, kw_only=True)
-class WRFGSPlus(DeformedPeer):
-    """Spectra; settings as of `DeformedPeer`."""
-
-    rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
-    name: str = "wrfgs"
-
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
-        """See `TrainedPeer.build`."""
-        return DeformedGaussians(scene, self)
 
 
 class DeformedGaussians(GaussianNetwork):
@@ -75,3 +63,12 @@ class DeformedGaussians(GaussianNetwork):
     def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `GaussianNetwork`; these are drawn where they lie before they are moved."""
         return torch.sigmoid(self.signals + self._changes(tx, rx)[-1][0, :, 0])
+
+
+@dataclass(eq=False, kw_only=True)
+class WRFGSPlus(DeformedPeer):
+    """Spectra; settings as of `DeformedPeer`."""
+
+    rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
+    makes = DeformedGaussians
+    name: str = "wrfgs"

@@ -18,17 +18,22 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.models.baselines.distance_law import law_of
-from gsparc.models.censored import silent
 from gsparc.models.haste import haste
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
-from gsparc.models.powers.likelihood import Covariance, left_out_losses
 from gsparc.models.powers.settings import choose_about, choose_prior
-from gsparc.models.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
+from gsparc.models.target_rows import (
+    TINY_POWER,
+    entry_variance,
+    from_real,
+    rows_of,
+)
 from gsparc.ops import Pose
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.density import gram_of
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import PowerProcess, Rows, conditioned, trend_of_rows
+from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.trend import Trend, trend_of
 from gsparc.processes.wall_count import Walls
 from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
@@ -49,7 +54,8 @@ class PowerField(ConditionalField):
         fringes: of coherent waves, beside the process; they do not move with gradients.
 
     Attributes:
-        log_lengths, share_logit, log_noise, log_amplitude: of the process, see `Covariance`.
+        log_lengths, log_noise, log_amplitude: of the process, see `Kernel`.
+        share_logit: of the first length; not read where there is one.
     """
 
     kind = "powers"
@@ -65,9 +71,10 @@ class PowerField(ConditionalField):
         super().__init__()
         self.fringes = fringes
         self.site, self.trend, self.seed = site, trend, seed
-        covariance = Covariance.of(kernel)
+        odds = kernel.shares[0] / kernel.shares[1] if len(kernel.shares) == 2 else 1.0
         self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude = (
-            nn.Parameter(part) for part in vars(covariance).values()
+            nn.Parameter(torch.tensor(part, dtype=torch.float64).log())
+            for part in (kernel.lengths, odds, kernel.noise, kernel.amplitude)
         )
         self.process: PowerProcess | None = None
         self._tree: cKDTree | None = None  # of its places, made when it is asked
@@ -93,9 +100,13 @@ class PowerField(ConditionalField):
 
     def prior(self) -> tuple[Trend, Kernel]:
         """What the parameters say, without gradients."""
-        logit = [self.share_logit.item()] if len(self.log_lengths) == 2 else []
-        settings = np.array([*self.log_lengths.tolist(), *logit, self.log_noise.item()])
+        settings = self._settings().detach().numpy()
         return self.trend, Kernel.of(settings, math.exp(self.log_amplitude.item()))
+
+    def _settings(self) -> Tensor:
+        """`Kernel.parameters()`, differentiable."""
+        logit = [self.share_logit[None]] if len(self.log_lengths) == 2 else []
+        return torch.cat([self.log_lengths, *logit, self.log_noise[None]])
 
     def loss(self, batch: Batch) -> Tensor:
         """See `ConditionalField`; of the process alone. Rows that were not measured cost 0."""
@@ -108,8 +119,8 @@ class PowerField(ConditionalField):
             return losses + 0 * self.log_noise
         decibels = 10 * batch.target.flatten(1)[used, 0].double().clamp_min(TINY_POWER).log10()
         distance = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
-        covariance = Covariance(self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude)
-        gram, values = covariance.gram(distance, self.trend.terms(places)), decibels - self.trend.mean(places)
+        gram = gram_of(self._settings(), distance, self.trend.terms(places))
+        values = decibels - self.trend.mean(places)
         return losses.index_put((used.nonzero()[:, 0],), left_out_losses(gram, values, self.log_amplitude))
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
@@ -215,10 +226,22 @@ class PowerField(ConditionalField):
         return from_real(decibels[:, None].float(), "rssi", (1,))
 
 
-def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
-    """Powers of rows (n,) in decibels, levels where nothing was heard."""
-    decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
-    return Rows(data.moving[rows], decibels, silent(data, rows))
+def left_out_losses(gram: Tensor, values: Tensor, log_amplitude: Tensor) -> Tensor:
+    """Negative log density (n,) [nats] of each value given the others.
+
+    Rasmussen and Williams (2006), eqs. 5.10 to 5.12.
+
+    Args:
+        gram: (n, n) relative to the amplitude.
+        values: (n,) less the mean law [dB].
+        log_amplitude: () of dB^2.
+
+    Raises:
+        NotPositiveDefiniteError: the covariance is not positive definite.
+    """
+    residual, variance = Conditioned.of(gram, values[:, None], "raise").left_out()
+    log_variance = log_amplitude + variance.log()
+    return 0.5 * (math.log(2 * math.pi) + log_variance + residual[:, 0].square() * torch.exp(-log_variance))
 
 
 def initialise(

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy.linalg import eigh
 
+from gsparc.models.channels.kernels import sphere
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 
 WAVES = 800  # on the sphere: twelve wavelengths of places are resolved
@@ -54,10 +55,7 @@ def basis_of(places: np.ndarray, wavelength: float) -> Basis:
 
     A prior of equal powers from all sides is a field of correlation sin(kd) / (kd).
     """
-    step = np.arange(WAVES) + 0.5
-    height, azimuth = 1 - 2 * step / WAVES, math.pi * (1 + 5**0.5) * step  # a Fibonacci lattice
-    across = np.sqrt(1 - height**2)
-    waves = 2 * math.pi / wavelength * np.c_[across * np.cos(azimuth), across * np.sin(azimuth), height]
+    waves = 2 * math.pi / wavelength * sphere(WAVES).numpy()
     plane = Basis(waves, np.eye(WAVES)).plane(places)
     values, vectors = eigh(plane.conj().T @ plane / len(places))
     kept = values > KEPT * values[-1]

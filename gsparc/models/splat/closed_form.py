@@ -9,6 +9,7 @@ is not the one of least norm).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,7 +19,9 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import Prior
+from gsparc.field.initial import InitTask, Start, unchanged
 from gsparc.field.model import GaussianModel
+from gsparc.models.array_vectors.splat_init import through_array
 from gsparc.models.baselines.gp import choose_kernel, principal_components
 from gsparc.models.left_out_images import LeftOut, predict_left_out
 from gsparc.models.target_rows import to_real, training_targets
@@ -40,9 +43,7 @@ LEAST_NOISE = 1e-6  # of the kernel's variance
 
 def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Prior:
     """Smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
-    generator = np.random.default_rng(seed)
-    chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
-    kernel = _kernel(data, chosen)
+    chosen, kernel = _kernel(data, rows, anchors, seed)
     return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
 
 
@@ -61,9 +62,7 @@ class Process:
 
 def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Process:
     """Of training rows (n,), at up to `anchors` places."""
-    generator = np.random.default_rng(seed)
-    chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
-    kernel = _kernel(data, chosen)
+    _, kernel = _kernel(data, rows, anchors, seed)
     noise = max(kernel.noise, LEAST_NOISE)
     places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
     features = whitened(places, kernel.length, noise, "matern32", anchors)
@@ -71,10 +70,13 @@ def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int)
     return Process(prior, features)
 
 
-def _kernel(data: Measurements, chosen: np.ndarray) -> Kernel:
+def _kernel(data: Measurements, rows: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, Kernel]:
+    """At most so many of rows (n,), drawn by seed, and the kernel of largest likelihood for them."""
+    draw = np.random.default_rng(seed)
+    chosen = rows if len(rows) <= most else np.sort(draw.choice(rows, most, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
     parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
-    return choose_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
+    return chosen, choose_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
 
 
 @dataclass(frozen=True)
@@ -189,3 +191,21 @@ def _left_out(seen: Seen, inverse: Tensor, places: np.ndarray, mean: Tensor) -> 
     predicted = [some.rendered(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
     images = seen.images[:, pixels].double().numpy()
     return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())
+
+
+def prepare(task: InitTask) -> Start:
+    """The start of a task.
+
+    Raises:
+        ValueError: a start is asked for that the data do not allow.
+    """
+    if task.settings.response.array and task.closed_form:
+        return through_array(task)
+    if task.closed_form:
+        assert task.receiver is not None  # else `auto_settings` refuses
+        process = learn_process(task.data, task.rows, task.anchors, task.seed)
+        solve = partial(warm_start, data=task.data, rows=task.rows, receiver=task.receiver, process=process)
+        return Start(process.prior, solve)
+    kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
+    prior = learn_prior(task.data, task.rows, task.anchors, task.seed) if kernel else None
+    return Start(prior, unchanged)

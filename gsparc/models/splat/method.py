@@ -32,11 +32,11 @@ from gsparc.models import checkpoint
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.weights import LEAST_HELD
-from gsparc.models.origin import Origin
+from gsparc.models.parts import Origin
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, resolve, settled
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
-from gsparc.models.splat.initialise import prepare
+from gsparc.models.splat.closed_form import prepare
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.fit import run_stage, total_steps

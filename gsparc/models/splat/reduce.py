@@ -17,9 +17,9 @@ from gsparc.field.fewer_features import distil_features
 from gsparc.field.frozen import FrozenArray, frozen_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.field.response import ArrayResponse
-from gsparc.models.coarse_grid import Filled, coarser
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
+from gsparc.models.reduced import Filled, coarser
 from gsparc.ops import Pose, SphereGrid, mean_weights
 
 if TYPE_CHECKING:

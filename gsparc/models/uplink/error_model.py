@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.models.uplink.posterior import Sources
+from gsparc.models.uplink.search import Sources
 from gsparc.physics.plane_waves import Aperture
 
 RIDGE = 1e-3

@@ -22,8 +22,7 @@ from gsparc.models.uplink.error_model import (
     fit_error_model,
 )
 from gsparc.models.uplink.interface import UplinkMethod
-from gsparc.models.uplink.posterior import Sources
-from gsparc.models.uplink.search import SearchSettings, SourceSearch
+from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext, FitReport

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.models.coarse_grid import Filled, coarser
+from gsparc.models.reduced import Filled, coarser
 from gsparc.ops import SphereGrid
 
 

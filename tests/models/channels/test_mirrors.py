@@ -13,10 +13,9 @@ from gsparc.models.channels.columns import gather
 from gsparc.models.channels.covariance import Shape, Values, diffuse_fields, disturbance, mirrored, specular
 from gsparc.models.channels.evidence import compressed, normalised
 from gsparc.models.channels.field import ChannelField, restored
-from gsparc.models.channels.initial import initialise
+from gsparc.models.channels.initial import ChannelSettings, initialise
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.probe import Probe
-from gsparc.models.channels.settings import ChannelSettings
 from gsparc.ops import Pose
 from gsparc.physics.mirror_planes import reflect
 from gsparc.simulate.shoebox import Room, images

@@ -15,9 +15,8 @@ from gsparc.models.channels.columns import bands, gather
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.covariance import Shape, Values, diffuse_of, disturbance, prior, specular
 from gsparc.models.channels.field import ChannelField, restored
-from gsparc.models.channels.initial import initialise
+from gsparc.models.channels.initial import ChannelSettings, initialise
 from gsparc.models.channels.kernels import cells, directed, directions, isotropic, sphere
-from gsparc.models.channels.settings import ChannelSettings
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 

@@ -20,9 +20,8 @@ from gsparc.models.channels.covariance import (
     prior,
 )
 from gsparc.models.channels.field import ChannelField, restored
-from gsparc.models.channels.initial import initialise
+from gsparc.models.channels.initial import ChannelSettings, initialise
 from gsparc.models.channels.kernels import sphere
-from gsparc.models.channels.settings import ChannelSettings
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.per_station import for_links

@@ -7,7 +7,7 @@ from shoeboxes import as_arrays
 
 from gsparc.data.own import from_arrays
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.source_types import SourceKind, box_of, kinds
+from gsparc.models.image_sources.rows import SourceKind, box_of, kinds
 from gsparc.training.context import FitContext
 
 SCATTERERS = np.array([[2.3, 0.9, 0.8], [1.1, 1.9, 1.2]])

@@ -9,8 +9,8 @@ from boxes import room_of_spectra
 
 from gsparc.field.initial import InitSettings
 from gsparc.models.fields import bearings
-from gsparc.models.moving_array.bearing_field import BearingField, restored
-from gsparc.models.moving_array.checks import site_problem
+from gsparc.models.moving_array.bearing_field import BearingField
+from gsparc.models.moving_array.triangulate import site_problem
 from gsparc.training.context import FitContext
 
 ROWS = np.arange(0, 160, 2)
@@ -30,7 +30,7 @@ def found(data, tmp_path_factory):
 @pytest.fixture
 def field(data, found):
     """A copy of its own, with all that conditioning leaves."""
-    again = restored(data.site, found[0].state())
+    again = BearingField.restored(data.site, found[0].state())
     again.condition(data, ROWS)
     return again
 
@@ -132,7 +132,7 @@ def test_a_restored_field_answers_the_same(data, field, tmp_path):
     with torch.no_grad():
         field.places[0] += 0.01  # not yet conditioned on
     torch.save(field.state(), tmp_path / "state.pt")
-    again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    again = BearingField.restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     batch = data.batch(np.arange(1, 20, 2))
     ours, theirs = (vars(one(batch.tx, batch.rx)) for one in (field, again))
     for name, value in ours.items():

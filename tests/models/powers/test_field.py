@@ -18,7 +18,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.models import fields
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.haste import haste
-from gsparc.models.image_sources.known.mirrors import counted
+from gsparc.models.image_sources.known.images import counted
 from gsparc.models.powers.field import (
     PowerField,
     initialise,

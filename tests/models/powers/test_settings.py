@@ -15,9 +15,9 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
-from gsparc.models.powers.field import rows_of
 from gsparc.models.powers.settings import fit_powers
 from gsparc.models.reduced import reduced
+from gsparc.models.target_rows import rows_of
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 

@@ -15,8 +15,7 @@ from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.peers.fire import Fire
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
-from gsparc.models.uplink.posterior import Sources
-from gsparc.models.uplink.search import SearchSettings, SourceSearch
+from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
 from gsparc.training.context import FitContext
 

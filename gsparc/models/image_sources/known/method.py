@@ -16,8 +16,14 @@ from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.ensemble import SEARCH_END, compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import Scene, direct_amplitude
-from gsparc.models.image_sources.known.images import affordable, hiding, start_amplitudes, visible_sequences
-from gsparc.models.image_sources.known.mirrors import MOST_PATCHES, Mirrors
+from gsparc.models.image_sources.known.images import (
+    MOST_PATCHES,
+    Mirrors,
+    affordable,
+    hiding,
+    start_amplitudes,
+    visible_sequences,
+)
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.phased_gp import PhasedScene
 from gsparc.models.image_sources.refine import learn_visibility, refine

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -26,6 +27,7 @@ from gsparc.processes.powers import conditioned
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, Shared, deviation_of, left_out_whole
 from gsparc.processes.trend import Trend
+from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
 
 LOOKS, SETTLED = 40, 1e-6
@@ -107,7 +109,29 @@ def _trend(prior: Prior) -> Trend:
 
 
 def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tuple[Own, list[str]]:
-    """The law and settings of own processes, and what must be said of them."""
+    """The law and settings of own processes, and what must be said of them.
+
+    Searches end with what they have when the budget is over; single stations have no settings of their own
+    when half of it is.
+    """
+    trend, said = _site_law(rows, seed)
+    heard = rows if rows.silent.all() else rows.loud
+    alone = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
+    with nullcontext() if budget is None else late_when(budget.over):
+        kernel, found = _common_settings(heard, trend, seed)
+        if budget is not None and budget.over(0.5):
+            alone = []
+        for number in alone:
+            distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
+            bounds = bounds_of(2, distance.numpy())
+            _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
+            found[number] = Prior(own, trend)
+    said += [f"settings of their own for {len(alone)} stations"] if alone else []
+    return Own(Prior(kernel, trend), found), said
+
+
+def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
+    """The law of all stations, of their median level, and what must be said of it."""
     few = rows.thinned(FITTED_ON, seed)
     law = fit_law(few, None)
     residual = few.decibels - law.mean(torch.from_numpy(few.places)).numpy()
@@ -115,8 +139,13 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
     levels, typical = np.array([[part.mean(), part.std()] for part in residuals]).T
     law = replace(law, level=law.level + float(np.median(levels)))  # that of one station may be far off
     trend = Trend.about(law, torch.from_numpy(few.places))
-    trend = replace(trend, spread=max(float(np.median(typical)), 0.1) / SLOPE_DB)
-    heard = rows if rows.silent.all() else rows.loud
+    by = f"law of exponent {law.exponent:.3g}, levels +- {levels.std():.2g} dB"
+    spread = max(float(np.median(typical)), 0.1) / SLOPE_DB
+    return replace(trend, spread=spread), [f"{len(levels)} stations in one model, {by}"]
+
+
+def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
+    """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thinned(min(LEARNED_EACH, max(LEARNED_ON // len(heard.stations), 1)), seed)
     views = {number: _view(few.of(number), trend) for number in few.stations}
     at = torch.from_numpy(np.unique(few.places[:, :3], axis=0)[:: max(1, len(few.places) // 4_000)])
@@ -137,22 +166,10 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
     mean = float((count * logs).sum() / count.sum())
     logs = (count * logs + ALIKE * mean) / (count + ALIKE)
     kernel = Kernel.of(best, math.exp(mean))
-    found = {
+    return kernel, {
         number: Prior(replace(kernel, amplitude=math.exp(log)), trend)
         for number, log in zip(views, logs, strict=True)
     }
-    alone = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
-    alone = [] if budget is not None and budget.over(0.5) else alone
-    for number in alone:
-        distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
-        bounds = bounds_of(2, distance.numpy())
-        _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
-        found[number] = Prior(own, trend)
-    by = f"law of exponent {law.exponent:.3g}, levels +- {levels.std():.2g} dB"
-    said = [f"{len(levels)} stations in one model, {by}"]
-    if alone:
-        said.append(f"settings of their own for {len(alone)} stations")
-    return Own(Prior(kernel, trend), found), said
 
 
 def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,8 +8,7 @@ import numpy as np
 
 from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import seek_place
-from gsparc.models.censored import silent
-from gsparc.models.target_rows import to_real, training_targets
+from gsparc.models.target_rows import rows_of
 from gsparc.processes.powers import Rows
 
 
@@ -62,7 +61,7 @@ def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[s
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
         own = rows[data.station[rows] == number]
         if len(own):
-            places[number] = seek_place(Rows(data.moving[own], _decibels(data, own), silent(data, own)))
+            places[number] = seek_place(rows_of(data, own))
             where = ", ".join(f"{value:.4g}" for value in places[number] + site.origin)
             name = site.stations.name[number]
             notes.append(f"the place of station {name} is not given; estimated from powers at ({where}) m")
@@ -73,9 +72,6 @@ def link_rows(data: Measurements, rows: np.ndarray, places: np.ndarray) -> LinkR
     """Rows (n,) of stations that stand at `places` (T, 3) [m]."""
     assert data.station is not None
     station = data.station[rows].astype(np.int64)
-    ends = np.concatenate([data.moving[rows].astype(np.float64), places[station]], 1)
-    return LinkRows(ends, _decibels(data, rows), silent(data, rows), station, np.asarray(rows, np.int64))
-
-
-def _decibels(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    return to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
+    seen = rows_of(data, rows)
+    ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
+    return LinkRows(ends, seen.decibels, seen.silent, station, np.asarray(rows, np.int64))

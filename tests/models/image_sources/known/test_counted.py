@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from gsparc.data.walls import SceneWalls
-from gsparc.models.image_sources.known.mirrors import counted
+from gsparc.models.image_sources.known.images import counted
 
 WALL = np.array([[2.0, -3, 0], [2, 3, 0], [2, 3, 3], [2, -3, 3]])
 FLOOR = np.array([[-5.0, -5, 3], [5, -5, 3], [5, 5, 3], [-5, 5, 3]])

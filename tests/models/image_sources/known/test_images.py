@@ -9,8 +9,13 @@ from rooms import PILLAR, shoebox
 from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.models.image_sources.clutter.blocking import visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.known.images import affordable, hiding, start_amplitudes, visible_sequences
-from gsparc.models.image_sources.known.mirrors import Mirrors
+from gsparc.models.image_sources.known.images import (
+    Mirrors,
+    affordable,
+    hiding,
+    start_amplitudes,
+    visible_sequences,
+)
 from gsparc.physics.mirror_planes import images
 
 ROOM = SceneWalls(tuple(box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5]))), PILLAR)

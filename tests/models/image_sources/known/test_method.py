@@ -48,7 +48,7 @@ def test_of_few_rows_known_walls_tell_more_than_a_search(room):
     assert errors[0] < 0.05 and errors[0] < 0.3 * errors[1], errors
     assert known.terms[:2] == ("phase", "visibility") and known.count > 20
     assert any("occluding boxes" in note for note in report.notes)
-    again = RESTORED["scene"](data.site, known.state())
+    again = RESTORED["sources"](data.site, known.state())
     assert missed(again, data, fold.test) == pytest.approx(errors[0], rel=1e-3)
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gsparc.data.walls import SceneWalls, box_faces
-from gsparc.models.image_sources.known import mirrors
-from gsparc.models.image_sources.known.mirrors import Mirrors
+from gsparc.models.image_sources.known import images as mirrors
+from gsparc.models.image_sources.known.images import Mirrors
 
 NOTHING = np.zeros((0, 2, 3))
 

@@ -8,7 +8,8 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.mixture.process_field import initialise, restored
+from gsparc.models.fields import process as initialise
+from gsparc.models.method_field import ProcessField
 from gsparc.models.mixture.solutions import weighed
 from gsparc.training.context import FitContext
 
@@ -22,7 +23,7 @@ def test_it_answers_as_the_process_does_and_is_read_back():
     plain.fit(data, Fold(ROWS, ROWS[:0], ROWS[:0]), FitContext())
     found, said = field(batch.tx, batch.rx), plain.predict(batch.tx, batch.rx)
     assert torch.equal(found.mean, said.mean) and torch.equal(found.unknown, 1 - said.confidence)
-    again = restored(data.site, field.state())(batch.tx, batch.rx)
+    again = ProcessField.restored(data.site, field.state())(batch.tx, batch.rx)
     assert torch.allclose(again.mean, found.mean, atol=1e-6) and field.count == 0
 
 

@@ -1,0 +1,77 @@
+"""A fitted method as a field, so that it is weighed against other solutions of the same rows."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.method import Method
+from gsparc.ops import Pose
+from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.training.context import FitContext
+
+
+class MethodField(ConditionalField):
+    """What a method found; it chooses its settings anew where it is conditioned.
+
+    Args:
+        method: fitted, or restored.
+
+    Attributes:
+        makes: class of the method.
+    """
+
+    makes: ClassVar[type[Method]]
+
+    def __init__(self, method: Any) -> None:
+        super().__init__()
+        self.method, self.site = method, method.site
+
+    @property
+    def count(self) -> int:
+        """Gaussians, of the largest search."""
+        return self.method.size()
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Of nothing that could be learned: `ValueError`."""
+        raise ValueError(f"{self.kind}: it has nothing that gradient steps move")
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`."""
+        self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`."""
+        found = self.method.predict(tx, rx)
+        return Posterior(found.mean, found.variance, found.mean if self.count else None, 1 - found.confidence)
+
+    def left_out(self) -> LeftOutRows:
+        """Not known: `ValueError`."""
+        raise ValueError(f"{self.kind}: rows left out are not kept")
+
+    def state(self) -> dict[str, Any]:
+        """The method's."""
+        return {"method": self.method.state()}
+
+    @classmethod
+    def restored(cls, site: Site, state: dict[str, Any]) -> Self:
+        """The field whose `state()` this was."""
+        method = cls.makes()
+        method.restore(site, state["method"])
+        return cls(method)
+
+
+class ProcessField(MethodField):
+    """`gp` without any Gaussians, so that others are weighed against it on the same rows."""
+
+    kind = "process"
+    makes = GaussianProcess
+    count = 0  # type: ignore[assignment]
+    terms = ("residual",)  # type: ignore[assignment]
