@@ -48,6 +48,8 @@ class FitContext:
             `best_stations` says.
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
         leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
+        rival: error of another solution on these groups, as a share of the energy: searches end where the
+            first that is finished misses so much more that it will have no weight beside it.
         resume: what an interrupted run left, to go on from: a file, or the folder of a run of parts.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -68,6 +70,7 @@ class FitContext:
     stations: StationModels = "auto"
     split: SplitSettings | FileSettings | None = None
     leave_out: tuple[np.ndarray, ...] = ()
+    rival: float = math.inf
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16

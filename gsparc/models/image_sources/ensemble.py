@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
@@ -29,6 +30,7 @@ CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no th
 LAST_START, ROUNDS_END, SEARCH_END = 0.6, 0.8, 0.9
 FINAL_SHARE = 0.1  # least share of the budget for the final process
 PROGRESS_S = 10.0  # [s] between two lines about progress
+BEATEN = 2.0  # times the error of a rival: sources that missed more had no weight in the end
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
 
@@ -41,10 +43,12 @@ def search_many(
     budget: TimeBudget,
     clutter: bool,
     cache: SearchCache,
+    rival: float = math.inf,
 ) -> list[Member]:
     """One search per set of rows, best first; at least one, others while the budget lasts.
 
-    Once two have reached the noise floor no further search starts, and those under way end without a result.
+    Once two have reached the noise floor, or one is `beaten`, no further search starts, and those under way
+    end without a result.
 
     Args:
         row_sets: rows of each search, unit mean power, about the middle of the scene.
@@ -55,6 +59,7 @@ def search_many(
         budget: of all together; see `LAST_START`, `ROUNDS_END` and `SEARCH_END`.
         clutter: search for occluding boxes and finite mirrors, too.
         cache: of finished searches.
+        rival: see `FitContext`.
 
     Raises:
         KeyboardInterrupt: by the user, within a step of each search.
@@ -63,7 +68,8 @@ def search_many(
     stopped = threading.Event()
 
     def unwanted() -> bool:
-        return stopped.is_set() or at_noise_floor(errors, noise_floor)
+        ended = at_noise_floor(errors, noise_floor) or (bool(errors) and beaten(min(errors), rival))
+        return stopped.is_set() or ended
 
     def made(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
@@ -153,6 +159,11 @@ def compact(rows: Rows) -> bool:
 def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2) -> bool:
     """Whether `least` searches have reached the noise floor."""
     return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
+
+
+def beaten(error: float, rival: float) -> bool:
+    """Whether a solution of such an error would hardly have weight beside one of error `rival`."""
+    return error > BEATEN * rival
 
 
 def affordable_rows(rows: Rows, found: list[Member], noise_floor: float, budget: TimeBudget) -> int:

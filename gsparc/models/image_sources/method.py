@@ -82,6 +82,7 @@ class ImageSourceGP(FramedMethod):
     name = "image_source_gp"
     held: LeftOutRows | None = None  # rows of `FitContext.leave_out`, by searches without them
     _groups: tuple[np.ndarray, ...] = ()
+    _rival = math.inf
     resumable = True  # finished searches are kept in `last.ckpt`
     takes_budget = True
 
@@ -121,7 +122,7 @@ class ImageSourceGP(FramedMethod):
         refuse(data.site, self.name)
         refuse_turning(data)
         known = np.concatenate([fold.train, fold.val])
-        self._groups = context.leave_out
+        self._groups, self._rival = context.leave_out, context.rival
         cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
         try:
             return self._fit(data, known, context, cache)
@@ -219,7 +220,9 @@ class ImageSourceGP(FramedMethod):
         cache: SearchCache,
     ) -> list[Member]:  # fmt: skip
         transmitter, floor = self._transmitter(), self.noise_floor
-        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache)
+        return search_many(
+            row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, self._rival
+        )
 
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
         """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ GROUPS = 3  # of training rows, that solutions are weighed by
 FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
 CLOSED_SHARE = 0.3  # of the seconds, for what takes no more than it needs beside what does
 FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
+HOPELESS = 1.5  # times the error of waves from all around, of few sources: more had no weight then
 SEARCH_LOOKS = 60  # at a search's rows, that the shortest takes
 LEAST_S = 0.2  # of a part, though others left none
 OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
@@ -73,6 +75,7 @@ def find(
         plans.append((part, init, 1.0))
     found: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
+    missed: dict[str, float] = {}
     for name, settings, share in plans:
         part = name.split()[-1]
         least = SEARCH_LOOKS * factor_s(settings.search_rows) if part in SEARCHES else 0.0
@@ -80,12 +83,15 @@ def find(
             log.info("init=%s is left out: the seconds are too few for a search", name)
             budget.limited = True
             continue
+        if part in SEARCHES and (why := _hopeless(name, missed)) is not None:
+            log.info("init=%s is left out: %s", name, why)
+            continue
         within = replace(context, budget_s=share * max(until_s - budget.spent, LEAST_S))
         if name.startswith("few "):
             within = replace(within, run_dir=Path(), resume=None)
         try:
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
-            within = replace(within, leave_out=leave_out)
+            within = replace(within, leave_out=leave_out, rival=min(missed.values(), default=math.inf))
             clutter = effects.visibility is not False
             with late_when(budget.over):
                 field, report = INITIALISERS[part](data, rows, settings, clutter, within)
@@ -105,7 +111,23 @@ def find(
             found.pop(name, None)
             continue
         reports[name] = report
+        if field.held is not None:
+            target = comparable(data.batch(field.held.rows).target, data.site)
+            missed[name] = solution_weights.error(comparable(field.held.mean, data.site), target)
     return found, reports
+
+
+def _hopeless(name: str, missed: dict[str, float]) -> str | None:
+    """Why a search would gain nothing, by what one of `FEW` sources missed; None where it may.
+
+    Args:
+        name: of the search.
+        missed: shares of the energy of held-out rows, of solutions found before.
+    """
+    few, waves = missed.get(f"few {name}", 0.0), missed.get("diffuse", math.inf)
+    if few <= HOPELESS * waves:
+        return None
+    return f"few sources miss {few:.3f} of the energy, waves from all around {waves:.3f}"
 
 
 def weighed(
