@@ -53,7 +53,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     measured = contributions(method, data, learned)
     settings = list(combinations(method, plain(config.grid), plain(config.singles)))
-    threads = _threads(config.threads)
+    alone = config.threads is None and not method.threads_pay
+    threads = [1] if alone else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [Candidate(worded(s), s, reduced(method, s, measured), tuple(threads)) for s in settings]
     others = others_of(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
@@ -61,6 +62,9 @@ class Method(ABC):
     has_parts = False  # whether it resumes parts in folders of their own
     has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
     takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
+    threads_pay: bool = (
+        False  # whether several threads answer a single place sooner than one: where it renders
+    )
 
     @property
     def label(self) -> str:
@@ -123,6 +127,23 @@ class Method(ABC):
             "model/variance_explained": None,
             "time/init_s": None,
         }
+
+
+@contextmanager
+def suited_threads(method: Method, places: int) -> Iterator[None]:
+    """As many CPU threads as suit a query: one for a single place, where parts of it are too small to share.
+
+    On a busy machine two threads that wait for each other take up to a hundred times as long.
+    """
+    before = torch.get_num_threads()
+    if before == 1 or places > 1 or method.threads_pay:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,11 @@ class PlannedField(LearnedField):
         return approximated(self.name, getattr(process, "posterior", None))
 
     @property
+    def threads_pay(self) -> bool:  # type: ignore[override]
+        """See `Method`."""
+        return self.field is None and super().threads_pay
+
+    @property
     def takes_budget(self) -> bool:  # type: ignore[override]
         """Always: steps or searches."""
         return True

@@ -81,7 +81,7 @@ class View(Method):
     """
 
     def __init__(self, inner: Method) -> None:
-        self.inner, self.name = inner, inner.name
+        self.inner, self.name, self.threads_pay = inner, inner.name, inner.threads_pay
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Kind, Site
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
 from gsparc.prediction.confidence import Trusted
@@ -142,8 +142,7 @@ class Predictor:
         The confidence is None where the method has none; else the one that `confidence` answers.
         """
         asked, pose, _, _ = self._ends(tx, rx)
-        with torch.no_grad():
-            said = self._whole.predict(asked, pose)
+        said = _predicted(self._whole, asked, pose)
         sure, scale = None, self.site.target_scale
         if said.confidence is not None or (self.kind or self.trusted.kind) not in (None, "learned"):
             places = self.site.moving(asked, pose).double().numpy()
@@ -264,8 +263,7 @@ class Predictor:
             single, like, places = np.ndim(uplink) == 2, isinstance(uplink, Tensor), None
         else:
             asked, pose, single, like = self._ends(tx, rx)
-            with torch.no_grad():
-                said = self._whole.predict(asked, pose)
+            said = _predicted(self._whole, asked, pose)
             places = self.site.moving(asked, pose).double().numpy()
         if said.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             raise ValueError(f"{self.method.name} has no confidence")
@@ -278,8 +276,7 @@ class Predictor:
                 f"call .{self.site.kind}(...)"
             )
         asked, pose, single, like = self._ends(tx, rx)
-        with torch.no_grad():
-            mean = self.method.predict(asked, pose).mean
+        mean = _predicted(self.method, asked, pose).mean
         scale = self.site.target_scale
         return _returned(mean if scale == 1 else mean * scale, single, like)
 
@@ -342,6 +339,12 @@ class Predictor:
                 raise ValueError(f"rx= holds {len(rotation)} rotations for {count} positions")
             return rotation
         return np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
+
+
+@torch.no_grad()
+def _predicted(method: Method, tx: Tensor, rx: Pose) -> Prediction:
+    with suited_threads(method, len(tx)):
+        return method.predict(tx, rx)
 
 
 def usual_heights(site: Site) -> dict[End, float]:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from gsparc.data.schema import Batch, Measurements
-from gsparc.models.method import Method
+from gsparc.models.method import Method, Prediction, suited_threads
 
 Key = TypeVar("Key")
 Call = Callable[[int], object]
@@ -106,7 +106,11 @@ def cycling(methods: Mapping[Key, Method], queries: Sequence[Batch]) -> dict[Key
     """Calls that answer one of `queries` each, another one every time."""
 
     def call(method: Method) -> Call:
-        return lambda turn: method.answer(queries[turn % len(queries)])
+        return lambda turn: answered(method, queries[turn % len(queries)])
+
+    def answered(method: Method, query: Batch) -> Prediction:
+        with suited_threads(method, len(query)):
+            return method.answer(query)
 
     return {name: call(method) for name, method in methods.items()}
 

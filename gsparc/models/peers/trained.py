@@ -110,6 +110,7 @@ class TrainedPeer(Method):
     """
 
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
+    threads_pay: ClassVar[bool] = True  # type: ignore[misc]
     kinds: ClassVar[tuple[Kind, ...]]
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name

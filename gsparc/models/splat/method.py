@@ -307,6 +307,11 @@ class LearnedField(Method):
             raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
         return self.model
 
+    @property
+    def threads_pay(self) -> bool:  # type: ignore[override]
+        """See `Method`; through an array all pixels follow from a few numbers."""
+        return not self.settings.response.array
+
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
