@@ -17,7 +17,7 @@ from gsparc.data.checks.outliers import outliers, too_far
 from gsparc.data.checks.plausibility import LinkLevels, wild_of
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import OUTLINE, annotate, bounded, draw_stations, legend_below
+from gsparc.evaluation.from_above import OUTLINE, annotate, bounded, draw_stations, framed, legend_below
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
@@ -159,11 +159,7 @@ def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
     shown = [found.place[~found.far], still_ends(data)]
     if data.site.static_end is None:
         shown.append(data.tx[:, :2] + data.site.origin[:2])
-    every = np.concatenate(shown)
-    every = every[np.isfinite(every).all(axis=1)]  # but for what stands at an unknown place
-    low, high = every.min(axis=0), every.max(axis=0)
-    margin = 0.06 * max(float((high - low).max()), 1e-3)
-    return low - margin, high + margin
+    return framed(np.concatenate(shown))
 
 
 def _draw_map(

@@ -14,16 +14,14 @@ import numpy as np
 from gsparc.data.instantiate import known_keys
 from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
-from gsparc.simulate.engine import Engine
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
-from gsparc.simulate.scenes.placement import clear_of
-from gsparc.simulate.scenes.receivers import layout, receivers
+from gsparc.simulate.scenes.receivers import clear_of, layout, receivers
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna, Transmitter, stations
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
-from gsparc.simulate.survey import Survey
+from gsparc.simulate.survey import Engine, Survey
 
 log = logging.getLogger(__name__)
 
