@@ -106,7 +106,10 @@ def draw_site(
         steps: `plausibility.steps_of` the levels.
     """
     found = spots(data, levels)
-    low, high = _view(data, found)
+    shown = [found.place[~found.far], still_ends(data)]  # but those far outside
+    if data.site.static_end is None:
+        shown.append(data.tx[:, :2] + data.site.origin[:2])
+    low, high = framed(np.concatenate(shown))
     width, height = (high - low) / (high - low).max() * INCHES
     width, height = max(width, 0.45 * INCHES) + 1.9, max(height, 0.35 * INCHES) + 1.6
     jumping = sorted({t for t, _ in steps}, key=lambda t: -max(abs(s.change_db) for u, s in steps if u == t))
@@ -152,14 +155,6 @@ def still_ends(data: Measurements) -> np.ndarray:
     else:
         place = np.zeros((0, 3)) if site.static_position is None else site.static_position[None]
     return place[:, :2] + site.origin[:2]
-
-
-def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of the map: all places but those far outside, all stations, and a margin."""
-    shown = [found.place[~found.far], still_ends(data)]
-    if data.site.static_end is None:
-        shown.append(data.tx[:, :2] + data.site.origin[:2])
-    return framed(np.concatenate(shown))
 
 
 def _draw_map(

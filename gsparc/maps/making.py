@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
+from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.maps.area import Grid, grid_of
@@ -256,10 +257,15 @@ def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> di
         return {site.moving_end: places}
     if other is None:
         raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    place = np.asarray(other, np.float64)
-    if place.shape != (3,) or not np.isfinite(place).all():
-        raise DataError(f"other_end={other}: three finite numbers [m] are needed")
-    return {"rx": places, "tx": np.broadcast_to(place, places.shape)}
+    return {"rx": places, "tx": np.broadcast_to(place_of("other_end", other), places.shape)}
+
+
+def place_of(name: str, given: Any) -> np.ndarray:
+    """(3,) [m] of the setting `name`; `DataError` where it is no place."""
+    place = finite(given)
+    if place.shape != (3,):
+        raise DataError(f"{name}={given}: three finite numbers [m] are needed")
+    return place
 
 
 def _local(places: np.ndarray, other: Sequence[float] | None, site: Site) -> np.ndarray:

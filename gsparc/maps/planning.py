@@ -120,12 +120,11 @@ def plan_next(
     """
     if type(count) is not int or count < 1:
         raise DataError(f"count={count}: a whole number of at least 1 is needed")
-    if route_m is not None and not (np.isfinite(route_m) and route_m > 0):
-        raise DataError(f"route_m={route_m}: metres above 0 are needed")
+    for name, metres in (("route_m", route_m), ("length_m", length_m)):
+        if metres is not None and not (np.isfinite(metres) and metres > 0):
+            raise DataError(f"{name}={metres}: metres above 0 are needed")
     if not (np.isfinite(least_gain_db) and least_gain_db >= 0):
         raise DataError(f"least_gain_db={least_gain_db}: at least 0 dB is needed")
-    if length_m is not None and not (np.isfinite(length_m) and length_m > 0):
-        raise DataError(f"length_m={length_m}: metres above 0 are needed")
     origin = None if predictor is None else predictor.site.georeference
     grid = coarse_grid(predictor, area, height_m, plan, promise)
     targets = grid.places()
@@ -279,7 +278,8 @@ class Tour:
         """Which of places (n, 3) can be added, (n,) bool."""
         if self.longest is None:
             return np.ones(len(places), bool)
-        return self._insertions(places[:, :2]).min(axis=0) + self._length() <= self.longest
+        length = self.length_of(self._stops(), self.start)
+        return self._insertions(places[:, :2]).min(axis=0) + length <= self.longest
 
     def add(self, place: np.ndarray) -> None:
         """Put a place (3,) where it lengthens the walk least."""
@@ -301,9 +301,6 @@ class Tour:
 
     def _stops(self) -> np.ndarray:
         return np.array([self._places[k] for k in self._walk]).reshape(-1, 2)
-
-    def _length(self) -> float:
-        return self.length_of(self._stops(), self.start)
 
     def _ends(self, stops: np.ndarray) -> np.ndarray:
         """Stops (n + 2, 2) with what is before and after them; NaN where there is nothing."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -23,14 +23,19 @@ INSIDE = ("drop", "refuse")
 MOST = 1_000_000  # places
 
 
-class Ground(Protocol):
-    """What receivers stand on, and where they may."""
+@dataclass(frozen=True)
+class Ground:
+    """What receivers stand on, and where they may.
 
-    def lift(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3) of places whose z counts from the ground (or roof), from the world's zero [m]."""
+    Attributes:
+        allowed: which of places (n, 3) [m], world, are not in, on or above what stands there (n,) bool.
+        lift: (n, 3) of places whose z counts from the ground (or roof), from the world's zero [m].
+        open_sky: whether nothing is above those that are allowed.
+    """
 
-    def allowed(self, points: np.ndarray) -> np.ndarray:
-        """Which of places (n, 3) [m], world, are not in, on or above what stands there (n,) bool."""
+    allowed: Callable[[np.ndarray], np.ndarray]
+    lift: Callable[[np.ndarray], np.ndarray] = lambda points: points
+    open_sky: bool = False
 
 
 @dataclass(frozen=True)

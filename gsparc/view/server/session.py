@@ -406,14 +406,14 @@ class Session:
             self._lay(*self.made[name])
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
         elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
-            yield from self._predicted_plane(name == BEYOND)
+            grid = replace(self.view.grid, height=float(self.height.value))
+            yield from self._predicted_plane(grid, name == BEYOND)
         elif PLANE in self.nodes:
             self.nodes.pop(PLANE).remove()
         self._legends()
         yield
 
-    def _predicted_plane(self, beyond: bool) -> Iterator[None]:
-        grid = replace(self.view.grid, height=float(self.height.value))  # type: ignore[type-var]
+    def _predicted_plane(self, grid: Grid, beyond: bool) -> Iterator[None]:
         predictor = self.view.viewed.asked(self.station)
         other = self.places["tx"] if self.site.static_end is None else None
         known, there = self.one.about.usual, self._still()
