@@ -75,15 +75,8 @@ def peak_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
-def measured(
-    source: str,
-    name: str,
-    data: Measurements,
-    fold: Fold,
-    error: Callable[..., Any],
-    amount: int | None = None,
-) -> None:
-    """A line of one method; `amount` stands in place of the number of rows."""
+def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
+    """A line of one method."""
     held, private, method = peak_gb(), Private(), for_links(lambda: make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
@@ -103,20 +96,19 @@ def measured(
     query = (time.process_time() - began) / SINGLE * 1e3
     spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
     values = (cpu, wall, query, rmse, spread, held, peak_gb(), private.most, os.getloadavg()[0])
-    count = len(fold.train) + len(fold.val) if amount is None else amount
+    count = len(fold.train) + len(fold.val)
     csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))
     sys.stdout.flush()
 
 
 def each(
-    source: str, methods: Sequence[str], data: Measurements, fold: Fold, error: Callable[..., Any],
-    amount: int | None = None,
-) -> None:  # fmt: skip
+    source: str, methods: Sequence[str], data: Measurements, fold: Fold, error: Callable[..., Any]
+) -> None:
     """A line of every method, each fitted in a child that the measurements are shared with."""
     for name in methods:
         make(name)  # imports it, so that no child does
     for name in methods:
-        aside(lambda name=name: measured(source, name, data, fold, error, amount))
+        aside(lambda name=name: measured(source, name, data, fold, error))
 
 
 def aside(work: Callable[[], Any]) -> None:

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from gsparc.ops import Pose as Pose
     from gsparc.ops import SphereGrid as SphereGrid
     from gsparc.prediction.fit import fit as fit
-    from gsparc.prediction.load import load as load
+    from gsparc.prediction.operating_point import load as load
     from gsparc.prediction.predictor import Predictor as Predictor
 
 # Torch's threads would otherwise spin for one another and against our kernels' own: up to twice slower, and
@@ -18,7 +18,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # Looked up on first use: `import gsparc` costs nothing.
 _PUBLIC = {
     "fit": "gsparc.prediction.fit",
-    "load": "gsparc.prediction.load",
+    "load": "gsparc.prediction.operating_point",
     "Predictor": "gsparc.prediction.predictor",
     "Pose": "gsparc.ops",
     "SphereGrid": "gsparc.ops",

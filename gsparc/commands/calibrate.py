@@ -23,9 +23,7 @@ from gsparc.evaluation.calibration import (
     trials,
 )
 from gsparc.evaluation.summary import provenance, shown, table, write_summary
-from gsparc.prediction.confidence import (
-    Evidence,
-)
+from gsparc.prediction.confidence import Evidence
 from gsparc.prediction.risk_threshold import Promise
 from gsparc.prediction.timing import machine_facts
 

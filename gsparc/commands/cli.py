@@ -9,8 +9,6 @@ import os
 import re
 import sys
 from collections.abc import Callable
-from importlib import import_module
-from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -21,7 +19,7 @@ from rich.console import Console
 from gsparc.commands import job_name  # noqa: F401  # configurations name folders by it
 from gsparc.commands.plugins import offer, offer_scenes
 from gsparc.commands.run_lock import InUse, release
-from gsparc.evaluation.console import CONFIGS, FULL_ERROR, one_line
+from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, one_line
 
 LAUNCHERS = ("submitit.", "joblib.externals.loky.")  # where their errors are defined
 
@@ -102,18 +100,14 @@ def _message_of(error: Exception) -> str:
 def _explained(task: Callable[[DictConfig], object], config: str) -> str:
     """What a command does and its settings with their comments, which Hydra leaves out."""
     what = inspect.cleandoc(inspect.getmodule(task).__doc__ or "").partition("\n\n")[0]  # type: ignore[union-attr]
-    texts = [(_folder() / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
+    folder = config_folder()
+    texts = [(folder / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
     kind = re.search(r"^  - kind: (\w+)", texts[0], re.MULTILINE)  # settings of the command itself
     if kind is not None:
         said = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
-        file = _folder() / "kind" / f"{(said or [kind[1]])[-1]}.yaml"
+        file = folder / "kind" / f"{(said or [kind[1]])[-1]}.yaml"
         texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
     return "\n\n".join([what, *texts]) + "\n\n"
-
-
-def _folder() -> Path:
-    """Where the configurations are."""
-    return Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0])
 
 
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:

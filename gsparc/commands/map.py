@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
 from gsparc.evaluation.console import open_console
-from gsparc.evaluation.open_runs import Opened, open_files
-from gsparc.maps import geotiff
-from gsparc.maps.field_map import FieldMap
+from gsparc.evaluation.open_runs import open_files
+from gsparc.maps.field_map import FieldMap, geotiff_wanted, write_geotiff
 from gsparc.maps.floor_plan import FloorPlan, read_plan
 from gsparc.maps.intervals import Coverage
 from gsparc.maps.making import map_of
@@ -26,8 +27,9 @@ from gsparc.maps.page import write_page
 from gsparc.maps.pictures import draw_layer, file_name, layers
 from gsparc.maps.promise import Promise, PromiseSettings, gather, stored_promise
 from gsparc.models import checkpoint
+from gsparc.models.method import Method
 from gsparc.models.registry import build
-from gsparc.prediction.load import load
+from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import peak_memory
 from gsparc.training.context import FitContext
@@ -45,23 +47,22 @@ def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, re
     found = None if renew else stored_promise(stored.extra)
     if found is not None and (settings.block_m is None or settings.block_m == found.block_m):
         return found
-    config = stored.configuration
-    if "model" not in config:
+    if "model" not in stored.configuration:
         raise DataError(
             f"{path}: does not say how it was trained; say promised=false for a map without promise"
         )
-    run, context = opened(path, dataset), context_of_stored(config)
-    make = partial(build, config["model"], trusted=False)
-    fold = run.split.folds[0]
+    method, make, data, fold, context = trained(path, dataset)
     log.info("a promise for this map: %d fits without blocks of places", settings.folds)
-    found = gather(run.methods[0], make, run.data, fold, settings, context, log.info)
+    found = gather(method, make, data, fold, settings, context, log.info)
     found.coverage(settings.share)  # too little evidence is said before anything is stored
     found.keep(path)
     return found
 
 
-def opened(path: str, dataset: dict[str, Any]) -> Opened:
-    """A model with the very data that it was trained on.
+def trained(
+    path: str, dataset: dict[str, Any]
+) -> tuple[Method, Callable[[], Method], Measurements, Fold, FitContext]:
+    """A model, an unfitted copy, the very data and rows that it was trained on, and how.
 
     Raises:
         DataError: they are gone, or are others.
@@ -74,15 +75,13 @@ def opened(path: str, dataset: dict[str, Any]) -> Opened:
         ) from None
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
-    return run
-
-
-def context_of_stored(config: Mapping[str, Any]) -> FitContext:
-    """That of the fit which a checkpoint's configuration describes."""
-    return FitContext(
+    config = run.stored[0].configuration
+    context = FitContext(
         seed=int(config.get("seed", 0)), budget_s=config.get("budget_s"),
         budget_clock=config.get("budget_clock", "wall"), stations=config.get("stations", "each"),
     )  # fmt: skip
+    make = partial(build, config["model"], trusted=False)
+    return run.methods[0], make, run.data, run.split.folds[0], context
 
 
 @contextmanager
@@ -104,6 +103,15 @@ def plan_of(config: DictConfig) -> FloorPlan | None:
     return read_plan(settings["plan"], settings["plan_points"])
 
 
+def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np.ndarray]:
+    """Columns of a table of places (n, 3) [m], in degrees, too, where the model knows its place on Earth."""
+    columns = dict(zip(("x", "y", "z"), places.T.round(4), strict=True))
+    if predictor is not None and predictor.site.georeference is not None and len(places):
+        latitude, longitude, _ = predictor.degrees(places)
+        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
+    return columns
+
+
 def settings_of(config: DictConfig) -> RunSettings:
     """The settings of a run, of which `stations` is not one here: it holds names."""
     return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
@@ -122,18 +130,6 @@ def stations_of(given: Any) -> list[str | int] | None:
     if not isinstance(given, list):
         raise DataError(f"stations={given}: all, a name or a list of names is needed")
     return given
-
-
-def draw(found: FieldMap, predictor: Predictor, folder: Path, unit: str, floor: FloorPlan | None) -> None:
-    """A PNG of every layer."""
-    for layer in layers(found, unit):
-        draw_layer(found, layer, folder / file_name(layer), title_of(found, predictor), floor)
-
-
-def title_of(found: FieldMap, predictor: Predictor) -> str:
-    """Of pictures and the page."""
-    height = f"height {found.grid.height:g} m, cells of {found.grid.step:.3g} m"
-    return f"{predictor.site.name}, {predictor.method.label}: {height}"
 
 
 def lines_of(found: FieldMap, kept: Coverage | None) -> list[str]:
@@ -176,8 +172,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         "load": settings["load"], "noise_db": config.noise_db, "other_end": settings["other_end"],
         "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db),
     }  # fmt: skip
-    check_map(predictor, asked)
-    geotiff.wanted(config.geotiff, predictor.site.georeference)
+    map_of(predictor, dry=True, **asked)  # refuses what cannot be before any evidence is gathered
+    geotiff_wanted(config.geotiff, predictor.site.georeference)
     promise = None
     if config.promised:
         promise = promise_of(str(config.ckpt), settings["dataset"], how, bool(config.renew))
@@ -187,13 +183,15 @@ def task(config: DictConfig) -> dict[str, Any]:
     lines = lines_of(found, kept)
     unit = str(config.unit or predictor.site.level_unit)
     drawn = list(layers(found, unit))
+    size = f"height {found.grid.height:g} m, cells of {found.grid.step:.3g} m"
+    title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     found.save(run_dir / "map.npz")
-    if config.pictures:
-        draw(found, predictor, run_dir, unit, floor)
+    for layer in drawn if config.pictures else ():
+        draw_layer(found, layer, run_dir / file_name(layer), title, floor)
     origin = predictor.site.georeference
-    if origin is not None and geotiff.wanted(config.geotiff, origin):
-        geotiff.write_geotiff(run_dir / "map.tif", found, origin)
-    write_page(run_dir / "map.html", found, drawn, title_of(found, predictor), lines, floor)
+    if origin is not None and geotiff_wanted(config.geotiff, origin):
+        write_geotiff(run_dir / "map.tif", found, origin)
+    write_page(run_dir / "map.html", found, drawn, title, lines, floor)
     facts = {
         **found.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,
@@ -205,12 +203,3 @@ def task(config: DictConfig) -> dict[str, Any]:
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
     before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map "
     return finish(run_dir, facts, lines=lines, before=before)
-
-
-def check_map(predictor: Predictor, asked: dict[str, Any]) -> None:
-    """Refuse what cannot be mapped before any evidence is gathered: one cell of each station is predicted.
-
-    Raises:
-        DataError: as `map_of`.
-    """
-    map_of(predictor, **{**asked, "dry": True})

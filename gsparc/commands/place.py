@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.map import context_of_stored, opened, progress, promise_of
+from gsparc.commands.map import coordinates, progress, promise_of, trained
 from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.maps.pictures import draw_placing
-from gsparc.maps.placing import (
-    NewStation,
-    in_words,
-    new_station_error,
-    number,
-    place_next,
-    unheard_refused,
-)
+from gsparc.maps.placing import NewStation, in_words, new_station_error, number, place_next, unheard_refused
 from gsparc.maps.promise import PromiseSettings
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
-from gsparc.models.registry import build
-from gsparc.prediction.load import load
+from gsparc.prediction.operating_point import load
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -45,21 +35,12 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.promised:
         promise = promise_of(path, settings["dataset"], PromiseSettings(**settings["promise"]), False)
     if config.left_out:
-        run = opened(path, settings["dataset"])
-        make = partial(build, stored.configuration["model"], trusted=False)
-        context = context_of_stored(stored.configuration)
-        fold = run.split.folds[0]
-        error = new_station_error(run.methods[0], make, run.data, fold, context, int(config.left_out))
+        error = new_station_error(*trained(path, settings["dataset"]), int(config.left_out))
     with progress("candidates") as tick:
         found = place_next(predictor, count=config.count, promise=promise, error=error, asked=tick, **asked)
-    columns: dict[str, Any] = dict(zip(("x", "y", "z"), found.places.T.round(4), strict=True))
-    if predictor.site.georeference is not None:
-        latitude, longitude, _ = predictor.degrees(found.places)
-        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
+    columns = coordinates(found.places, predictor)
     columns |= {found.what: found.goal, "low": found.low, "high": found.high}
-    write_samples(
-        run_dir / "place.csv", {name: np.asarray(values).tolist() for name, values in columns.items()}
-    )
+    write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
     draw_placing(found, run_dir / "place.png", level, unit)
     x, y, z = found.places[0]

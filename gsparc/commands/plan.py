@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.map import plan_of, promise_of, settings_of, stations_of
+from gsparc.commands.map import coordinates, plan_of, promise_of, settings_of, stations_of
 from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.maps.pictures import draw_plan_picture
-from gsparc.maps.planning import Plan, plan_next
+from gsparc.maps.planning import plan_next
 from gsparc.maps.promise import PromiseSettings
-from gsparc.prediction.load import load
-from gsparc.prediction.predictor import Predictor
-
-
-def write_places(path: Path, found: Plan, predictor: Predictor | None) -> None:
-    """The places as a table, in the order in which they are to be measured."""
-    columns: dict[str, Any] = {"order": np.arange(1, len(found.places) + 1)}
-    columns |= dict(zip(("x", "y", "z"), found.places.T.round(4), strict=True))
-    if predictor is not None and predictor.site.georeference is not None and len(found.places):
-        latitude, longitude, _ = predictor.degrees(found.places)
-        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
-    columns |= {"rank": found.chosen + 1, "expected_error_db": found.expected_db.round(4)}
-    write_samples(path, {name: values.tolist() for name, values in columns.items()})
+from gsparc.prediction.operating_point import load
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -46,7 +33,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         promise=promise, least_gain_db=float(config.least_gain_db), route=bool(config.route),
         start=settings["start"], route_m=config.route_m, length_m=config.length_m,
     )  # fmt: skip
-    write_places(run_dir / "plan.csv", found, predictor)
+    columns = {"order": np.arange(1, len(found.places) + 1), **coordinates(found.places, predictor)}
+    columns |= {"rank": found.chosen + 1, "expected_error_db": found.expected_db.round(4)}
+    write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
     draw_plan_picture(found, run_dir / "plan.png", promise, predictor, floor)
     facts = {
         "plan/places": len(found.places), "plan/before_db": found.before_db, "plan/after_db": found.after_db,

@@ -12,8 +12,7 @@ from omegaconf import DictConfig
 
 from gsparc.commands.output import run_directory
 from gsparc.evaluation.console import open_console
-from gsparc.evaluation.report.page import studies, write
-from gsparc.evaluation.report.readme import refresh
+from gsparc.evaluation.report.page import refresh, studies, write
 from gsparc.evaluation.report.runs import columns, find_runs, retime
 from gsparc.evaluation.summary import program, provenance, write_summary
 

@@ -24,7 +24,6 @@ from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.effects import from_config as effects_from_config
-from gsparc.simulate.engine import HasTriangles
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
@@ -32,6 +31,7 @@ from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.scenes.solid import write_mesh
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
+from gsparc.simulate.survey import HasTriangles
 
 log = logging.getLogger(__name__)
 

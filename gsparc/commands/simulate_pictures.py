@@ -12,7 +12,7 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import bounded, draw_stations, draw_walls, legend_below
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
-from gsparc.simulate.engine import HasTriangles
+from gsparc.simulate.survey import HasTriangles
 
 
 def floor_plan(outcome: Outcome, path: Path) -> None:

@@ -19,23 +19,22 @@ from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.fit import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
-from gsparc.evaluation.experiment.study import Row, Study, Variant
+from gsparc.evaluation.experiment.study import Row, Study
 from gsparc.evaluation.summary import run_conditions, shown, table, write_samples
 from gsparc.models.method import Method
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
 
 
-def variants_of(config: DictConfig) -> list[Variant]:
+def variants_of(config: DictConfig) -> dict[str, Callable[[], Method]]:
     """Those of `config.variants`, each overrides of `config.model`, then `config.baselines` by name."""
 
     def maker(overrides: Any) -> Callable[[], Method]:
         return lambda: build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
 
     # Resolved first: an interpolation would take the place of the model's own settings, not join them.
-    given = plain(config.variants)
-    found = [Variant(str(name), maker(overrides)) for name, overrides in given.items()]
-    return found + [Variant(name, method_class(name)) for name in config.baselines]
+    found = {str(name): maker(overrides) for name, overrides in plain(config.variants).items()}
+    return found | {name: method_class(name) for name in config.baselines}
 
 
 def study_of(config: DictConfig) -> Study:

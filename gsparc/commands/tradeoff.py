@@ -18,7 +18,6 @@ from gsparc.commands.settings import plain
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment.tradeoff import (
-    Candidate,
     Other,
     beaten_by,
     cells_of,
@@ -33,7 +32,7 @@ from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import provenance, table, write_samples, write_summary
 from gsparc.models.method import Method
-from gsparc.models.pareto import front, worded
+from gsparc.models.pareto import front
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import combinations, contributions, knobs, reduced
 from gsparc.prediction import operating_point
@@ -56,7 +55,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     alone = config.threads is None and not method.threads_pay
     threads = [1] if alone else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
-    candidates = [Candidate(worded(s), s, reduced(method, s, measured), tuple(threads)) for s in settings]
+    candidates = [(some, reduced(method, some, measured)) for some in settings]
     others = others_of(
         run, config.baselines, config.peers, config.ckpt, config.eval_on,
         platform_cache() if config.cache is None else Path(config.cache),
@@ -65,7 +64,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     timed = {COPY: reference_copy(), **clocks}
-    points, other_ms = sweep(candidates, data, fold, eval_on=config.eval_on, clock=clock, others=timed)
+    how = {"eval_on": config.eval_on, "clock": clock, "others": timed}
+    points, other_ms = sweep(candidates, threads, data, fold, **how)
     figure = DECIDING[data.site.kind]
     shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])

@@ -97,7 +97,9 @@ def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     objective_of(config, data.site.kind)  # refused now, not after the training
     walls = config.get("known_walls") or OmegaConf.select(config, "init.file")
     known = None if walls is None else read_walls(walls)
-    split = _split(config, data, run_dir / "split.json")
+    split = split_for(plain(config.split), data)
+    split.check()  # none without rows to learn from or to test on
+    write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     count = len(split.folds)
     folders = [run_dir] if count == 1 else [run_dir / f"fold{number}" for number in range(count)]
     files = tuple(folder / "model.ckpt" for folder in folders)
@@ -174,14 +176,6 @@ def _data(config: DictConfig) -> DataModule:
         except ValueError as error:
             raise ValueError(f"init_from={start}: {error}") from None
     return module
-
-
-def _split(config: DictConfig, data: Measurements, file: Path) -> Split:
-    """The folds, written to `file`; none without rows to learn from or to test on."""
-    split = split_for(plain(config.split), data)
-    split.check()
-    write_split(file, split, len(data), data.site.sha256)
-    return split
 
 
 def _check_model(config: DictConfig, resumed: bool) -> None:

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.map import plan_of
@@ -15,9 +14,9 @@ from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
-from gsparc.data.limits import finite
 from gsparc.data.walls import read_walls
 from gsparc.maps.field_map import FieldMap
+from gsparc.maps.making import place_of
 from gsparc.maps.pictures import layers
 from gsparc.prediction.timing import peak_memory
 from gsparc.view.building import Given, cloud_colours, cloud_of
@@ -80,19 +79,8 @@ def view_of(config: DictConfig, settings: dict[str, Any]) -> SiteView:
     if config.map is not None:
         found = FieldMap.read(config.map)
         made = tuple((found.grid, layer) for layer in layers(found, viewed.unit) if not layer.words)
-    return SiteView(
-        viewed, given, grid_for(viewed, settings, plan), made, _place("at", settings["at"]),
-        _place("other_end", settings["other_end"]),
-    )  # fmt: skip
-
-
-def _place(name: str, given: Any) -> np.ndarray | None:
-    if given is None:
-        return None
-    place = finite(given)
-    if place.shape != (3,):
-        raise DataError(f"{name}={given}: three finite numbers [m] are needed")
-    return place
+    at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
+    return SiteView(viewed, given, grid_for(viewed, settings, plan), made, at, other)
 
 
 def serve(view: SiteView, host: str, port: int) -> str:

@@ -36,16 +36,11 @@ def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
     carrier = site.carrier_hz is not None or (
         site.stations is not None and site.stations.carrier_hz is not None
     )
-    if site.kind == "csi" and carrier and _all_trained("complex_gp", data, split):
-        return (*names, "complex_gp")
-    return names
-
-
-def _all_trained(name: str, data: Measurements, split: Split) -> bool:
-    """Whether every station of test rows has training rows enough."""
-    if data.station is None:
-        return True
-    return not any(trained_stations(method_class(name)(), data, fold)[1].any() for fold in split.folds)
+    if site.kind != "csi" or not carrier:
+        return names
+    folds = split.folds if data.station is not None else ()  # of all stations of test rows enough are known
+    few = (trained_stations(method_class("complex_gp")(), data, fold)[1].any() for fold in folds)
+    return names if any(few) else (*names, "complex_gp")
 
 
 @dataclass(frozen=True)

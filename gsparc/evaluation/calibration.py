@@ -166,9 +166,9 @@ def divided(
     Raises:
         ValueError: too few positions, or patches, for three parts.
     """
-    unit = _units(evidence, how)
+    unit = np.arange(len(evidence)) if how == "random" else cells(evidence.position)
     order = rng.permutation(unit.max(initial=-1) + 1)
-    first, second = _cuts(len(order))
+    first, second = (round(share * len(order)) for share in np.cumsum(SHARES))
     if not 0 < first < second < len(order):
         what = "positions" if how == "random" else "patches of the plane"
         raise ValueError(
@@ -182,9 +182,11 @@ def divided(
 
 def divisible(evidence: Evidence, how: How) -> bool:
     """Whether `divided` has three parts to give."""
-    count = int(_units(evidence, how).max(initial=-1)) + 1
-    first, second = _cuts(count)
-    return 0 < first < second < count
+    try:
+        divided(evidence, how, np.random.default_rng(0))
+    except ValueError:
+        return False
+    return True
 
 
 def too_few(count: int, promise: Promise) -> str | None:
@@ -205,16 +207,6 @@ def laxer(evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: 
         if np.isfinite(accept(evidence, other, kind, spatial, seed)[1].value):
             return other
     return None
-
-
-def _units(evidence: Evidence, how: How) -> np.ndarray:
-    """What each position (n,) is dealt out with: itself, or its patch."""
-    return np.arange(len(evidence)) if how == "random" else cells(evidence.position)
-
-
-def _cuts(count: int) -> tuple[int, int]:
-    first, second = (round(share * count) for share in np.cumsum(SHARES))
-    return first, second
 
 
 def cells(position: np.ndarray) -> np.ndarray:

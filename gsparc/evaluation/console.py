@@ -28,11 +28,8 @@ def open_console() -> Console:
     Without markup: square brackets of a path or a title are no style.
     """
     terminal = Console(soft_wrap=True, markup=False)
-    if terminal.is_terminal or "COLUMNS" in os.environ:
-        return terminal
-    return Console(
-        soft_wrap=True, markup=False, width=WIDE
-    )  # a log has no width: 80 columns cut headings short
+    known = terminal.is_terminal or "COLUMNS" in os.environ  # a log has no width: 80 cut headings short
+    return terminal if known else Console(soft_wrap=True, markup=False, width=WIDE)
 
 
 def plain(node: DictConfig) -> dict[str, Any]:
@@ -76,9 +73,14 @@ def one_line(error: BaseException) -> str:
     return text if expected and text else f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)"
 
 
+def config_folder() -> Path:
+    """Where the configurations are."""
+    return Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0])
+
+
 def _choices(group: str) -> list[str]:
     """Every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
-    folder = Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0]) / group
+    folder = config_folder() / group
     own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
     return sorted(own.union(plugins(group) if group in GROUPS else ()))
 

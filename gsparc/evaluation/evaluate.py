@@ -71,7 +71,9 @@ def evaluate(
         ValueError: as in `score`.
     """
     methods = (methods,) if isinstance(methods, Method) else tuple(methods)
-    seconds = _per_fold(train_s, len(methods))
+    seconds = None if train_s is None else [float(s) for s in np.atleast_1d(train_s)]
+    if seconds is not None and len(seconds) != len(methods):
+        raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     scores = score(methods, data, split, eval_on)
     names = fitting(data, split) if baselines is None else baselines
     others = {name: baseline(name, data, split, eval_on, cache) for name in names}
@@ -181,15 +183,6 @@ def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:
         return None
     bar = float(np.nanmean(others["nearest"].scores.samples["mse"]))
     return 1 - float(np.nanmean(scores.samples["mse"])) / bar if bar > 0 else None
-
-
-def _per_fold(train_s: float | Sequence[float] | None, count: int) -> tuple[float, ...] | None:
-    if train_s is None:
-        return None
-    seconds = (float(train_s),) if isinstance(train_s, (int, float)) else tuple(float(s) for s in train_s)
-    if len(seconds) != count:
-        raise ValueError(f"{len(seconds)} training times for {count} methods")
-    return seconds
 
 
 def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -> dict[str, Any]:

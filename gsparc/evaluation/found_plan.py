@@ -14,7 +14,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import bounded, draw_stations, legend_below
+from gsparc.evaluation.from_above import bounded, draw_stations, framed, legend_below
 from gsparc.evaluation.site_plan import still_ends
 
 INCHES = 6.5  # longer side of the map
@@ -35,7 +35,7 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     origin = data.site.origin
     places = np.unique(data.moving[:, -3:], axis=0) + origin
     ends = still_ends(data)
-    low, high = _view(np.concatenate([places[:, :2], ends]), AROUND if len(objects.planes) else MARGIN)
+    low, high = framed(np.concatenate([places[:, :2], ends]), AROUND if len(objects.planes) else MARGIN)
     width, height = (high - low) / (high - low).max() * INCHES
     figure, axes = panels(max(width, 3.0) + 1.9, max(height, 2.3) + 1.6)
     axis = axes[0, 0]
@@ -58,13 +58,6 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     title = f"{data.site.name}: what the field found"
     figure.suptitle(title if not level else f"{title}\n{level}", fontsize="medium")
     save(figure, path)
-
-
-def _view(shown: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of the map: points (n, 2) and a share of their extent around them."""
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    margin = max(float((high - low).max()), 1e-3) * share
-    return low - margin, high + margin
 
 
 def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:

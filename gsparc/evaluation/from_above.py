@@ -23,6 +23,14 @@ def bounded(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
     axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share
 
 
+def framed(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (2,) of a map: the known ones of places (n, 2) and a share of their extent around them."""
+    known = places[np.isfinite(places).all(axis=1)]
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = max(float((high - low).max()), 1e-3) * share
+    return low - margin, high + margin
+
+
 def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", **how: Any) -> None:
     """Marks at places (n, 2) [m], black unless `how` says another colour."""
     marks = {"marker": "^", "color": "k", "markersize": 9, "markeredgecolor": "white", "linestyle": ""}

@@ -132,11 +132,11 @@ def _foreign(
     if same and known:
         return None, 0
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
-    own = data if same else _training_data(stored[0])
-    before = None if own is None else _training_folds(stored, own)
-    if own is None or before is None:
+    trained = _trained(stored, data)
+    if trained is None:
         what = "rows that it does not name" if same and known is None else what
         return f"{what}; these test rows may have been TRAINED on", None
+    own, before = trained
     if same and indices_hash(before.folds) == indices_hash(chosen.folds):
         return None, 0
     learned, count = 0, sum(len(fold.test) for fold in chosen.folds)
@@ -152,22 +152,19 @@ def _foreign(
     return f"{what}: {learned} of these {count} test rows are at places that were TRAINED on", learned
 
 
-def _training_data(stored: checkpoint.Stored) -> Measurements | None:
-    """What a checkpoint was trained on; None where it is gone or has changed."""
+def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[Measurements, Split] | None:
+    """What checkpoints were trained on (`data` where it is that) and its folds; None where these are gone."""
+    site = stored[0].site
     try:
-        own = datamodule(_settings("dataset", stored, None), trusted=False).measurements
-        return aligned(own, stored.site) if own.site.sha256 == stored.site.sha256 else None
+        if data.site.sha256 != site.sha256:
+            data = datamodule(_settings("dataset", stored[0], None), trusted=False).measurements
+            if data.site.sha256 != site.sha256:
+                return None
+            data = aligned(data, site)
+        before = _folds(split_for(_settings("split", stored[0], None), data), stored)
     except (ValueError, OSError):
         return None
-
-
-def _training_folds(stored: Sequence[checkpoint.Stored], own: Measurements) -> Split | None:
-    """The folds of the stored settings; None where they are gone or not those that were trained on."""
-    try:
-        before = _folds(split_for(_settings("split", stored[0], None), own), stored)
-    except ValueError:
-        return None
-    return None if trained_on(stored, before) is False else before
+    return None if trained_on(stored, before) is False else (data, before)
 
 
 def aligned(data: Measurements, site: Site) -> Measurements:

@@ -17,7 +17,7 @@ from gsparc.data.checks.outliers import outliers, too_far
 from gsparc.data.checks.plausibility import LinkLevels, wild_of
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import OUTLINE, annotate, bounded, draw_stations, legend_below
+from gsparc.evaluation.from_above import OUTLINE, annotate, bounded, draw_stations, framed, legend_below
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
@@ -106,7 +106,10 @@ def draw_site(
         steps: `plausibility.steps_of` the levels.
     """
     found = spots(data, levels)
-    low, high = _view(data, found)
+    shown = [found.place[~found.far], still_ends(data)]  # but those far outside
+    if data.site.static_end is None:
+        shown.append(data.tx[:, :2] + data.site.origin[:2])
+    low, high = framed(np.concatenate(shown))
     width, height = (high - low) / (high - low).max() * INCHES
     width, height = max(width, 0.45 * INCHES) + 1.9, max(height, 0.35 * INCHES) + 1.6
     jumping = sorted({t for t, _ in steps}, key=lambda t: -max(abs(s.change_db) for u, s in steps if u == t))
@@ -152,18 +155,6 @@ def still_ends(data: Measurements) -> np.ndarray:
     else:
         place = np.zeros((0, 3)) if site.static_position is None else site.static_position[None]
     return place[:, :2] + site.origin[:2]
-
-
-def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of the map: all places but those far outside, all stations, and a margin."""
-    shown = [found.place[~found.far], still_ends(data)]
-    if data.site.static_end is None:
-        shown.append(data.tx[:, :2] + data.site.origin[:2])
-    every = np.concatenate(shown)
-    every = every[np.isfinite(every).all(axis=1)]  # but for what stands at an unknown place
-    low, high = every.min(axis=0), every.max(axis=0)
-    margin = 0.06 * max(float((high - low).max()), 1e-3)
-    return low - margin, high + margin
 
 
 def _draw_map(

@@ -143,13 +143,9 @@ def _queries(asking: Predictor, places: np.ndarray, other: Sequence[float] | Non
     local = places - site.origin
     if width == 3:
         return local
-    if site.static_position is not None:
-        still = site.static_position
-    elif other is not None:
-        still = np.asarray(other, np.float64) - site.origin
-    else:
+    still = site.static_position
+    if still is None and other is None:
         raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    both = {"tx": np.broadcast_to(still, local.shape), "rx": local}
-    if site.static_end == "rx":
-        both = {"tx": local, "rx": np.broadcast_to(still, local.shape)}
-    return np.hstack([both["tx"], both["rx"]])
+    still = np.asarray(other, np.float64) - site.origin if still is None else still
+    both = np.broadcast_to(still, local.shape), local
+    return np.hstack(both[::-1] if site.static_end == "rx" else both)

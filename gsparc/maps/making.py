@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
+from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.maps.area import Grid, grid_of
@@ -126,7 +127,8 @@ def map_of(
     return FieldMap(
         grid, tuple(names), power, lower, upper, error, best, chance, ratio, outage, share,
         calibration is not None, threshold_db, _path_layers(predictor, grid, best),
-        np.zeros((0, 2)) if promise is None else _measured_places(promise, site), _still(site, names),
+        np.zeros((0, 2)) if promise is None else np.unique(promise.known[:, -3:-1] + site.origin[:2], axis=0),
+        _still(site, names),
         tuple(notes),
     )  # fmt: skip
 
@@ -228,8 +230,15 @@ def levels_at(
     predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
+    return levels_of(predictor, lambda part: ends_of(predictor.site, part, other), places)
+
+
+def levels_of(
+    predictor: Predictor, ends: Callable[[np.ndarray], dict[End, np.ndarray]], places: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same with the ends that a predictor is told of each part of the places."""
     parts = [
-        predicted(predictor.predict(**ends_of(predictor.site, part, other)), predictor.site.kind)
+        predicted(predictor.predict(**ends(part)), predictor.site.kind)
         for part in np.split(places, range(CHUNK, len(places), CHUNK))
     ]
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
@@ -248,10 +257,15 @@ def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> di
         return {site.moving_end: places}
     if other is None:
         raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    place = np.asarray(other, np.float64)
-    if place.shape != (3,) or not np.isfinite(place).all():
-        raise DataError(f"other_end={other}: three finite numbers [m] are needed")
-    return {"rx": places, "tx": np.broadcast_to(place, places.shape)}
+    return {"rx": places, "tx": np.broadcast_to(place_of("other_end", other), places.shape)}
+
+
+def place_of(name: str, given: Any) -> np.ndarray:
+    """(3,) [m] of the setting `name`; `DataError` where it is no place."""
+    place = finite(given)
+    if place.shape != (3,):
+        raise DataError(f"{name}={given}: three finite numbers [m] are needed")
+    return place
 
 
 def _local(places: np.ndarray, other: Sequence[float] | None, site: Site) -> np.ndarray:
@@ -333,10 +347,6 @@ def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str
             azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
             layers["direction_deg"].reshape(-1)[cells] = azimuth
     return {name: layer for name, layer in layers.items() if np.isfinite(layer).any()}
-
-
-def _measured_places(promise: Promise, site: Site) -> np.ndarray:
-    return np.unique(promise.known[:, -3:-1] + site.origin[:2], axis=0)
 
 
 def _still(site: Site, names: Sequence[str]) -> np.ndarray:

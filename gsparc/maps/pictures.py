@@ -106,9 +106,7 @@ def file_name(layer: Layer) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
 
 
-def draw_layer(
-    found: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None, more: Any = None
-) -> None:
+def draw_layer(found: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
     """Save one layer.
 
     Args:
@@ -117,7 +115,6 @@ def draw_layer(
         path: PNG file.
         title: above.
         plan: beneath.
-        more: called with the axes, to draw on them.
     """
     left, right, low, high = found.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
@@ -145,8 +142,6 @@ def draw_layer(
     bounded(axis, (left, low), (right, high), title=title)
     draw_places(axis, found)
     scale_bar(axis)
-    if more is not None:
-        more(axis)
     if found.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
     legend_below(figure)

@@ -10,12 +10,11 @@ import numpy as np
 from scipy.stats import norm
 
 from gsparc.data.errors import DataError
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import End, Measurements
 from gsparc.data.splits import Fold
 from gsparc.maps.area import Grid
 from gsparc.maps.intervals import Evidence
-from gsparc.maps.levels import predicted
-from gsparc.maps.making import map_of
+from gsparc.maps.making import levels_of, map_of
 from gsparc.maps.planning import coarse_grid, walkable_places
 from gsparc.maps.promise import Promise, evidence_of, without
 from gsparc.models.method import Method
@@ -24,7 +23,6 @@ from gsparc.training.context import FitContext
 
 Goal = Literal["coverage", "worst"]
 GOALS = ("coverage", "worst")
-CHUNK = 512
 DECILE = 0.1
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
@@ -116,7 +114,10 @@ def place_next(
     height = float(np.median(heights)) if station_height_m is None else float(station_height_m)
     candidates = _candidates(grid, sites, predictor, height, count)
     cells = grid.places()
-    _refuse_unheard(predictor, candidates[0], cells[:1])
+    try:
+        _new(predictor, candidates[0], cells[:1])
+    except ValueError as refused:
+        raise unheard_refused(f"{predictor.method.name} ({refused})") from None
     left, right, south, north = grid.extent
     now = map_of(
         predictor,
@@ -188,20 +189,9 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
 
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] of a station at `place` (3,) in cells (n, 3)."""
-    parts = []
-    for start in range(0, len(cells), CHUNK):
-        ends = place, cells[start : start + CHUNK]
-        tx, rx = ends if predictor.site.static_end == "tx" else ends[::-1]
-        parts.append(predicted(predictor.predict(tx=tx, rx=rx), predictor.site.kind))
-    level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
+    static: End = predictor.site.static_end or "tx"
+    level, spread = levels_of(predictor, lambda part: {static: place, predictor.site.moving_end: part}, cells)
     return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
-
-
-def _refuse_unheard(predictor: Predictor, place: np.ndarray, cell: np.ndarray) -> None:
-    try:
-        _new(predictor, place, cell)
-    except ValueError as error:
-        raise unheard_refused(f"{predictor.method.name} ({error})") from None
 
 
 def unheard_refused(what: str) -> DataError:

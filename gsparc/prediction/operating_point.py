@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.models import checkpoint
+from gsparc.models import checkpoint, loading
 from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
 from gsparc.models.pareto import Point, Settings
 from gsparc.models.reduced import Measured, reduced
+from gsparc.prediction.confidence import kept as trusted_of
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, interleaved
 
@@ -105,3 +106,31 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     torch.set_num_threads(points[best].threads)
     log.info("%s: %s, %.3g ms here", stored.path, points[best].label, np.median(times[best]))
     return ways[best], points[best]
+
+
+def load(path: str | Path, budget_ms: float | None = None, confidence: str | None = None) -> Predictor:
+    """The model in a checkpoint, ready to be asked.
+
+    Args:
+        path: the file.
+        budget_ms: what one query may take on this machine, end to end [ms]. The operating points that
+            `gsparc tradeoff` stored with the model are timed here (a few seconds), the most
+            accurate that fits answers, and torch's number of threads becomes that point's.
+        confidence: `learned`, `expected`, `distance` or `gp_variance`; None takes the one that
+            `gsparc calibrate` found best on positions set aside and stored with the model, and
+            the model's own where it was never calibrated.
+
+    Raises:
+        gsparc.models.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
+        ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence.
+    """
+    method, stored = loading.load(path)
+    trusted = trusted_of(stored.extra)
+    if confidence is not None:
+        trusted.check(confidence)
+    if budget_ms is None:
+        return Predictor(method, stored.site, trusted=trusted, kind=confidence, extra=stored.extra)
+    chosen, point = within(method, stored, budget_ms)
+    return Predictor(
+        chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence, extra=stored.extra
+    )

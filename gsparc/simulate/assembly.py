@@ -15,12 +15,11 @@ from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.engine import Engine
 from gsparc.simulate.paths import ARRAYS, Paths, starts
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.spectrum import spectra
-from gsparc.simulate.survey import Survey
+from gsparc.simulate.survey import Engine, Survey
 
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions

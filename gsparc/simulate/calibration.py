@@ -104,16 +104,12 @@ class Replay:
     """
 
     def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: Effects) -> None:
-        self._tracer, self._count = tracer, len(receivers)
+        self.tracer, self._count = tracer, len(receivers)
         self._parts: list[tuple[dict[str, Any], Any]] = []
         first = 0
         for found, count in tracer.solutions(receivers, effects):
             self._parts.append(_kept(tracer, found, effects, first))
             first += count
-
-    def apply(self, materials: Mapping[str, Material]) -> None:
-        """Give the scene these materials."""
-        apply(self._tracer, materials)
 
     def powers(self) -> np.ndarray:
         """(R,) sums of path powers under the scene's present materials; 0 where no path arrives."""
@@ -134,7 +130,7 @@ class Replay:
         import drjit as dr
         import mitsuba as mi
 
-        there, free = self._tracer.surfaces(), []
+        there, free = self.tracer.surfaces(), []
         for name, logarithms in materials.items():
             pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]  # as in `apply`
             for one in pair:
@@ -147,9 +143,7 @@ class Replay:
         value, by_level = slopes(dr.detach(level).numpy().astype(np.float64))
         dr.backward(dr.sum(level * mi.Float(by_level.astype(np.float32))))
         gradient = np.array([dr.grad(one).numpy()[0] for one in free], dtype=np.float64)
-        apply(
-            self._tracer, {name: Material.of(pair) for name, pair in materials.items()}
-        )  # without gradients
+        apply(self.tracer, {name: Material.of(pair) for name, pair in materials.items()})  # without gradients
         lost = ~np.isfinite(gradient)
         if lost.any():
             said = "%d of %d slopes by materials are not finite: these do not move in this step"
@@ -248,7 +242,7 @@ def calibrate(
     minimize(objective, centre, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     _, x, gain, scale = best
     materials = {name: Material.of(pair) for name, pair in zip(start, x.reshape(-1, 2), strict=True)}
-    replay.apply(materials)
+    apply(replay.tracer, materials)
     return Calibration(materials, gain, scale, spent)
 
 

@@ -117,7 +117,8 @@ def _choose(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: 
     mine: list[Decision] = []
 
     def work(note: str) -> None:
-        shards.drop(0)  # of a process that was killed before it noted by which decision it was made
+        # of a process that was killed before it noted by which decision it was made
+        shards.path(0).unlink(missing_ok=True)
         decision = deciding.Decider(campaign, settings, survey).decide()
         if decision.rows is not None and decision.paths is not None:
             made = shard_arrays(decision.paths, campaign, survey.engine.wavelength)
@@ -125,7 +126,9 @@ def _choose(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: 
         shards.write_note(note, decision.note())
         mine.append(decision)
 
-    each_once(["choice"], shards.lock, lambda note: shards.finished or shards.has_note(note), work)
+    each_once(
+        ["choice"], shards.lock, lambda note: shards.out.exists() or shards.read_note(note) is not None, work
+    )
     if mine:
         return mine[0]
     stored = shards.read_note("choice")
@@ -149,7 +152,7 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Sha
     spent: list[tuple[float, int]] = []
 
     def there(number: int) -> bool:
-        return shards.path(number).exists() or shards.finished
+        return shards.path(number).exists() or shards.out.exists()
 
     def work(number: int) -> None:
         rows, start, busy = missing[number], time.perf_counter(), deciding.busy_s()

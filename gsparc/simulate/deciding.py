@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.files import platform_cache, whole_file
-from gsparc.simulate import auto, priors
-from gsparc.simulate.attribution import Probe
+from gsparc.simulate import auto
+from gsparc.simulate.attribution import Probe, reasons
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths, join
-from gsparc.simulate.scenes.placement import neighbours
+from gsparc.simulate.scenes.receivers import neighbours
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.survey import Survey
 
@@ -236,7 +236,7 @@ class Decider:
             log.info("auto: %d probes with %s", len(rows), traced.effects)
 
             def why(probe: Probe, rows: np.ndarray = rows) -> dict[str, str]:
-                return priors.reasons(probe, self.survey.distances()[rows], materials)
+                return reasons(probe, self.survey.distances()[rows], materials)
 
             choice = auto.decide(self._probe(traced, rows), self.settings, why, last)
             if choice is not None:

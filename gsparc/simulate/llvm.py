@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import lru_cache
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
@@ -87,15 +88,10 @@ def _seal(library: Path) -> Path:
     """An empty file that is there once a solve worked with this library and these versions of the solver."""
     stat = library.stat()
     parts = [str(library.resolve()), stat.st_mtime_ns, stat.st_size, sys.executable]
-    parts += [_version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
+    for name in ("sionna-rt", "mitsuba", "drjit"):
+        with suppress(PackageNotFoundError):
+            parts.append(version(name))
     return platform_cache() / "llvm" / sha256(repr(parts).encode()).hexdigest()[:32]
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return ""
 
 
 def prepare(fetch_missing: bool = False) -> Path:

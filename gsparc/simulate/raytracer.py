@@ -74,6 +74,9 @@ class RayTracer:
         scattering: scattering coefficient of all materials instead of `MATERIALS`; None for those.
         antenna: of the transmitter.
 
+    Attributes:
+        scene: Sionna's (`sionna.rt.Scene`).
+
     Raises:
         SimulatorMissing: no Sionna, or no LLVM that works.
         ValueError: no such scene, or a file that Sionna cannot read.
@@ -94,7 +97,7 @@ class RayTracer:
         llvm.prepare()
         self.sampling = sampling
         self.wavelength = LIGHT / carrier_hz
-        self._scene = _load(source, carrier_hz, scattering)
+        self.scene = _load(source, carrier_hz, scattering)
         self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
         self._arrays: list[tuple[int, str]] = []  # what the scene's antennas are, shared by `at`
         self.retried = 0  # batches traced again because candidates were cut off
@@ -125,7 +128,7 @@ class RayTracer:
     def fingerprint(self) -> str:
         """Of vertices, faces and material of every object."""
         digest = sha256()
-        for name, thing in sorted(self._scene.objects.items()):
+        for name, thing in sorted(self.scene.objects.items()):
             digest.update(f"{name} {thing.radio_material.name};".encode())
             digest.update(thing.mi_mesh.vertex_positions_buffer().numpy().tobytes())
             digest.update(thing.mi_mesh.faces_buffer().numpy().tobytes())
@@ -140,18 +143,13 @@ class RayTracer:
                 "scattering": round(float(m.scattering_coefficient[0]), 6),
                 "permittivity": round(float(m.relative_permittivity[0]), 6),
             }
-            for name, m in self._scene.radio_materials.items()
+            for name, m in self.scene.radio_materials.items()
         }
-
-    @property
-    def scene(self) -> Any:
-        """Sionna's (`sionna.rt.Scene`)."""
-        return self._scene
 
     def surfaces(self) -> dict[str, Any]:
         """Sionna's materials (`sionna.rt.RadioMaterial`) of the scene's objects, by name."""
-        used = {thing.radio_material.name for thing in self._scene.objects.values()}
-        return {name: one for name, one in self._scene.radio_materials.items() if name in used}
+        used = {thing.radio_material.name for thing in self.scene.objects.values()}
+        return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
     def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Paths from the transmitter to receivers (R, 3) [m].
@@ -221,10 +219,17 @@ class RayTracer:
         shooting.SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = HASHES
         shooting.fibonacci_lattice = _lattice
         solver = rt.PathSolver()
-        counting = _CountingGenerator(solver._candidate_generator)
-        solver._candidate_generator = counting
+        generate, stored = solver._candidate_generator, list[Any]()
+
+        def counted(**arguments: Any) -> Any:
+            """Keeps how many candidates there are, which the solver does not report."""
+            buffer = generate(**arguments)
+            stored.append(buffer.paths_counter)
+            return buffer
+
+        solver._candidate_generator = counted
         found = solver(
-            self._scene,
+            self.scene,
             max_depth=effects.depth,
             samples_per_src=self.sampling.samples,
             max_num_paths_per_src=limit,
@@ -236,7 +241,7 @@ class RayTracer:
             edge_diffraction=effects.edge_diffraction,
             seed=seed,
         )
-        return None if counting.stored() >= limit else found
+        return None if int(stored[-1].numpy().max()) >= limit else found
 
     def _place_ends(self, receivers: np.ndarray, ports: int) -> None:
         """Place transmitter and receivers in the scene."""
@@ -244,7 +249,7 @@ class RayTracer:
         import mitsuba as mi
         import sionna.rt as rt
 
-        scene, wanted = self._scene, (ports, self.antenna.pattern)
+        scene, wanted = self.scene, (ports, self.antenna.pattern)
         if self._arrays != [wanted]:
 
             def one(pattern: str, polarisation: str) -> Any:
@@ -272,12 +277,12 @@ class RayTracer:
 
     def under_open_sky(self, points: np.ndarray) -> np.ndarray:
         """Whether nothing is above points (N, 3) [m]: outdoors that means outside of buildings."""
-        return ~np.isfinite(self._distance(points, np.array([0.0, 0.0, 1.0])))
+        return ~np.isfinite(self._hit(points, np.array([0.0, 0.0, 1.0])).t.numpy())
 
     def clear_of_surfaces(self, points: np.ndarray, gap: float) -> np.ndarray:
         """Whether no surface is within `gap` [m] of points (N, 3) along the six axes."""
         axes = np.concatenate([np.eye(3), -np.eye(3)])
-        return np.all([self._distance(points, axis) > gap for axis in axes], axis=0)
+        return np.all([self._hit(points, axis).t.numpy() > gap for axis in axes], axis=0)
 
     def triangles(self) -> np.ndarray:
         """(n, 3, 3) [m] of all objects."""
@@ -295,7 +300,7 @@ class RayTracer:
     def _objects(self) -> dict[str, np.ndarray]:
         """Triangles (n, 3, 3) of each object."""
         found = {}
-        for name, thing in self._scene.objects.items():
+        for name, thing in self.scene.objects.items():
             vertices = thing.mi_mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
             found[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
         return found
@@ -314,7 +319,7 @@ class RayTracer:
         if ground is None:
             return height, np.isfinite(height)
         # Mitsuba compares shapes by pointer.
-        shape = mi.ShapePtr(self._scene.objects[ground].mi_mesh)
+        shape = mi.ShapePtr(self.scene.objects[ground].mi_mesh)
         return height, (hit.shape == shape).numpy()
 
     def _ground(self) -> str | None:
@@ -332,9 +337,6 @@ class RayTracer:
         height = self.surface(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))[0]
         return bool((height[np.isfinite(height)] < (low + top) / 2).mean() > 0.05)
 
-    def _distance(self, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        return self._hit(points, direction).t.numpy()
-
     def _hit(self, points: np.ndarray, direction: np.ndarray) -> Any:
         import mitsuba as mi
 
@@ -342,7 +344,7 @@ class RayTracer:
             *(mi.Float(np.ascontiguousarray(points[:, i], dtype=np.float32)) for i in range(3))
         )
         ray = mi.Ray3f(origin, mi.Vector3f(*map(float, direction)))
-        return self._scene.mi_scene.ray_intersect(ray)
+        return self.scene.mi_scene.ray_intersect(ray)
 
 
 def _lattice(points: int) -> Any:
@@ -364,22 +366,6 @@ def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     if whole and rest > 2 * size:
         return [*[(batch, batch)] * whole, (rest, batch)]
     return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
-
-
-class _CountingGenerator:
-    """A candidate generator that counts the candidates it stored; the solver does not report it."""
-
-    def __init__(self, generator: Any) -> None:
-        self._generator = generator
-        self._counter: Any = None
-
-    def __call__(self, **arguments: Any) -> Any:
-        buffer = self._generator(**arguments)
-        self._counter = buffer.paths_counter
-        return buffer
-
-    def stored(self) -> int:
-        return int(self._counter.numpy().max())
 
 
 def _collect(found: Any, receivers: int) -> Paths:

@@ -65,15 +65,6 @@ class Shards:
         """Attribute of the dataset that says which plan it was made by."""
         return _signature(self.plan)
 
-    @property
-    def finished(self) -> bool:
-        """Whether the dataset is written, and shards that are not there were not missing."""
-        return self.out.exists()
-
-    def has_note(self, name: str) -> bool:
-        """Whether a decision is stored."""
-        return (self.folder / f"{name}.json").exists()
-
     def path(self, number: int) -> Path:
         """File of a shard; it is there once the shard is finished."""
         return self.folder / f"shard_{number:04d}.npz"
@@ -91,10 +82,6 @@ class Shards:
         """The arrays of a finished shard; `names` alone where given."""
         with np.load(self.path(number), allow_pickle=False) as file:
             return {name: file[name] for name in names or file.files}
-
-    def drop(self, number: int) -> None:
-        """Remove a shard, if it is there."""
-        self.path(number).unlink(missing_ok=True)
 
     def of_rows(self, rows: np.ndarray, *names: str) -> list[np.ndarray]:
         """Arrays of `names` (n, ...) at rows (n,), all of them in finished shards; no others are kept."""

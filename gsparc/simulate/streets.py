@@ -126,23 +126,21 @@ def _routes(streets: Streets, users: np.ndarray, wavelength: float) -> Iterator[
         amplitude = np.sqrt(area / (4 * np.pi)) * np.exp(1j * phase)
         yield from _bounce(streets, flat, place[:2], lambda d, e, g=amplitude: spread * g / (d * e))
     number = 2 * np.pi / wavelength
-    for corner in _corners(streets):
+    low, high = streets.buildings[:, 0], streets.buildings[:, 1]
+    signs = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    for corner in np.concatenate([np.where(s < 0, low, high) + 1e-3 * s for s in signs]):  # in the street
         yield from _edge(streets, flat, corner, shadow, spread, number)
 
 
-def _walls(streets: Streets) -> list[tuple[int, float, float, float, float, float]]:
-    """(axis, coordinate, low, high, outward sign, reflection) of every wall."""
-    return [
+def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[_Route]:
+    """One and two reflections: the straight line to an image must cross its walls, and nothing else."""
+    base = streets.base[:2]
+    walls = [  # axis, coordinate, low, high, outward sign, reflection
         (axis, place[axis], low[1 - axis], high[1 - axis], sign, reflection)
         for (low, high), reflection in zip(streets.buildings, streets.reflection, strict=True)
         for axis in (0, 1)
         for place, sign in ((low, -1.0), (high, 1.0))
     ]
-
-
-def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[_Route]:
-    """One and two reflections: the straight line to an image must cross its walls, and nothing else."""
-    walls, base = _walls(streets), streets.base[:2]
     for sequence in (*permutations(range(len(walls)), 1), *permutations(range(len(walls)), 2)):
         images = [base]
         for i in sequence:
@@ -188,13 +186,6 @@ def _bounce(streets: Streets, flat: np.ndarray, place: np.ndarray, law) -> Itera
         far = np.maximum(far, 1.0)
         unit = np.broadcast_to((place - base) / near, (len(users), 2))
         yield _Route(users, near + far, unit, law(near, far) + 0j)
-
-
-def _corners(streets: Streets) -> np.ndarray:
-    """(4 n, 2) corners, pushed a little into the street."""
-    low, high = streets.buildings[:, 0], streets.buildings[:, 1]
-    signs = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    return np.concatenate([np.where(s < 0, low, high) + 1e-3 * s for s in signs])
 
 
 def _edge(

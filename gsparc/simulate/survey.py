@@ -1,17 +1,17 @@
-"""Every pair of a receiver and a transmitter of one scene: the rows of a dataset, and how they are traced."""
+"""The protocol of simulators; every pair of a receiver and a transmitter of one scene: the rows of a file."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.engine import Engine
 from gsparc.simulate.paths import Paths, join
-from gsparc.simulate.scenes.placement import spread
+from gsparc.simulate.scenes.receivers import spread
 
 
 @dataclass(frozen=True)
@@ -79,3 +79,45 @@ class Survey:
             self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
         ]
         return join(parts).take(np.argsort(order, kind="stable"))
+
+
+@runtime_checkable
+class HasTriangles(Protocol):
+    """Its objects are triangles."""
+
+    def triangles(self) -> np.ndarray:
+        """(n, 3, 3) [m] of all objects."""
+
+
+class Engine(Protocol):
+    """A scene with one transmitter, ready to trace.
+
+    Attributes:
+        name: for provenance.
+        transmitter: (3,) [m].
+        wavelength: at the carrier [m].
+        random: whether another seed gives another answer.
+    """
+
+    name: str
+    transmitter: np.ndarray
+    wavelength: float
+    random: bool
+
+    def supported(self, effects: Effects) -> Effects:
+        """These switches without what the engine cannot compute."""
+
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+        """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
+
+    def thinned(self, samples: int) -> Engine:
+        """The same with so many rays of a call, where there are any."""
+
+    def versions(self) -> dict[str, str]:
+        """Versions of the solver's packages."""
+
+    def fingerprint(self) -> str:
+        """Hash of the geometry, and of which material is where."""
+
+    def materials(self) -> dict[str, dict[str, Any]]:
+        """Material properties of the scene, for provenance and physical expectations."""

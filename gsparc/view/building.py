@@ -56,15 +56,6 @@ class Given:
     walls: SceneWalls | None = None
 
 
-def extent_of(viewed: Viewed) -> np.ndarray:
-    """World places (n, 3) [m] that a frame is put around: where was measured, and the ends that stand."""
-    shown = [viewed.box()]
-    shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
-    if viewed.site.static_end is None:
-        shown.append(viewed.site.box + viewed.site.origin)
-    return np.concatenate(shown)
-
-
 def build(viewed: Viewed, given: Given, station: str | None, measured: Measured | None) -> Scene:
     """Everything that stands still, seen from one station.
 
@@ -74,13 +65,19 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
         station: whose measurements and Gaussians are drawn.
         measured: of that station.
     """
-    frame = Frame.around(extent_of(viewed))
+    shown = [viewed.box()]  # where was measured, and the ends that stand
+    shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
+    if viewed.site.static_end is None:
+        shown.append(viewed.site.box + viewed.site.origin)
+    frame = Frame.around(np.concatenate(shown))
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
     ground = ground_of(viewed, given)
     if given.plan is not None:
-        parts.append(plan_sheet(given.plan, ground - BENEATH * extent))
+        corners = np.column_stack([given.plan.corners(), np.full(4, ground - BENEATH * extent)])
+        edges = corners[1] - corners[0], corners[3] - corners[0]
+        parts.append(Sheet("floor plan", corners[0], *edges, given.plan.image))
     if given.walls is not None:
         parts += walls_faces(given.walls)
     if measured is not None:
@@ -102,7 +99,9 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
     if cloud is not None:
         parts += _cloud_parts(cloud, legends, extent)
     hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
-    parts.append(_box_lines(viewed.box()))
+    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+    edge = _corners(viewed.box())[np.array(pairs)]
+    parts.append(Lines("box of measurements", edge, np.full((len(pairs), 3), 150, np.uint8)))
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
@@ -239,20 +238,6 @@ def walls_faces(walls: SceneWalls) -> list[Part]:
         parts.append(Faces("walls", np.concatenate(vertices), np.array(triangles), WALL, 0.4))
     parts += [_box_faces(f"known box {number}", box) for number, box in enumerate(walls.boxes)]
     return parts
-
-
-def plan_sheet(plan: FloorPlan, height: float) -> Sheet:
-    """A floor plan at a height [m]."""
-    corners = np.column_stack([plan.corners(), np.full(4, height)])
-    return Sheet("floor plan", corners[0], corners[1] - corners[0], corners[3] - corners[0], plan.image)
-
-
-def _box_lines(box: np.ndarray) -> Lines:
-    """Edges of the box in which was measured."""
-    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
-    return Lines(
-        "box of measurements", _corners(box)[np.array(pairs)], np.full((len(pairs), 3), 150, np.uint8)
-    )
 
 
 @dataclass(frozen=True)

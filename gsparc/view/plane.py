@@ -36,11 +36,6 @@ class Plane:
     stride: int
 
 
-def lifted(grid: Grid, height: float) -> Grid:
-    """The same cells at another height [m, world]."""
-    return replace(grid, height=height)
-
-
 def thinned(grid: Grid, most: int) -> Grid:
     """At most about `most` cells along the longer side, of every n-th row and column."""
     every = max(1, -(-max(grid.shape) // most))

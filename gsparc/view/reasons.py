@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +11,9 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.site_objects import SiteObjects
 from gsparc.view.answer import SILENT_DB, Answer, azimuth_elevation
+from gsparc.view.building import SURFACES
 from gsparc.view.crossed import Obstacles, crossed_losses
+from gsparc.view.scene import Faces, Legend, Part
 
 NEAREST_M = 0.1  # where a distance law ends
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
@@ -166,3 +170,46 @@ def _paths(answer: Answer) -> list[str]:
             how = "cancel each other" if gap < 0 else "add up"
             said.append(f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers")
     return said
+
+
+ENDS = {"tx": "transmitter", "rx": "receiver"}
+
+
+def headline(answer: Answer, unit: str = "dB") -> str:
+    """Level and confidence in one line."""
+    said = []
+    if answer.level_db is not None:
+        spread = "" if answer.spread_db is None else f" ± {answer.spread_db:.1f}"
+        said.append(f"{answer.level_db:.1f}{spread} {unit}")
+    if answer.strongest is not None:
+        said.append("strongest from azimuth {:.0f}°, elevation {:.0f}° (world)".format(*answer.strongest))
+    said.append("no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}")
+    return ", ".join(said)
+
+
+def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:
+    """An answer and why, for a panel."""
+    lines = [f"**{headline(answer, unit)}**", ""]
+    lines += [
+        f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"
+        for end in moving  # + 0.0: no minus before nought
+    ]
+    lines += [f"- {reason}" for reason in reasons]
+    return "\n".join(lines)
+
+
+def legend_html(legends: Iterable[Legend], surfaces: Iterable[Part] = ()) -> str:
+    """Colour bars with their ends and labels, and what surfaces are by their colours."""
+    rows = []
+    for colour in dict.fromkeys(part.colour for part in surfaces if isinstance(part, Faces)):
+        swatch = f'<span style="background:rgb{colour};opacity:.6">&emsp;</span>'
+        rows.append(f'<div style="margin:.35em .7em;font-size:.8em">{swatch} {SURFACES[colour]}</div>')
+    for legend in dict.fromkeys(legends):
+        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in legend.strip(16))
+        rows.append(
+            f'<div style="margin:.35em .7em;font-size:.8em">{html.escape(legend.label)}'
+            f'<div style="height:.8em;background:linear-gradient(to right,{stops})"></div>'
+            f'<div style="display:flex;justify-content:space-between"><span>{legend.low:.4g}</span>'
+            f"<span>{legend.high:.4g}</span></div></div>"
+        )
+    return "".join(rows)

@@ -18,9 +18,9 @@ from gsparc.view.answer import ask
 from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
 from gsparc.view.panel import RED, draw_answer
 from gsparc.view.plane import thinned
+from gsparc.view.reasons import ENDS, headline
 from gsparc.view.scene import Faces, Legend, Lines, Mark, Points
 from gsparc.view.site_view import SiteView
-from gsparc.view.words import ENDS, headline
 
 WIDTH, HEIGHT, DPI = 8.0, 4.4, 150  # readable at 600 pixels
 MOST_DOTS = 3000

@@ -32,25 +32,6 @@ LEAST_RATIO = 1e-6  # of a mean square error, where PSNR ends
 
 
 @dataclass(frozen=True)
-class OperatingPoint:
-    """One way of answering.
-
-    Attributes:
-        label: the operating point in words.
-        predictor: answers so.
-        threads: CPU threads; None: as they are.
-        swept: accuracy and median milliseconds that `gsparc tradeoff` measured; None where it did not.
-        figure: name of the accuracy.
-    """
-
-    label: str
-    predictor: Predictor
-    threads: int | None = None
-    swept: tuple[float, float] | None = None
-    figure: str = ""
-
-
-@dataclass(frozen=True)
 class Measured:
     """What was measured of one station.
 
@@ -75,7 +56,8 @@ class Viewed:
 
     Attributes:
         name: of the checkpoint.
-        ways: operating points, the fastest first, as trained last.
+        ways: one per operating point, the fastest first, as trained last; the `point` of that has no settings
+            and is None where `gsparc tradeoff` measured nothing.
         data: in the model's coordinates and units; None where they are gone.
         test: (n,) rows that were not learned from.
         stations: that it answers for; one, None, where there is one static end or none.
@@ -84,7 +66,7 @@ class Viewed:
     """
 
     name: str
-    ways: tuple[OperatingPoint, ...]
+    ways: tuple[Predictor, ...]
     data: Measurements | None
     test: np.ndarray
     stations: tuple[str | None, ...]
@@ -94,7 +76,7 @@ class Viewed:
     @property
     def predictor(self) -> Predictor:
         """As trained."""
-        return self.ways[-1].predictor
+        return self.ways[-1]
 
     @property
     def site(self) -> Site:
@@ -108,8 +90,7 @@ class Viewed:
 
     def asked(self, station: str | None, way: int = -1) -> Predictor:
         """Who answers for a station."""
-        predictor = self.ways[way].predictor
-        return predictor if station is None else predictor.at(station)
+        return self.ways[way] if station is None else self.ways[way].at(station)
 
     def still(self, station: str | None) -> np.ndarray | None:
         """World place (3,) [m] of the static end; None where it is unknown or moves."""
@@ -216,16 +197,11 @@ def open_viewed(
         lean, whole, sure = reduced(method, point.settings, measured), method, trusted
         if point.settings.get("confidence") is False:
             whole, sure = lean, Trusted()
-        predictor = Predictor(lean, site, whole, point, sure, None, stored.extra)
-        spent = point.figure[1], point.p50_ms
-        ways.append(OperatingPoint(point.label, predictor, point.threads, spent, point.figure[0]))
-    complete = [(point.figure[1], point.p50_ms) for point in points if not point.settings]
-    figure = points[0].figure[0] if points else ""
-    known = min(complete, key=lambda one: one[1]) if complete else None
-    trained = Predictor(method, site, trusted=trusted, extra=stored.extra)
-    ways.append(OperatingPoint("as trained", trained, None, known, figure))
+        ways.append(Predictor(lean, site, whole, point, sure, None, stored.extra))
+    complete = min((one for one in points if not one.settings), key=lambda one: one.p50_ms, default=None)
+    ways.append(Predictor(method, site, point=complete, trusted=trusted, extra=stored.extra))
     return Viewed(
-        str(path), tuple(ways), data, test, _stations(ways[-1].predictor, station), tuple(notes),
+        str(path), tuple(ways), data, test, _stations(ways[-1], station), tuple(notes),
         unit or site.level_unit,
     )  # fmt: skip
 

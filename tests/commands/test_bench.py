@@ -9,8 +9,8 @@ import torch
 
 from gsparc.commands.bench import kernels, layers
 from gsparc.commands.bench.claims import Claim
+from gsparc.commands.bench.command import markdown
 from gsparc.commands.bench.measure import Case, Machine, Work, measure
-from gsparc.commands.bench.report import markdown
 from gsparc.commands.bench.scene import receiver, scene
 from gsparc.ops import composite, machine_limits, make_plan
 from gsparc.prediction.timing import ClockSettings

@@ -45,15 +45,16 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
 
 def test_each_kind_has_its_variants_and_baselines():
     effects, positions, measured = (study_of(compose(f"kind={kind}", config="study")) for kind in LINES)
-    names = [variant.name for variant in effects.variants]
+    names = [*effects.variants]
     assert names[0] == effects.base == "plain" and {"array", "phase", "power", "gp"} <= set(names)
-    assert [v.name for v in positions.variants] == [v.name for v in measured.variants]
+    assert [*positions.variants] == [*measured.variants]
     assert len(positions.conditions) == 13 and len(measured.conditions) == 4 and measured.rounds == 3
 
 
 def test_variants_join_the_models_settings_where_they_are_interpolations():
     """Both studies of the pages ended after 8 s: `error: visibility: Missing key visibility`."""
-    variants = {v.name: v.make() for v in study_of(compose("kind=effects", config="study")).variants}
+    makers = study_of(compose("kind=effects", config="study")).variants
+    variants = {name: make() for name, make in makers.items()}
     switches = {name: method.switches for name, method in variants.items() if name != "gp"}
     assert len(switches) == 9 and all(isinstance(one, EffectSettings) for one in switches.values())
     assert (switches["plain"].image, switches["plain"].phase) == (True, False)

@@ -13,7 +13,7 @@ import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
 from gsparc.maps import map_of
-from gsparc.maps.geotiff import wanted, write_geotiff
+from gsparc.maps.field_map import geotiff_wanted, write_geotiff
 from gsparc.maps.planning import plan_next
 
 ORIGIN = Georeference(47.2, 11.3)
@@ -74,5 +74,5 @@ def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
 
 def test_asked_for_without_a_place_on_earth():
     with pytest.raises(DataError, match="unknown origin"):
-        wanted(True, None)
-    assert not wanted(None, None) and not wanted(False, ORIGIN)
+        geotiff_wanted(True, None)
+    assert not geotiff_wanted(None, None) and not geotiff_wanted(False, ORIGIN)

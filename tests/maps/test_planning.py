@@ -13,9 +13,8 @@ import gsparc
 from gsparc.data.errors import DataError
 from gsparc.maps.covariance import ErrorCovariance
 from gsparc.maps.intervals import Evidence
-from gsparc.maps.planning import plan_next
+from gsparc.maps.planning import Tour, plan_next
 from gsparc.maps.promise import Promise
-from gsparc.maps.route import Tour
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,7 @@ import pandas as pd
 import pytest
 
 from gsparc.data.links.georeference import Georeference
-from gsparc.simulate.scenes.placement import place
-from gsparc.simulate.scenes.receivers import Layout, receivers
+from gsparc.simulate.scenes.receivers import Layout, place, receivers
 from gsparc.simulate.scenes.transmitters import stations
 
 AREA = np.array([[0.0, 0.0], [20.0, 10.0]])

@@ -21,7 +21,7 @@ from gsparc.simulate.effects import BITS, Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import SceneSettings, build, from_config
 from gsparc.simulate.scenes.conference import SIZE, conference_room
-from gsparc.simulate.scenes.placement import clear_of, place
+from gsparc.simulate.scenes.receivers import clear_of, place
 from gsparc.simulate.scenes.shipped import settings
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -78,7 +78,7 @@ def test_our_channels_are_the_solvers_own(room, places):
     import sionna.rt as rt
 
     found = rt.PathSolver()(
-        room._scene, max_depth=2, samples_per_src=QUICK.samples, max_num_paths_per_src=120_000,
+        room.scene, max_depth=2, samples_per_src=QUICK.samples, max_num_paths_per_src=120_000,
         diffuse_reflection=False, seed=QUICK.seed,
     )  # fmt: skip
     real, imaginary = found.cfr(frequencies=mi.Float(tones - tones.mean()), normalize_delays=False)

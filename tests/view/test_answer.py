@@ -139,6 +139,6 @@ def test_an_operating_point_without_confidence_showed_that_of_the_whole_model(sp
     shutil.copy(spectrum_view.viewed.name, file)
     point = Operating("no confidence", {"confidence": False}, 1, 0.0, ("psnr_db", 20.0), 0.5)
     checkpoint.amend(file, {KEY: {"points": [asdict(point)], "measured": {}}})
-    lean, trained = (way.predictor for way in open_viewed(file).ways)
+    lean, trained = open_viewed(file).ways
     place = {end: np.full(3, 0.5) for end in spectrum_view.viewed.moving}
     assert ask(lean, place).confidence is None and ask(trained, place).confidence is not None

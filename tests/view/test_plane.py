@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from campaigns import channels, compose
 
 from gsparc.commands.train import train
 from gsparc.view.answer import ask
-from gsparc.view.plane import Plane, beyond_distance, lifted, refining, sheet, thinned, weakest
+from gsparc.view.plane import Plane, beyond_distance, refining, sheet, thinned, weakest
 from gsparc.view.reasons import usual
 from gsparc.view.scene import Legend
 from gsparc.view.site_view import grid_for
@@ -44,7 +46,7 @@ def test_what_distance_explains_is_taken_off_a_plane(power_view):
 
 def test_a_lifted_plane_is_asked_at_its_height(power_view):
     asked = power_view.viewed.asked(power_view.viewed.stations[0])
-    high = lifted(thinned(power_view.grid, 10), 6.0)
+    high = replace(thinned(power_view.grid, 10), height=6.0)
     *_, plane = refining(asked, high)
     assert (high.places()[:, 2] == 6.0).all() and max(high.shape) <= 11
     direct = 10 * np.log10(asked.rssi(rx=high.places())).reshape(high.shape)

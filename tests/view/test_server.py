@@ -21,8 +21,9 @@ from gsparc.commands.train import train
 from gsparc.maps import map_of
 from gsparc.maps.pictures import layers
 from gsparc.models.reduced import reduced
+from gsparc.prediction.operating_point import Operating
 from gsparc.view.site_view import SiteView, grid_for
-from gsparc.view.viewed import OperatingPoint, open_viewed
+from gsparc.view.viewed import open_viewed
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -164,10 +165,11 @@ def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
 
 
 def test_operating_points_are_steps_with_their_accuracy_and_live_milliseconds(visit, spectrum_view):
-    trained = spectrum_view.viewed.ways[-1]
-    coarse = gsparc.load(spectrum_view.viewed.name)
+    coarse, trained = (gsparc.load(spectrum_view.viewed.name) for _ in range(2))
     coarse.method = reduced(coarse.method, {"stride": 2}, {})
-    ways = OperatingPoint("stride 2", coarse, 1, (20.0, 0.5), "psnr_db"), replace(trained, swept=(25.0, 2.0))
+    coarse.point = Operating("stride 2", {"stride": 2}, 1, 20.0, ("psnr_db", 20.0), 0.5)
+    trained.point = Operating("full, 2 threads", {}, 2, 100.0, ("psnr_db", 25.0), 2.0)
+    ways = coarse, trained
     session = visit(SiteView(replace(spectrum_view.viewed, ways=ways)))
     settle(session)
     assert re.search(r"as trained.*\*\*[\d.]+ ms\*\*", session.speed.content)

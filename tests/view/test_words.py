@@ -6,8 +6,8 @@ import numpy as np
 
 from gsparc.view.answer import Answer
 from gsparc.view.building import MIRROR, WALL
+from gsparc.view.reasons import answer_markdown, legend_html
 from gsparc.view.scene import Faces
-from gsparc.view.words import answer_markdown, legend_html
 
 
 def test_nought_has_no_sign():

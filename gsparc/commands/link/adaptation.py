@@ -106,7 +106,9 @@ class Adaptation:
             chosen = self._highest(self._fails(guess - care))
             regret = torch.full((len(chosen),), torch.nan, dtype=torch.float64)
         else:
-            chosen, regret = self._carries_most(guess, care * self._uncertainty_db(band))
+            loud = band.expected_power.mean(1).clamp_min(1e-30)
+            doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
+            chosen, regret = self._carries_most(guess, care * doubt)
         delivered = self.full_bps * (1 - fails.clamp_max(1))
 
         def of(table: Tensor, mcs: Tensor) -> np.ndarray:
@@ -124,12 +126,6 @@ class Adaptation:
             of(fails, oracle) > OUTAGE,
             care,
         )
-
-    @staticmethod
-    def _uncertainty_db(band: Band) -> Tensor:
-        """`SLOW_DECIBEL` times the root of the expected relative error (n,)."""
-        loud = band.expected_power.mean(1).clamp_min(1e-30)
-        return SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()
 
     def _effective_db(self, sinr: Tensor) -> Tensor:
         """Effective SINR [dB] (n, 28) under every MCS, from the SINR of the tones (n, K)."""

@@ -10,13 +10,13 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.output import run_directory, show
-from gsparc.commands.predict.answers import Answers, answers, check_fits, decibels, target, write
+from gsparc.commands.predict.answers import answers, check_fits, decibels, target, write
 from gsparc.commands.predict.placing import far_outside, in_a_speck, in_world, stations_of, with_heights
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.prediction.load import load
+from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
@@ -72,6 +72,9 @@ def predict(
             places, int(far.sum()), len(far), margin, queries.rows[int(np.argmax(far))],
         )  # fmt: skip
     write(path, queries, found, site.kind)
+    level = decibels(found)[0] if site.kind == "rssi" else np.zeros(0)
+    level = level[np.isfinite(level)]
+    ends = {"lowest": float(level.min()), "highest": float(level.max())} if len(level) else {}
     return {
         "predict/places": len(queries),
         "predict/predictions": len(found),
@@ -82,7 +85,7 @@ def predict(
         "model/name": predictor.method.name,
         "places": str(places),
         "out": str(path),
-        **_range(found, site),
+        **{f"predict/{name}_db": value for name, value in ends.items()},
     }
 
 
@@ -93,17 +96,6 @@ def _notes(queries: QueryPlaces, site: Site) -> list[str]:
     if queries.station is not None and site.stations is None:
         notes.append("not used: stations; the model has none")
     return notes
-
-
-def _range(found: Answers, site: Site) -> dict[str, float]:
-    """Lowest and highest level [dB] of powers."""
-    level = decibels(found)[0] if site.kind == "rssi" else np.zeros(0)
-    level = level[np.isfinite(level)]
-    return (
-        {"predict/lowest_db": float(level.min()), "predict/highest_db": float(level.max())}
-        if len(level)
-        else {}
-    )
 
 
 def task(config: DictConfig) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
 from gsparc.data.query_places import WORDS, QueryPlaces
 from gsparc.data.schema import End, Site
-from gsparc.data.tables.places import Places
 from gsparc.prediction.predictor import usual_heights
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
@@ -31,17 +30,14 @@ def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
         if where.height is not None:
             continue
         if end not in known:
+            low, high = site.moving_box[:, 2::3][:, -1 if end == "rx" else 0] + site.origin[2]
+            several = f"the {WORDS[end]} was measured at heights from {low:g} to {high:g} m"
             say = f"say columns.{'' if len(ends) == 1 else end + '_'}height=NUMBER, or give it in the file"
-            raise DataError(f"{queries.source}: no height, and the {WORDS[end]} {_heights(site, end)}; {say}")
+            raise DataError(f"{queries.source}: no height, and {several}; {say}")
         height = np.full(len(queries), known[end])
         ends[end] = replace(where, height=height)
         notes.append(f"no height of the {WORDS[end]}: taken as {known[end]:g} m, as when it was measured")
     return replace(queries, ends=ends, notes=tuple(notes))
-
-
-def _heights(site: Site, end: End) -> str:
-    low, high = site.moving_box[:, 2::3][:, -1 if end == "rx" else 0] + site.origin[2]
-    return f"was measured at heights from {low:g} to {high:g} m"
 
 
 def in_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
@@ -50,22 +46,21 @@ def in_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
     Raises:
         DataError: degrees where the model knows none, or a place that no measurement in metres can have.
     """
-    return {end: _in_world(queries, where, site) for end, where in queries.ends.items()}
-
-
-def _in_world(queries: QueryPlaces, where: Places, site: Site) -> np.ndarray:
-    origin = site.georeference
-    if where.degrees and origin is None:
-        fault = f"places in degrees, but {site.name} was measured in metres about an unknown origin"
-        raise DataError(f"{queries.source}: {fault}; give x, y and z [m]")
-    across = origin.from_degrees(*where.across.T) if where.degrees and origin is not None else where.across
-    assert where.height is not None
-    world = np.column_stack([across, where.height])
-    wrong = np.flatnonzero((np.abs(world) > FARTHEST).any(axis=1))
-    if len(wrong):
-        place = ", ".join(f"{value:g}" for value in where.all()[wrong[0]])
-        fault = f"({place}) is more than {FARTHEST / 1e3:.0f} km from the origin"
-        raise DataError(f"{queries.source}, {queries.rows[wrong[0]]}: {fault}; expected metres, or degrees")
+    origin, world = site.georeference, dict[End, np.ndarray]()
+    for end, where in queries.ends.items():
+        if where.degrees and origin is None:
+            fault = f"places in degrees, but {site.name} was measured in metres about an unknown origin"
+            raise DataError(f"{queries.source}: {fault}; give x, y and z [m]")
+        across = where.across
+        if where.degrees and origin is not None:
+            across = origin.from_degrees(*across.T)
+        assert where.height is not None
+        world[end] = np.column_stack([across, where.height])
+        wrong = np.flatnonzero((np.abs(world[end]) > FARTHEST).any(axis=1))
+        if len(wrong):
+            place = ", ".join(f"{value:g}" for value in where.all()[wrong[0]])
+            fault = f"({place}) is more than {FARTHEST / 1e3:.0f} km from the origin; expected metres"
+            raise DataError(f"{queries.source}, {queries.rows[wrong[0]]}: {fault}, or degrees")
     return world
 
 

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from hydra.utils import instantiate
 from lightning import Callback, Trainer
 from omegaconf import DictConfig, OmegaConf
@@ -23,7 +22,6 @@ from gsparc.evaluation.scores import score
 from gsparc.models import parts
 from gsparc.models.method import Method
 from gsparc.models.per_station import for_links
-from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Clock, less_repeatable
 
@@ -137,11 +135,3 @@ def fit_and_score(
             keep(number, method, report)
     found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes), limited)
     return found if eval_on is None else found.scored_on(data, split, eval_on)
-
-
-def query_ms(
-    methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings
-) -> dict[str, tuple[float, float]]:
-    """Median and 95th percentile of warm single queries, all methods in turns [ms]."""
-    times = interleaved(cycling(methods, queries(data, rows)), clock)
-    return {name: percentiles(ms) for name, ms in times.items()}

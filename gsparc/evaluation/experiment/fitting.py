@@ -256,7 +256,9 @@ def fill_all(
         number = prepared.index(one) + 1
         log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
         try:
-            _log_filled(fill(one))
+            found = fill(one)
+            score = f"{score_db(found.facts['dataset/kind'], found.facts):.2f} dB" if found.scored() else "-"
+            log.info("%s: %s after %.1f s", found.cell, score, found.facts["time/train_s"])
         except KeyboardInterrupt:
             kept = "interrupted; finished cells are kept: the same command goes on with the others"
             raise KeyboardInterrupt(kept) from None
@@ -272,11 +274,5 @@ def fill_all(
     if train:
         here = [one for one in missing if one.problem.data is not None]
         each_once(here, lambda one: one.lock, done, work)
-    found = [one.found() or (None if cannot(one) else one.found_earlier()) for one in prepared]
-    return [one for one in found if one is not None]
-
-
-def _log_filled(found: Filled) -> None:
-    scored = found.scored()
-    score = f"{score_db(found.facts['dataset/kind'], found.facts):.2f} dB" if scored else "-"
-    log.info("%s: %s after %.1f s", found.cell, score, found.facts["time/train_s"])
+    kept = [one.found() or (None if cannot(one) else one.found_earlier()) for one in prepared]
+    return [one for one in kept if one is not None]

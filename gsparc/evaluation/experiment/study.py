@@ -12,28 +12,15 @@ import numpy as np
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.experiment.fit import Outcome, fit_and_score, in_folders, query_ms
+from gsparc.evaluation.experiment.fit import Outcome, fit_and_score, in_folders
 from gsparc.evaluation.figures import DECIDING
 from gsparc.models.method import Method
-from gsparc.prediction.timing import ClockSettings
+from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
 REFUSED = "not possible"  # in the error of an effect that the data do not allow
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One way of predicting.
-
-    Attributes:
-        name: in tables.
-        make: an unfitted method.
-    """
-
-    name: str
-    make: Callable[[], Method]
 
 
 @dataclass(frozen=True)
@@ -65,7 +52,7 @@ class Row:
     """A variant under a condition.
 
     Attributes:
-        variant, what, amount: names and amount, see `Variant` and `Condition`.
+        variant, what, amount: names and amount, see `Study` and `Condition`.
         effects: the propagation effects it computes.
         rows: measurements it learned from, mean over folds.
         figure: name of the accuracy.
@@ -108,7 +95,7 @@ class Study:
     """What is compared.
 
     Attributes:
-        variants: by the order of the table.
+        variants: what makes an unfitted method, by name, in the order of the table.
         conditions: each variant is fitted once per condition that changes what is learned from.
         base: name of the variant that times are compared with; None: no ratios.
         rounds: trainings of each, in turns; round r uses seed + r.
@@ -116,7 +103,7 @@ class Study:
         clock: of the queries.
     """
 
-    variants: Sequence[Variant]
+    variants: Mapping[str, Callable[[], Method]]
     conditions: Sequence[Condition] = (Condition(),)
     base: str | None = None
     rounds: int = 1
@@ -124,9 +111,8 @@ class Study:
     clock: ClockSettings = field(default_factory=ClockSettings)
 
     def __post_init__(self) -> None:
-        names = [variant.name for variant in self.variants]
-        if self.base is not None and self.base not in names:
-            raise ValueError(f"base={self.base}: no such variant; there are {', '.join(names)}")
+        if self.base is not None and self.base not in self.variants:
+            raise ValueError(f"base={self.base}: no such variant; there are {', '.join(self.variants)}")
 
     def run(self, data: Measurements, split: Split, context: FitContext) -> list[Row]:
         """Fit, score and time everything; a variant that the data do not allow is left out.
@@ -138,16 +124,16 @@ class Study:
         Raises:
             ValueError: the base variant, or every variant, cannot be trained here.
         """
-        outcomes: dict[tuple[Variant, Condition], list[Outcome]] = {}
+        outcomes: dict[tuple[str, Condition], list[Outcome]] = {}
         allowed = list(self.variants)
         for turn in range(self.rounds):
             for variant in list(allowed):
                 try:
                     found = self._outcomes(variant, data, split, context, turn)
                 except ValueError as refused:
-                    if variant.name == self.base or REFUSED not in str(refused) or len(allowed) == 1:
+                    if variant == self.base or REFUSED not in str(refused) or len(allowed) == 1:
                         raise
-                    log.info("%s is left out: %s", variant.name, refused)
+                    log.info("%s is left out: %s", variant, refused)
                     allowed.remove(variant)
                     continue
                 for condition, outcome in found.items():
@@ -155,7 +141,7 @@ class Study:
         return self._rows(outcomes, data, split)
 
     def _outcomes(
-        self, variant: Variant, data: Measurements, split: Split, context: FitContext, turn: int
+        self, variant: str, data: Measurements, split: Split, context: FitContext, turn: int
     ) -> dict[Condition, Outcome]:
         """One training per condition that changes what is learned from."""
         found: dict[Condition, Outcome] = {}
@@ -163,10 +149,11 @@ class Study:
         for condition in self.conditions:
             outcome, learned = plain, condition.learned
             if outcome is None or learned is not None:
-                folder = context.run_dir / variant.name / str(condition).replace(" ", "-") / str(turn)
+                folder = context.run_dir / variant / str(condition).replace(" ", "-") / str(turn)
                 settings = in_folders(replace(context, run_dir=folder, seed=seed))
                 learned_from = partial(condition.learned_from, seed=seed)
-                outcome = fit_and_score(variant.make, data, split, settings, learned=learned_from)
+                make = self.variants[variant]
+                outcome = fit_and_score(make, data, split, settings, learned=learned_from)
                 plain = outcome if learned is None else plain
             if condition.tested is not None:
                 outcome = outcome.scored_on(condition.tested(data, split, seed), split)
@@ -174,32 +161,33 @@ class Study:
             figure = DECIDING[data.site.kind]
             log.info(
                 "%s, %s, round %d of %d: %s %.4g after %.3g s of training",
-                variant.name, condition, turn + 1, self.rounds, figure, _value(outcome, figure),
+                variant, condition, turn + 1, self.rounds, figure, _value(outcome, figure),
                 sum(outcome.train_s),
             )  # fmt: skip
         return found
 
     def _rows(
-        self, outcomes: Mapping[tuple[Variant, Condition], list[Outcome]], data: Measurements, split: Split
+        self, outcomes: Mapping[tuple[str, Condition], list[Outcome]], data: Measurements, split: Split
     ) -> list[Row]:
         figure = DECIDING[data.site.kind]
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
         methods = {str(id(o[-1].methods[0])): o[-1].methods[0] for o in outcomes.values()}
-        asked = query_ms(methods, data, split.folds[0].test, self.clock)
+        times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)
+        asked = {name: percentiles(ms) for name, ms in times.items()}
         rows = []
         for (variant, condition), found in outcomes.items():
             values = [_value(one, figure) for one in found]
             seconds = np.array([np.mean(one.train_s) for one in found])
             p50, p95 = asked[str(id(found[-1].methods[0]))]
             train_ratio = query_ratio = None
-            base = next((o for (v, c), o in outcomes.items() if (v.name, c) == (self.base, condition)), None)
+            base = outcomes.get((self.base or "", condition))
             if base is not None:
                 train_ratio = float(np.median(seconds / np.array([np.mean(one.train_s) for one in base])))
                 query_ratio = p50 / asked[str(id(base[-1].methods[0]))][0]
             folds = [condition.learned_from(data, fold, self.seed)[1] for fold in split.folds]
             rows.append(
                 Row(
-                    variant.name, condition.what, condition.amount,
+                    variant, condition.what, condition.amount,
                     str(found[-1].methods[0].effects or "none"),
                     float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
                     figure, float(np.mean(values)),

@@ -163,21 +163,15 @@ def _label(facts: Sequence[Mapping[str, Any]]) -> str:
 
 
 @dataclass(frozen=True)
-class Result:
+class Result(Cell):
     """One scored cell, so that anyone can pair what they like.
 
     Attributes:
-        dataset, split, method, budget_s, seed: of the cell.
         figure, value: the deciding figure.
         train_s, train_cpu_s: of one model [s].
         load: 1-minute load per core at the end of the training.
     """
 
-    dataset: str
-    split: str
-    method: str
-    budget_s: float | None
-    seed: int | None
     figure: str
     value: float
     train_s: float
@@ -187,15 +181,14 @@ class Result:
 
 def results(filled: Sequence[Filled]) -> list[Result]:
     """Of every scored cell."""
-    return [_result(one.cell, one.facts) for one in filled if one.scored()]
-
-
-def _result(cell: Cell, facts: Mapping[str, Any]) -> Result:
-    figure = DECIDING[facts["dataset/kind"]]
-    return Result(
-        **asdict(cell), figure=figure, value=facts[f"test/{figure}"], train_s=facts["time/train_s"],
-        train_cpu_s=facts["time/train_cpu_s"], load=facts.get("machine/load"),
-    )  # fmt: skip
+    return [
+        Result(
+            **asdict(one.cell), figure=figure, value=one.facts[f"test/{figure}"],
+            train_s=one.facts["time/train_s"], train_cpu_s=one.facts["time/train_cpu_s"],
+            load=one.facts.get("machine/load"),
+        )
+        for one in filled if one.scored() for figure in [DECIDING[one.facts["dataset/kind"]]]
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True)

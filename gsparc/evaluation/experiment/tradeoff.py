@@ -24,14 +24,10 @@ from gsparc.evaluation.open_runs import Opened, trained_on
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.models import loading
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Point, Settings, cost_of_halving
+from gsparc.models.pareto import Point, Settings, cost_of_halving, worded
 from gsparc.models.reduced import View
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import (
-    Call,
-    ClockSettings,
-    interleaved,
-)
+from gsparc.prediction.timing import Call, ClockSettings, interleaved
 
 log = logging.getLogger(__name__)
 
@@ -39,31 +35,15 @@ CLOSEST_DB = 100.0  # the precision of float32
 PAIRED = {"nmse": "snr_db"}  # an NMSE is of a whole set; its samples are compared by their own ratios
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """One way of answering, before it is measured.
-
-    Attributes:
-        label: in words.
-        settings: what it is reduced by.
-        method: answers so.
-        threads: CPU threads to be timed with.
-    """
-
-    label: str
-    settings: Settings
-    method: Method
-    threads: tuple[int, ...]
-
-
 def sweep(
-    candidates: Sequence[Candidate], data: Measurements, fold: Fold, *, eval_on: str, clock: ClockSettings,
-    others: Mapping[str, Call],
+    candidates: Sequence[tuple[Settings, Method]], threads: Sequence[int], data: Measurements, fold: Fold, *,
+    eval_on: str, clock: ClockSettings, others: Mapping[str, Call],
 ) -> tuple[list[Point], dict[str, np.ndarray]]:  # fmt: skip
     """Measure the candidates; the first is the full model, which the others are compared with.
 
     Args:
-        candidates: to be measured.
+        candidates: to be measured: what a method is reduced by, and the method that answers so.
+        threads: CPU threads that each is timed with.
         data, fold: as the model was trained with.
         eval_on: rows whose figures are shown.
         clock: how long to measure.
@@ -76,8 +56,8 @@ def sweep(
     scored: list[tuple[Scores, float]] = []
     whole = None
     places = data.moving[rows_of(fold, eval_on)] + data.site.origin
-    for number, candidate in enumerate(candidates):
-        recorded = Recorded(candidate.method)
+    for number, (_, method) in enumerate(candidates):
+        recorded = Recorded(method)
         there = score([recorded], data, split, eval_on)
         answers = torch.cat(recorded.means)
         whole = answers if whole is None else whole
@@ -85,25 +65,19 @@ def sweep(
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
-    threads: dict[tuple[int, int] | str, int] = dict.fromkeys(others, 1)
-    for index, candidate in enumerate(candidates):
-        ask = Predictor(candidate.method, data.site).cycling(places)
-        for count in candidate.threads:
-            calls[index, count], threads[index, count] = ask, count
-    times = interleaved(calls, clock, threads)
+    for index, (_, method) in enumerate(candidates):
+        ask = Predictor(method, data.site).cycling(places)
+        calls |= {(index, count): ask for count in threads}
+    times = interleaved(calls, clock, {key: 1 if isinstance(key, str) else key[1] for key in calls})
     points = []
     for key, ms in times.items():
         if isinstance(key, str):
             continue
         index, count = key
-        candidate, (scores, close) = candidates[index], scored[index]
-        label = f"{candidate.label}, {count} thread{'s' if count > 1 else ''}"
-        points.append(
-            Point(
-                label, candidate.settings, count, scores.figures(), close, ms,
-                candidate.method.size(), _difference(scores, scored[0][0], figure),
-            )
-        )  # fmt: skip
+        (settings, method), (scores, close) = candidates[index], scored[index]
+        label = f"{worded(settings)}, {count} thread{'s' if count > 1 else ''}"
+        apart = _difference(scores, scored[0][0], figure)
+        points.append(Point(label, settings, count, scores.figures(), close, ms, method.size(), apart))
     return points, {name: times[name] for name in others}
 
 

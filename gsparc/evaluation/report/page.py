@@ -1,4 +1,4 @@
-"""One self-contained page: tables that sort, plots inside, nothing fetched."""
+"""Tables of runs as one self-contained page, sortable and with plots inside, and in a document."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import numpy as np
 from jinja2 import Environment
 from PIL import Image
 
+from gsparc.data.files import whole_file
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
 from gsparc.evaluation.report.table import Table
@@ -138,3 +139,43 @@ def write(folder: Path, title: str, made: str, shown: Sequence[Study]) -> None:
 
 def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+BEGIN = "<!-- results: written by `make results` -->"
+END = "<!-- end of results -->"
+OMITTED_COLUMNS = ("SSIM (uniform 7)", "MSE", "p95", "Gaussians")  # columns for the report's page
+OMITTED_ROWS = ("zero",)  # rows likewise
+
+
+def refresh(path: Path, runs: Sequence[Run]) -> None:
+    """Replace what stands between the marks `BEGIN` and `END`; the file is replaced whole.
+
+    Raises:
+        ValueError: the marks are missing or in the wrong order.
+    """
+    text = path.read_text(encoding="utf-8")
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"{path}: the lines {BEGIN} and {END} are needed, in this order")
+    shown = "\n".join(_short(f"{name}, split {cut}", group) for (name, cut), group in by_study(runs).items())
+    with whole_file(path) as partial:
+        partial.write_text(f"{before}{BEGIN}\n\n{shown}\n{END}{after}", encoding="utf-8")
+
+
+def _short(title: str, runs: Sequence[Run]) -> str:
+    """The settings of a study over seeds, then the baselines."""
+    runs = [replace(run, render_ms=np.zeros(0)) for run in runs]  # on the clock that timed the baselines
+    table, whole, facts = tables.seeds(runs), tables.results(runs), runs[0].facts
+    names, heads = ([column.name for column in one.columns] for one in (table, whole))
+    rows = list(table.rows)
+    for row in whole.rows[len(runs) :]:  # the baselines have no seeds
+        cells = dict(zip(heads, row, strict=True))
+        if row[0] not in OMITTED_ROWS:
+            rows.append([cells.get(name) for name in names])
+    load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
+    machine = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s)"
+    note = f"{machine}, load {load:.1f} per core; queries in turns."
+    kept = [i for i, name in enumerate(names) if name not in OMITTED_COLUMNS]
+    short = [[row[i] for i in kept] for row in rows]
+    return Table(title, [table.columns[i] for i in kept], short, note).markdown()

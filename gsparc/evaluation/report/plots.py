@@ -192,11 +192,10 @@ def costs(runs: Sequence[Run]) -> Figure:
     }
     for panel, (title, value) in zip(line, columns.items(), strict=True):
         for row, ((_, group), style) in enumerate(_styled(runs)):
-            known = [float(v) for v in map(value, group) if v is not None]
-            if not known:
+            found = over_seeds([value(run) for run in group])
+            if found is None:
                 panel.text(0, row, " none", va="center", fontsize=7, color="0.5")
                 continue
-            found = over_seeds(known)
             low, high = found.low or found.value, found.high or found.value
             reach = [[found.value - low], [high - found.value]]
             panel.barh(row, found.value, color=style["color"], alpha=0.8)

@@ -69,11 +69,12 @@ def _parts(run: Run, figure: str) -> tuple[np.ndarray, np.ndarray | None] | None
     return (found, None) if len(found) > 1 else None
 
 
-def over_seeds(values: Sequence[float]) -> Interval:
-    """Mean, least and largest over seeds."""
-    if len(values) == 1:
-        return Interval(values[0])
-    return Interval(float(np.mean(values)), min(values), max(values))
+def over_seeds(values: Sequence[float | None]) -> Interval | None:
+    """Mean, least and largest over those seeds that have a value; None where none has."""
+    known = [value for value in values if value is not None]
+    if len(known) < 2:
+        return Interval(known[0]) if known else None
+    return Interval(float(np.mean(known)), min(known), max(known))
 
 
 @dataclass(frozen=True)

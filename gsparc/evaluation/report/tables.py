@@ -82,10 +82,10 @@ def seeds(runs: Sequence[Run]) -> Table:
     )  # fmt: skip
     for setting, group in grouped(runs).items():
         p50, p95 = zip(*(run.latency for run in group), strict=True)
-        spread = [_over([run.figure_of(f) for run in group]) for f in figures]
-        times = _over([number(run.facts.get("time/train_s")) for run in group])
-        size = _over([number(run.facts.get("model/num_gaussians")) for run in group])
-        table.add(setting, len(group), *spread, times, _over(p50), _over(p95), size)
+        spread = [over_seeds([run.figure_of(f) for run in group]) for f in figures]
+        times = over_seeds([number(run.facts.get("time/train_s")) for run in group])
+        size = over_seeds([number(run.facts.get("model/num_gaussians")) for run in group])
+        table.add(setting, len(group), *spread, times, over_seeds(p50), over_seeds(p95), size)
     return table
 
 
@@ -133,11 +133,6 @@ def worst(runs: Sequence[Run]) -> Table:
                 None if rival is None else float(rival[i]), float(own["confidence"][i]),
             )  # fmt: skip
     return table
-
-
-def _over(values: Sequence[float | None]) -> Interval | None:
-    known = [v for v in values if v is not None]
-    return over_seeds(known) if known else None
 
 
 MINUTES = (1, 2, 5, 10)

@@ -14,16 +14,14 @@ import numpy as np
 from gsparc.data.instantiate import known_keys
 from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
-from gsparc.simulate.engine import Engine
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
-from gsparc.simulate.scenes.placement import clear_of
-from gsparc.simulate.scenes.receivers import layout, receivers
+from gsparc.simulate.scenes.receivers import Ground, clear_of, layout, receivers
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna, Transmitter, stations
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
-from gsparc.simulate.survey import Survey
+from gsparc.simulate.survey import Engine, Survey
 
 log = logging.getLogger(__name__)
 
@@ -139,7 +137,7 @@ def build(scene: SceneSettings, sampling: Sampling) -> Survey:
     tracer = RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering)
     box = tracer.box()[:, :2] if town is None else town.box
     area = _area(scene, box)
-    ground: _Around | _Clear = _Around(scene, tracer, area) if solids is None else _Clear(solids)
+    ground = _around(scene, tracer, area) if solids is None else Ground(solids)
     georeference = None if town is None else town.georeference
     masts = _masts(scene, tracer, ground, area, georeference)
     streets = () if town is None else town.streets
@@ -218,7 +216,7 @@ def _shoebox(scene: SceneSettings) -> Survey:
         raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
     engines: list[Engine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
     placed = receivers(
-        layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, _Clear(room.contains)
+        layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, Ground(room.contains)
     )
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
 
@@ -258,7 +256,7 @@ def _stated(
 def _masts(
     scene: SceneSettings,
     tracer: RayTracer,
-    ground: _Around | _Clear,
+    ground: Ground,
     area: np.ndarray,
     georeference: Georeference | None,
 ) -> list[Transmitter]:
@@ -267,7 +265,7 @@ def _masts(
     if stated is not None:
         return stated
     middle = area.mean(0)
-    if isinstance(ground, _Around) and ground.open_sky:
+    if ground.open_sky:
         high = float(tracer.surface(middle[None])[0][0]) + MAST_M
     else:
         low, top = tracer.box()[:, 2]
@@ -277,49 +275,20 @@ def _masts(
     return [Transmitter("tx", position, Antenna())]
 
 
-class _Clear:
-    """Places that a test of the objects allows; heights count from zero.
+def _around(scene: SceneSettings, tracer: RayTracer, area: np.ndarray) -> Ground:
+    """Places about the surfaces that rays find; an area (2, 2) [m] is looked at for a ceiling."""
+    open_sky = tracer.has_open_sky(area) if scene.open_sky is None else scene.open_sky
+    over = scene.over if open_sky else "zero"
 
-    Args:
-        test: (n, 3) [m] -> (n,) bool.
-    """
-
-    def __init__(self, test: Any) -> None:
-        self._test = test
-
-    def lift(self, points: np.ndarray) -> np.ndarray:
-        """As they are."""
-        return points
-
-    def allowed(self, points: np.ndarray) -> np.ndarray:
-        """See `receivers.Ground`."""
-        return np.asarray(self._test(points))
-
-
-class _Around:
-    """Places about the surfaces of a scene that rays find.
-
-    Args:
-        scene: `over` and `open_sky`.
-        tracer: of the scene.
-        area: (2, 2) [m] that is looked at for a ceiling.
-    """
-
-    def __init__(self, scene: SceneSettings, tracer: RayTracer, area: np.ndarray) -> None:
-        self._over, self._tracer = scene.over, tracer
-        self.open_sky = tracer.has_open_sky(area) if scene.open_sky is None else scene.open_sky
-        if not self.open_sky:
-            self._over = "zero"
-
-    def lift(self, points: np.ndarray) -> np.ndarray:
-        """From heights above the ground or roofs to z [m]."""
-        if self._over == "zero":
+    def lift(points: np.ndarray) -> np.ndarray:
+        if over == "zero":
             return points
-        return points + [0.0, 0.0, 1.0] * self._tracer.surface(points[:, :2])[0][:, None]
+        return points + [0.0, 0.0, 1.0] * tracer.surface(points[:, :2])[0][:, None]
 
-    def allowed(self, points: np.ndarray) -> np.ndarray:
-        """See `receivers.Ground`."""
-        free = self._tracer.clear_of_surfaces(points, CLEARANCE)
-        if self._over == "ground":
-            free &= self._tracer.surface(points[:, :2])[1]
-        return free & self._tracer.under_open_sky(points) if self.open_sky else free
+    def allowed(points: np.ndarray) -> np.ndarray:
+        free = tracer.clear_of_surfaces(points, CLEARANCE)
+        if over == "ground":
+            free &= tracer.surface(points[:, :2])[1]
+        return free & tracer.under_open_sky(points) if open_sky else free
+
+    return Ground(allowed, lift, open_sky)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.links.georeference import Georeference, bad_degrees
-from gsparc.simulate.scenes.solid import Solid
+from gsparc.simulate.scenes.solid import Solid, sheet
 
 LEVEL_M = 3.0  # of a storey
 USUAL_LEVELS = 3  # of a building that says neither height nor levels
@@ -72,6 +72,8 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise ValueError(f"scene=osm needs {', '.join(missing)}; pip install 'gsparc[scenes]'")
+    import trimesh
+
     features = _features(path)
     shapes = [
         (shape, tags)
@@ -97,7 +99,11 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
             meshes.setdefault(_material(tags, guesses), []).append(mesh)
     if not meshes:
         raise ValueError(f"scene.file={path}: none of {len(shapes)} footprints can be a building")
-    solids = [_joined(material, parts) for material, parts in sorted(meshes.items())]
+    solids = []
+    for material, parts in sorted(meshes.items()):
+        whole: Any = trimesh.util.concatenate(parts)
+        arrays = np.array(whole.vertices), np.array(whole.faces)
+        solids.append(Solid(f"buildings_{material}", material, *arrays))
     corners = np.concatenate([solid.vertices[:, :2] for solid in solids])
     box = np.stack([corners.min(0), corners.max(0)])
     if np.ptp(box, axis=0).max() > LARGEST_M:
@@ -109,7 +115,9 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     said = [f"{number} of {count} buildings: {what}" for what, number in sorted(guesses.items())]
     notes = (f"{count} buildings about {origin.latitude:g}, {origin.longitude:g} degrees", *said)
     streets = [line for geometry, tags in features for line in _streets(geometry, tags, origin)]
-    return Town([_ground(box, soil), *solids], streets, box, origin, notes)
+    (x0, y0), (x1, y1) = box + np.array([[-MARGIN_M], [MARGIN_M]])
+    ground = sheet(GROUND, soil, (x0, y0, 0), (x1 - x0, 0, 0), (0, y1 - y0, 0))
+    return Town([ground, *solids], streets, box, origin, notes)
 
 
 def _features(path: Path) -> list[tuple[Any, Mapping[str, Any]]]:
@@ -191,19 +199,6 @@ def _extruded(shape: Any, low: float, high: float, origin: Georeference) -> Any:
     mesh = trimesh.util.concatenate(meshes)
     mesh.apply_translation([0, 0, low])
     return mesh
-
-
-def _joined(material: str, meshes: list[Any]) -> Solid:
-    import trimesh
-
-    whole: Any = trimesh.util.concatenate(meshes)
-    return Solid(f"buildings_{material}", material, np.array(whole.vertices), np.array(whole.faces))
-
-
-def _ground(box: np.ndarray, material: str) -> Solid:
-    (x0, y0), (x1, y1) = box + np.array([[-MARGIN_M], [MARGIN_M]])
-    corners = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
-    return Solid(GROUND, material, corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _streets(geometry: Any, tags: Mapping[str, Any], origin: Georeference) -> list[np.ndarray]:

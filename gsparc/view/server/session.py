@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,13 +29,12 @@ from gsparc.view.building import (
 )
 from gsparc.view.latest_job import LatestJobQueue
 from gsparc.view.panel import response_db, spectrum_image, tones_mhz
-from gsparc.view.plane import Plane, beyond_distance, lifted, refining, sheet, weakest
+from gsparc.view.plane import Plane, beyond_distance, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
-from gsparc.view.reasons import reasons
+from gsparc.view.reasons import ENDS, answer_markdown, legend_html, reasons
 from gsparc.view.scene import EXTENT, Legend, Points
 from gsparc.view.server.draw import draw, draw_scene, first_view, floor
 from gsparc.view.site_view import SiteView
-from gsparc.view.words import ENDS, answer_markdown, legend_html
 
 PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothing"
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
@@ -147,8 +147,9 @@ class Session:
                 self.way = gui.add_slider("fast to accurate", 0, last, 1, last)
                 self._on(self.way, self._way_changed)
             self.speed = gui.add_markdown("")
-            if last:
-                title = f"{viewed.ways[0].figure} by ms of a query, as swept; filled: this one"
+            if viewed.ways[0].point is not None and last:
+                figure, _ = viewed.ways[0].point.figure
+                title = f"{figure} by ms of a query, as swept; filled: this one"
                 self.front = self._plot(self._front(), title, DOTS)
         with gui.add_folder("Notes", expand_by_default=False):
             gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
@@ -256,10 +257,10 @@ class Session:
     def _front(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first, and
         that of the chosen one, NaN elsewhere."""
-        ways = self.view.viewed.ways
-        swept = sorted((*one.swept[::-1], k) for k, one in enumerate(ways) if one.swept is not None)
+        points = [one.point for one in self.view.viewed.ways]
+        swept = sorted((one.p50_ms, one.figure[1], k) for k, one in enumerate(points) if one is not None)
         took, reached, number = np.array(swept).T
-        chosen = len(ways) - 1 if self.way is None else self.way.value
+        chosen = len(points) - 1 if self.way is None else self.way.value
         return took, reached, np.where(number == chosen, reached, np.nan)
 
     def _station_changed(self, value: str) -> None:
@@ -304,13 +305,15 @@ class Session:
 
     def _answered(self) -> Iterator[None]:
         since, places = self.asked_s, {end: at.copy() for end, at in self.places.items()}
-        way = self.view.viewed.ways[-1 if self.way is None else int(self.way.value)]
-        threads = self.threads if way.threads is None else way.threads
+        way = -1 if self.way is None else int(self.way.value)
+        point, threads, label, accuracy = self.view.viewed.ways[way].point, self.threads, "as trained", ""
+        if point is not None:
+            threads, label = (point.threads, point.label) if point.settings else (threads, label)
+            accuracy = ", {} {:.4g}".format(*point.figure)
         if threads != torch.get_num_threads():
             torch.set_num_threads(threads)
         try:
-            predictor = way.predictor if self.station is None else way.predictor.at(self.station)
-            answer = ask(predictor, places)
+            answer = ask(self.view.viewed.asked(self.station, way), places)
         except ValueError as error:
             self.said.content = f"**{error}**"
             return
@@ -318,9 +321,8 @@ class Session:
         self.answers += 1
         self.queries.append(answer.query_ms)
         self.delays.append((time.perf_counter() - since) * 1e3)
-        accuracy = "" if way.swept is None else f", {way.figure} {way.swept[0]:.4g}"
         self.speed.content = (
-            f"{way.label}{accuracy}: query **{np.median(self.queries):.2f} ms**, with confidence, reasons "
+            f"{label}{accuracy}: query **{np.median(self.queries):.2f} ms**, with confidence, reasons "
             f"and drawing {np.median(self.delays):.1f} ms (medians of the last {len(self.queries)})"
         )
         yield
@@ -404,14 +406,14 @@ class Session:
             self._lay(*self.made[name])
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
         elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
-            yield from self._predicted_plane(name == BEYOND)
+            grid = replace(self.view.grid, height=float(self.height.value))
+            yield from self._predicted_plane(grid, name == BEYOND)
         elif PLANE in self.nodes:
             self.nodes.pop(PLANE).remove()
         self._legends()
         yield
 
-    def _predicted_plane(self, beyond: bool) -> Iterator[None]:
-        grid = lifted(self.view.grid, float(self.height.value))  # type: ignore[arg-type]
+    def _predicted_plane(self, grid: Grid, beyond: bool) -> Iterator[None]:
         predictor = self.view.viewed.asked(self.station)
         other = self.places["tx"] if self.site.static_end is None else None
         known, there = self.one.about.usual, self._still()

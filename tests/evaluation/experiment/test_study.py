@@ -10,7 +10,7 @@ from clocks import WoundClock
 from invented import divide, invent
 
 from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
-from gsparc.evaluation.experiment.study import Measured, Positions, Study, Variant
+from gsparc.evaluation.experiment.study import Measured, Positions, Study
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.baselines.nearest import Nearest
@@ -57,13 +57,9 @@ class NeedsUplink(Quick):
         return Quick.predict(self, batch.tx, batch.rx)
 
 
-def variants(**makers):
-    return [Variant(name, make) for name, make in makers.items()]
-
-
 def test_times_are_ratios_to_the_base(monkeypatch):
     monkeypatch.setattr(timing.time, "perf_counter", WATCH)
-    made = variants(plain=Quick, slow=Slow, impossible=Impossible, needs=NeedsUplink)
+    made = dict(plain=Quick, slow=Slow, impossible=Impossible, needs=NeedsUplink)
     rows = Study(made, base="plain", rounds=2, clock=CLOCK).run(invent("csi"), divide(48), CONTEXT)
     found = {row.variant: row for row in rows}
     assert list(found) == ["plain", "slow", "needs"]
@@ -78,10 +74,10 @@ def test_times_are_ratios_to_the_base(monkeypatch):
 
 def test_the_base_must_be_there():
     with pytest.raises(ValueError, match="no such variant; there are mean"):
-        Study(variants(mean=Mean), base="plain")
+        Study(dict(mean=Mean), base="plain")
     for base in ("plain", None):
         with pytest.raises(ValueError, match="not possible"):
-            Study(variants(plain=Impossible), base=base).run(invent("csi"), divide(48), CONTEXT)
+            Study(dict(plain=Impossible), base=base).run(invent("csi"), divide(48), CONTEXT)
 
 
 def test_every_fit_gets_the_context_and_every_round_another_seed():
@@ -91,7 +87,7 @@ def test_every_fit_gets_the_context_and_every_round_another_seed():
         found.append(Quick())
         return found[-1]
 
-    Study(variants(quick=make), rounds=2, seed=3, clock=CLOCK).run(invent(), divide(48, 2), CONTEXT)
+    Study(dict(quick=make), rounds=2, seed=3, clock=CLOCK).run(invent(), divide(48, 2), CONTEXT)
     assert [m.context.seed for m in found] == [3, 3, 4, 4] and {m.context.budget_s for m in found} == {7.0}
     assert len({m.context.run_dir for m in found}) == 4
 
@@ -99,7 +95,7 @@ def test_every_fit_gets_the_context_and_every_round_another_seed():
 def test_errors_cost_an_interpolator_and_not_the_mean():
     data, split = invent(), divide(48)
     conditions = Positions([0.001, 0.3]).conditions()
-    rows = Study(variants(gp=GaussianProcess, mean=Mean), conditions, clock=CLOCK).run(data, split, CONTEXT)
+    rows = Study(dict(gp=GaussianProcess, mean=Mean), conditions, clock=CLOCK).run(data, split, CONTEXT)
     value = {(r.variant, r.what, r.amount): r.value for r in rows}
     assert len(value) == 10
     for what in ("query", "train"):
@@ -111,7 +107,7 @@ def test_errors_cost_an_interpolator_and_not_the_mean():
 
 def test_more_measurements_are_better_and_are_counted():
     conditions = Measured([1, 0.5, 9]).conditions()
-    rows = Study(variants(gp=GaussianProcess), conditions, clock=CLOCK).run(invent(), divide(48), CONTEXT)
+    rows = Study(dict(gp=GaussianProcess), conditions, clock=CLOCK).run(invent(), divide(48), CONTEXT)
     assert [row.rows for row in rows] == [36, 18, 9]
     values = [row.value for row in rows]
     assert values == sorted(values, reverse=True) and values[0] > values[-1] + 1

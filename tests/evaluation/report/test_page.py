@@ -14,8 +14,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
 from gsparc.evaluation.drawing import look
 from gsparc.evaluation.report import plots
-from gsparc.evaluation.report.page import html, studies, warnings
-from gsparc.evaluation.report.readme import BEGIN, END, refresh
+from gsparc.evaluation.report.page import BEGIN, END, html, refresh, studies, warnings
 from gsparc.evaluation.report.runs import find_runs
 
 arguments = COMMANDS["report"].arguments
