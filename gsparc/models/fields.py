@@ -45,12 +45,7 @@ def sources(
 ) -> tuple[ConditionalField, FitReport]:
     """Image sources of several searches, and a process on what they leave within the same seconds."""
     budget = context.time_budget()
-    method = ImageSourceGP(
-        searches=init.searches, search_rows=init.search_rows, rows=init.rows, margin=init.margin,
-        max_sources=init.max_sources, order=init.order, clutter=clutter,
-        offsets=init.snapshot, seed=context.seed,
-    )  # fmt: skip
-    return _completed(method, data, rows, context, budget)
+    return _completed(ImageSourceGP(**_searched(init, clutter, context)), data, rows, context, budget)
 
 
 def scene(
@@ -64,11 +59,15 @@ def scene(
     if data.site.kind == "rssi":
         return powers(data, rows, init, clutter, context)
     budget = context.time_budget()
-    method = KnownWallsGP(
-        read_walls(init.file), search_rows=init.search_rows, rows=init.rows, max_sources=init.max_sources,
-        order=init.order, clutter=clutter, offsets=init.snapshot, seed=context.seed,
-    )  # fmt: skip
+    method = KnownWallsGP(read_walls(init.file), **_searched(init, clutter, context))
     return _completed(method, data, rows, context, budget)
+
+
+def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
+    """What `ImageSourceGP` takes, of the settings of an initialiser."""
+    names = ("searches", "search_rows", "rows", "margin", "max_sources", "order")
+    own = {name: getattr(init, name) for name in names}
+    return {**own, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
 
 
 def rays(

@@ -105,12 +105,14 @@ class View(Method):
 class MeanOnly(View):
     """Leaves confidence and variance out of the answer."""
 
+    def __init__(self, inner: Method) -> None:
+        super().__init__(inner)
+        self._mean_at = inner.mean_at if isinstance(inner, Differentiable) else None
+
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the mean alone."""
-        inner = self.inner
-        mean = inner.mean_at(tx, rx) if isinstance(inner, Differentiable) else inner.predict(tx, rx).mean
-        return Prediction(mean)
+        return Prediction(self._mean_at(tx, rx) if self._mean_at else self.inner.predict(tx, rx).mean)
 
 
 def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
@@ -180,8 +182,8 @@ class Blended(View):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
         found = self.inner.predict(tx, rx)
-        mean = self.own * found.mean + self.weight * self.other(tx, rx).mean
-        return replace(found, mean=mean)
+        mean = found.mean if self.own == 1 else found.mean * self.own
+        return replace(found, mean=torch.add(mean, self.other(tx, rx).mean, alpha=self.weight))
 
 
 def mean_alone(process: Method, settings: Settings | None = None) -> Method:

@@ -89,8 +89,10 @@ def called_for(
     placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
     drawn = networks or placed  # asks for Gaussians that are rendered
     obstacles = {
-        "array": _no_static_array(site) or (networks and f"{networks} asks for networks"),
-        "moving_array": _no_moving_array(site) or (drawn and f"{drawn} asks for rendered Gaussians"),
+        "array": _no_array(site, "rx", "the receiver moves")
+        or (networks and f"{networks} asks for networks"),
+        "moving_array": _no_array(site, "tx", "the receiver stands still")
+        or (drawn and f"{drawn} asks for rendered Gaussians"),
         "phase": _no_phase(data) or (drawn and f"{drawn} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
@@ -135,23 +137,12 @@ def _refuse_scene(
         raise ValueError(f"init=scene is not possible: {why}")
 
 
-def _no_static_array(site: Site) -> str | None:
+def _no_array(site: Site, static_end: str, otherwise: str) -> str | None:
+    """Why spectra arise in no array of a receiver that stands (`rx`) or moves (`tx` stands)."""
     if site.kind != "spectrum":
         return f"the target is {site.kind}, not a spectrum"
-    if site.static_end != "rx":
-        return "the receiver moves"
-    return _no_array(site)
-
-
-def _no_moving_array(site: Site) -> str | None:
-    if site.kind != "spectrum":
-        return f"the target is {site.kind}, not a spectrum"
-    if site.static_end != "tx":
-        return "the receiver stands still"
-    return _no_array(site)
-
-
-def _no_array(site: Site) -> str | None:
+    if site.static_end != static_end:
+        return otherwise
     if site.array is None or len(site.array) < 2 or site.wavelength is None:
         return "the dataset declares no array or no carrier"
     return None

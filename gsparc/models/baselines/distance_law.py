@@ -77,21 +77,21 @@ def misfit(residual: np.ndarray, silent: np.ndarray, scale: float) -> tuple[floa
     return value, slope / scale, float((~silent).sum() - (slope * z).sum())
 
 
-def _prior(exponent: float) -> tuple[float, float]:
-    """Negative logarithm of the exponent's prior and its slope."""
-    away = (exponent - USUAL) / SPREAD
-    return 0.5 * away**2, away / SPREAD
+def _posterior(p: np.ndarray, decades: np.ndarray, rows: Rows) -> tuple[float, list[float], np.ndarray]:
+    """Negative log posterior of level, exponent and log scale, its slopes by these and by residuals (n,)."""
+    residual = rows.decibels - p[0] + 10 * p[1] * decades
+    value, slope, by_scale = misfit(residual, rows.silent, math.exp(p[2]))
+    away = (p[1] - USUAL) / SPREAD
+    slopes = [-slope.sum(), 10 * (slope * decades).sum() + away / SPREAD, by_scale]
+    return value + 0.5 * away**2, slopes, slope
 
 
 def fit_line(decades: np.ndarray, rows: Rows, start: np.ndarray) -> tuple[float, np.ndarray]:
     """Negative log posterior and its (level, exponent, log scale) for known decades (n,) of distance."""
 
     def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
-        residual = rows.decibels - p[0] + 10 * p[1] * decades
-        value, slope, by_scale = misfit(residual, rows.silent, math.exp(p[2]))
-        prior, by_prior = _prior(p[1])
-        slopes = np.array([-slope.sum(), 10 * (slope * decades).sum() + by_prior, by_scale])
-        return value + prior, slopes
+        value, slopes, _ = _posterior(p, decades, rows)
+        return value, np.array(slopes)
 
     bounds = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB))]
     found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
@@ -152,12 +152,9 @@ def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
         towards = (p[3:] * size) - rows.places
         squared = (towards**2).sum(1) + tiny
         decades = 0.5 * np.log10(squared)
-        residual = rows.decibels - p[0] + 10 * p[1] * decades
-        value, slope, by_scale = misfit(residual, rows.silent, math.exp(p[2]))
-        prior, by_prior = _prior(p[1])
+        value, slopes, slope = _posterior(p, decades, rows)
         by_place = 10 * p[1] / math.log(10) * size * (slope / squared) @ towards
-        slopes = [-slope.sum(), 10 * (slope * decades).sum() + by_prior, by_scale, *by_place]
-        return value + prior, np.array(slopes)
+        return value, np.array([*slopes, *by_place])
 
     limits = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB)), *(bounds / size)]
     found = []

@@ -370,13 +370,14 @@ class ChannelField(ConditionalField):
             "rows": torch.from_numpy(self.rows),
             **self.runs.state(),
             "groups": [
-                {**_parts(group), "slot": _stored(group.slot), "target": group.target * self._turn(group)}
+                {
+                    **{one.name: getattr(group, one.name) for one in fields(group)},
+                    "slot": _stored(group.slot),
+                    "target": group.target * self.runs.factors[group.run][:, None],
+                }
                 for group in groups
             ],
         }
-
-    def _turn(self, group: Group) -> Tensor:
-        return self.runs.factors[group.run][:, None]
 
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
@@ -392,11 +393,9 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
         for name, parameter in field.named_parameters():
             parameter.copy_(kept[name])
     field.rows, runs = state["rows"].numpy(), RunFactors.read(state)
-    groups = []
-    for each in state["groups"]:
-        groups.append(Group(**{**each, "slot": _read(each["slot"])}))
+    groups = tuple(Group(**{**each, "slot": _read(each["slot"])}) for each in state["groups"])
     with torch.no_grad():
-        field._solve(tuple(groups), runs.runs, runs.factors)
+        field._solve(groups, runs.runs, runs.factors)
     return field
 
 
@@ -425,8 +424,3 @@ def _read(state: dict[str, Any]) -> Slot:
 def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:
     """Entries (n, D) of a slot, of `rows` of (B, A, K)."""
     return whole[rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(rows), -1)
-
-
-def _parts(group: Group) -> dict[str, Any]:
-    """The attributes, without what was computed from them."""
-    return {one.name: getattr(group, one.name) for one in fields(group)}
