@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Mapping
 from importlib.resources import files
@@ -16,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, nearest
 from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
@@ -118,8 +117,7 @@ def _choices() -> dict[str, DictConfig]:
 
 def _named(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
     if str(name) not in choices:
-        close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        hint = nearest(str(name), choices, 0.4)
         raise DataError(f"dataset: {str(name)!r} is none of {', '.join(sorted(choices))}{hint}")
     return choices[str(name)]
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.checks import outliers
+from gsparc.data.errors import some
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.ops import SphereGrid
@@ -98,7 +97,7 @@ def _static(site: Site) -> str:
         lost = len(site.stations) - len(known)
         box = f" in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(known, axis=0))} m" if len(known) else ""
         box += f", {lost} of them at unknown places" if lost else ""
-        return f"the {end}, {len(site.stations)} stations{box}: {_some(site.stations.name)}"
+        return f"the {end}, {len(site.stations)} stations{box}: {some(site.stations.name, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64
@@ -114,11 +113,6 @@ def _moving(data: Measurements) -> str:
         f"{end}, in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(places, axis=0))} m"
         for end, places in ends.items()
     )
-
-
-def _some(names: Sequence[str], count: int = 4) -> str:
-    more = f" and {len(names) - count} more" if len(names) > count else ""
-    return ", ".join(names[:count]) + more
 
 
 def suspicious_values(data: Measurements) -> list[str]:

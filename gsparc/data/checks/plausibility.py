@@ -15,9 +15,10 @@ import numpy as np
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, level_steps
 from gsparc.data.checks.outliers import too_far
+from gsparc.data.errors import some
 from gsparc.data.schema import Measurements
 
-NAMED = 5  # rows or stations in a line
+NAMED = 5  # wild rows that a station may have, however few its rows
 HIGHEST_DBM = 60.0  # a kilowatt received
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
@@ -53,7 +54,7 @@ def position_warnings(position: np.ndarray, rows: Sequence[str]) -> list[str]:
     lost = too_far(position)
     found = []
     if lost.any():
-        which = _some(rows, np.flatnonzero(lost))
+        which = some([rows[i] for i in np.flatnonzero(lost)])
         found.append(f"{which}: far outside the region of all others; a lost fix of the receiver?")
     return found + _units(position[~lost])
 
@@ -189,9 +190,8 @@ def copies(position: np.ndarray, station: np.ndarray, level_db: np.ndarray, rows
             spreads.append(float(np.std(list(first), ddof=1)))
     found = []
     if same:
-        pairs = [f"{rows[b]} of {rows[a]}" for a, b in same[:NAMED]]
-        more = f" and {len(same) - NAMED} more" if len(same) > NAMED else ""
-        found.append(f"copies (same place, station and level): {', '.join(pairs)}{more}; leave them out")
+        pairs = some([f"{rows[b]} of {rows[a]}" for a, b in same])
+        found.append(f"copies (same place, station and level): {pairs}; leave them out")
     if repeated:
         found.append(
             f"{repeated} places were measured more than once by one station, with different levels "
@@ -207,7 +207,9 @@ def wild_rows(
     found = []
     for t, bad, most in wild_of(station, level_db):
         where = f"station {names[t]}: " if len(names) > 1 else ""
-        found.append(f"{where}{_some(rows, bad)}: up to {most:.0f} dB from the rows around; wrong?")
+        found.append(
+            f"{where}{some([rows[i] for i in bad])}: up to {most:.0f} dB from the rows around; wrong?"
+        )
     return found
 
 
@@ -327,16 +329,8 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
     return found
 
 
-def _some(rows: Sequence[str], which: np.ndarray) -> str:
-    more = f" and {len(which) - NAMED} more" if len(which) > NAMED else ""
-    return ", ".join(str(rows[i]) for i in which[:NAMED]) + more
-
-
 def _of(who: list[str], total: int) -> str:
-    if total == 1:
-        return ""
-    more = f" and {len(who) - NAMED} more" if len(who) > NAMED else ""
-    return f" of station{'s' * (len(who) > 1)} {', '.join(who[:NAMED])}{more}"
+    return "" if total == 1 else f" of station{'s' * (len(who) > 1)} {some(who)}"
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ import numpy as np
 
 from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
 from gsparc.data.errors import DataError, Problems, shortened
+from gsparc.data.files import read_csv, read_text
 from gsparc.data.raw import Raw, read_raw
 
 CARRIER_HZ = 462.7e6
@@ -156,15 +157,8 @@ def _of_csv(path: Path, table: Path) -> Raw:
 
 def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and the other lines with their numbers; blank ones are none."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [
-                (i, cells) for i, cells in enumerate(csv.reader(file), 1) if any(c.strip() for c in cells)
-            ]
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file; expected single_tx.csv of the POWDER release") from None
-    except (UnicodeDecodeError, csv.Error, OSError) as error:
-        raise DataError(f"{path}: not readable as CSV text ({error})") from None
+    found = read_csv(path, "no such file; expected single_tx.csv of the POWDER release")
+    lines = [(i, cells) for i, cells in enumerate(found, 1) if any(c.strip() for c in cells)]
     if len(lines) < 2:
         raise DataError(f"{path}: no rows; expected a header and a line per place")
     return lines[0][1], lines[1:]
@@ -215,14 +209,8 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
     Raises:
         DataError: missing, not readable, or no pair of degrees.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise DataError(
-            f"{path}: missing; expected the stations' coordinates, name the file with dataset.station_table"
-        ) from None
-    except (UnicodeDecodeError, OSError) as error:
-        raise DataError(f"{path}: not readable as text ({error})") from None
+    expected = "the stations' coordinates, name the file with dataset.station_table"
+    text = read_text(path, f"missing; expected {expected}")
     content = _rows_by_name(path, text) if path.suffix.lower() == ".csv" else _literal(path, text)
     problems, places = Problems(path), {}
     for name, value in content.items():

@@ -8,7 +8,6 @@ train_index.txt, test_index.txt   optional, both or none: one number per line
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +20,8 @@ from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.blocks import empty
 from gsparc.data.datasets.campaign import Release
 from gsparc.data.errors import DataError, Problems
-from gsparc.data.files import read_yaml
+from gsparc.data.files import read_csv, read_text, read_yaml
+from gsparc.data.limits import finite
 from gsparc.data.own_checks import quaternion_to_matrix
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
@@ -94,22 +94,10 @@ class _Gateway(NamedTuple):
     rotation: np.ndarray
 
 
-def _numbers(value: object, count: int) -> np.ndarray | None:
-    """`value` as (count,) float64, or None when it is anything else than that many finite numbers."""
-    if not isinstance(value, list) or len(value) != count:
-        return None
-    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
-        return None
-    numbers = np.array(value, dtype=np.float64)
-    return numbers if np.isfinite(numbers).all() else None
-
-
 def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gateway | None:
     entry = "entries like `gateway1: {position: [x, y, z], orientation: [x, y, z, w]}`"
-    try:
-        content = read_yaml(path, "the gateway's position and orientation", entry)
-    except DataError as error:
-        problems.extend(error.problems)
+    content = problems.attempt(lambda: read_yaml(path, "the gateway's position and orientation", entry))
+    if content is None:
         return None
     gateways = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
     if not gateways:
@@ -118,12 +106,12 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
     if name not in gateways:
         return problems.add(path, f"no gateway named {name!r}; there are {', '.join(gateways)}")
     given = [gateways[name].get(key) for key in ("position", "orientation")]
-    position, orientation = _numbers(given[0], 3), _numbers(given[1], 4)
-    if position is None:
+    position, orientation = map(finite, given)
+    if position.shape != (3,):
         problems.add(path, f"{name}: position is {given[0]}; expected three finite numbers [m]")
     else:
         check_positions(problems, str(path), position[None], [f"{name}: position"])
-    if orientation is None:
+    if orientation.shape != (4,):
         expected = "expected a quaternion of four finite numbers (x, y, z, w)"
         return problems.add(path, f"{name}: orientation is {given[1]}; {expected}")
     try:
@@ -131,18 +119,15 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
     except ValueError as error:
         return problems.add(path, f"{name}: orientation: {error}")
     dataset = str(content.get("dataset_name", "unnamed"))
-    return None if position is None else _Gateway(dataset, name, position, rotation)
+    return _Gateway(dataset, name, position, rotation)
 
 
 def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     """Tag positions (S, 3) float64 [m]."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except FileNotFoundError:
-        return problems.add(path, "missing; expected a header x,y,z and one row per spectrum")
-    except (UnicodeDecodeError, csv.Error, OSError) as error:
-        return problems.add(path, f"not readable as CSV text ({error})")
+    missing = "missing; expected a header x,y,z and one row per spectrum"
+    rows = problems.attempt(lambda: read_csv(path, missing))
+    if rows is None:
+        return None
     while rows and not any(cell.strip() for cell in rows[-1]):
         rows.pop()
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
@@ -220,13 +205,12 @@ def _read_split(root: Path, count: int | None, problems: Problems) -> tuple[np.n
 
 
 def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray | None:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except (UnicodeDecodeError, OSError) as error:
-        return problems.add(path, f"not readable as text ({error})")
+    text = problems.attempt(lambda: read_text(path, "missing"))
+    if text is None:
+        return None
     rows: list[int] = []
     first_line: dict[int, int] = {}
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         text = line.strip().removesuffix(".png")
         if not text:
             continue

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsparc.data.errors import some
 from gsparc.data.tables.heads import (
     AXES,
     END_WORDS,
@@ -147,8 +148,7 @@ def choose(
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head and head not in used]
     if unused:
-        more = f" and {len(unused) - 8} more" if len(unused) > 8 else ""
-        notes.append(f"not used: column{'s' * (len(unused) > 1)} {', '.join(unused[:8])}{more}")
+        notes.append(f"not used: column{'s' * (len(unused) > 1)} {some(unused, 8)}")
     if "station" not in chosen and not any(columns[0].label for columns in chosen.values()):
         notes += _perhaps_stations(sheet, used)
     return chosen, notes

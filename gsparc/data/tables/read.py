@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from gsparc.data.errors import nearest
 from gsparc.data.raw import Raw
 from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
 from gsparc.data.tables.places import (
@@ -308,8 +309,7 @@ class Builder:
         for word in dict.fromkeys(words[words != ""].tolist()):
             if word in self.listed.names:
                 continue
-            close = difflib.get_close_matches(word, self.listed.names, 1, 0.5)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
+            hint = nearest(word, self.listed.names)
             place = "the heads"
             if head is not None:
                 place = f"column {head!r}, {self.sheet.rows[int(np.argmax(words == word))]}"
