@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -28,15 +28,17 @@ class Campaign(DataModule):
 
     Args:
         file: what `raw` reads.
-        name, batch_size: see `DataModule`.
+        name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
         stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
         level_steps: by station, rows from which it counts as another; see `gsparc.data.selection`.
     """
 
+    choice: ClassVar[str]  # of conf/dataset
+
     def __init__(
         self,
         file: str | Path,
-        name: str,
+        name: str | None = None,
         batch_size: int = 16,
         stations: Sequence[str | int] | None = None,
         runs: Sequence[str | int] | None = None,
@@ -44,7 +46,7 @@ class Campaign(DataModule):
         max_rows: int | None = None,
         level_steps: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
-        super().__init__(name, batch_size)
+        super().__init__(name or self.choice, batch_size)
         self.file = Path(file)
         self.selection = Selection(stations, runs, min_rssi_db, max_rows)
         self.level_steps = rows_by_station(level_steps or {})
@@ -158,16 +160,18 @@ class Expected:
         kinds: allowed kinds of NumPy's dtypes, one of those above.
         place: whether rows are coordinates [m], all of which must be finite and on Earth.
         optional: whether the array may be absent.
+        field: of the schema that it is read as; None: the one of its name.
     """
 
     shape: tuple[str | int, ...]
     kinds: str = REAL
     place: bool = False
     optional: bool = False
+    field: str | None = None
 
 
-def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> None:
-    """Refuse arrays that do not fit `layout`; a letter's size is that of the first array that has it.
+def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> dict[str, np.ndarray]:
+    """The arrays of `layout` by field of the schema; a letter's size is that of the first array that has it.
 
     Raises:
         DataError: all that is missing, of another shape or type, or no place, with array and row.
@@ -193,6 +197,7 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
                 what = f"expected finite coordinates in metres, none beyond {FARTHEST:.0e}"
                 problems.add_rows(where, rows, what)
     problems.raise_if_any()
+    return {of.field or name: raw.arrays[name] for name, of in layout.items() if name in raw.arrays}
 
 
 def _fits(found: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> bool:

@@ -26,21 +26,21 @@ class Own(Campaign):
 
     Args:
         file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
-        name: of run directories.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
         **rest: see `Campaign`.
     """
 
+    choice = "own"
+
     def __init__(
         self,
         file: str | Path,
-        name: str = "own",
         columns: Mapping[str, object] | None = None,
         stations_file: str | Path | None = None,
         **rest: Any,
     ) -> None:
-        super().__init__(file, name, **rest)
+        super().__init__(file, **rest)
         self.columns, self.stations_file = columns or {}, stations_file
 
     def raw(self) -> Raw:

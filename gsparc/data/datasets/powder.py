@@ -36,13 +36,13 @@ TIMES = ("timestamp", "time", "date", "datetime")
 EMPTY = ("", "nan", "none", "null", "na", "n/a")
 SLACK_M = 1.0  # an affine map from degrees to metres is good to centimetres over a campus
 LAYOUT = {
-    "mobile_position": Expected(("S", 2), place=True),
+    "mobile_position": Expected(("S", 2), place=True, field="tx_position"),
     "station_position": Expected(("T", 2), place=True),
     "rssi_db": Expected(("S", "T")),
-    "station": Expected(("T",), TEXT, optional=True),
+    "station": Expected(("T",), TEXT, optional=True, field="station_name"),
     "latitude": Expected(("S",), optional=True),
     "longitude": Expected(("S",), optional=True),
-    "frequency_hz": Expected((), optional=True),
+    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
 }
 
 
@@ -81,19 +81,14 @@ def raw_of_powder(
 
 
 def _of_npz(raw: Raw, path: Path) -> Raw:
-    check_layout(raw, path, LAYOUT)
-    held = raw.arrays
-    arrays = {"rssi_db": held["rssi_db"], "carrier_hz": held.get("frequency_hz", np.array(CARRIER_HZ))}
-    if "station" in held:
-        arrays["station_name"] = held["station"]
-    if "latitude" in held and "longitude" in held:
-        degrees = np.stack([held["latitude"], held["longitude"]], axis=1).astype(np.float64)
-        stations = _degrees_of(held["station_position"], held["mobile_position"], degrees, path)
-        geographic = {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
-        geographic |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
-        return Raw({**arrays, **geographic}, raw.attributes)
-    metric = {"tx_position": held["mobile_position"], "station_position": held["station_position"]}
-    return Raw({**arrays, **metric}, raw.attributes)
+    held = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
+    parts = [held.pop(name) for name in ("latitude", "longitude") if name in held]
+    if len(parts) == 2:
+        degrees = np.stack(parts, axis=1).astype(np.float64)
+        stations = _degrees_of(held.pop("station_position"), held.pop("tx_position"), degrees, path)
+        held |= {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
+        held |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
+    return Raw(held, raw.attributes)
 
 
 def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: Path) -> np.ndarray:
@@ -261,9 +256,10 @@ class Powder(Campaign):
 
     Args:
         file, station_table, tx_height, station_height: see `raw_of_powder`.
-        name: of run directories.
         **rest: see `Campaign`.
     """
+
+    choice = "powder"
 
     def __init__(
         self,
@@ -271,10 +267,9 @@ class Powder(Campaign):
         station_table: str | Path | None = None,
         tx_height: float = WALKER_M,
         station_height: float = STATION_M,
-        name: str = "powder",
         **rest: Any,
     ) -> None:
-        super().__init__(file, name, **rest)
+        super().__init__(file, **rest)
         self.station_table, self.heights = station_table, (tx_height, station_height)
 
     def raw(self) -> Raw:
