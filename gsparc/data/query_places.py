@@ -125,13 +125,12 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:
-    heads = ", ".join(repr(head) for head in sheet.heads[:8] if head)
     axes = (
         f"columns.{end}_x=COLUMN and .{end}_y"
         if both
         else "columns.latitude=COLUMN and .longitude, or .x and .y"
     )
-    return f"{sheet.source}: no coordinates of the {WORDS[end]} among {heads}; say {axes}"
+    return f"{sheet.source}: no coordinates of the {WORDS[end]} among {sheet.first_heads()}; say {axes}"
 
 
 def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:

@@ -54,7 +54,7 @@ def position_warnings(position: np.ndarray, rows: Sequence[str]) -> list[str]:
     lost = too_far(position)
     found = []
     if lost.any():
-        which = some([rows[i] for i in np.flatnonzero(lost)])
+        which = some([rows[i] for i in np.flatnonzero(lost).tolist()])
         found.append(f"{which}: far outside the region of all others; a lost fix of the receiver?")
     return found + _units(position[~lost])
 

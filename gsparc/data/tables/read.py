@@ -126,10 +126,8 @@ class Builder:
         """Add the measurement; its quantity."""
         role = next((name for name in (*LEVELS, *CHANNELS) if name in self.chosen), None)
         if role is None:
-            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
-            return self.refuse(
-                f"no column of levels, powers or channels among {heads}; say dataset.columns.rssi_db=COLUMN"
-            )
+            fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
+            return self.refuse(f"{fault}; say dataset.columns.rssi_db=COLUMN")
         if role in CHANNELS:
             self._channels()
             return role
@@ -192,10 +190,8 @@ class Builder:
         if self.sheet.problems:
             return
         if not found:
-            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
-            return self.refuse(
-                f"no coordinates among {heads}; say dataset.columns.x=COLUMN and .y, or .latitude, .longitude"
-            )
+            fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
+            return self.refuse(f"{fault}, or .latitude, .longitude")
         if len(found) == 3:
             return self.refuse(
                 "coordinates of rx, of tx and of an end without a name; expected two ends, rename one"

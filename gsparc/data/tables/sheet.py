@@ -45,6 +45,10 @@ class Sheet:
     def __len__(self) -> int:
         return len(self.rows)
 
+    def first_heads(self) -> str:
+        """The first heads, for messages."""
+        return ", ".join(repr(head) for head in self.heads[:8] if head)
+
     def where(self, head: str) -> str:
         """How messages name a column."""
         return f"{self.source}, column {head!r}"
@@ -257,7 +261,7 @@ def _with_heads(lines: _Lines, delimiter: str, source: str) -> _Lines:
     first = _cells(lines.text[0], delimiter)
     values = all(_is_number(cell) for cell in first)
     heads = _cells(lines.comment_before, delimiter) if lines.comment_before else []
-    named = [sum(understand(cell).role is not None for cell in cells) for cells in (heads, first)]
+    named = [sum(bool(understand(cell).role) for cell in cells) for cells in (heads, first)]
     fits = len(heads) == len(first) and not all(_is_number(cell) for cell in heads)
     if not values and not (fits and named[0] > named[1]):
         return lines
