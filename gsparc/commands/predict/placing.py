@@ -10,8 +10,8 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
-from gsparc.data.query_places import WORDS, QueryPlaces
-from gsparc.data.schema import End, Site
+from gsparc.data.query_places import QueryPlaces
+from gsparc.data.schema import ENDS, End, Site
 from gsparc.data.tables.places import Places
 from gsparc.prediction.predictor import usual_heights
 
@@ -32,10 +32,10 @@ def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
             continue
         if end not in known:
             say = f"say columns.{'' if len(ends) == 1 else end + '_'}height=NUMBER, or give it in the file"
-            raise DataError(f"{queries.source}: no height, and the {WORDS[end]} {_heights(site, end)}; {say}")
+            raise DataError(f"{queries.source}: no height, and the {ENDS[end]} {_heights(site, end)}; {say}")
         height = np.full(len(queries), known[end])
         ends[end] = replace(where, height=height)
-        notes.append(f"no height of the {WORDS[end]}: taken as {known[end]:g} m, as when it was measured")
+        notes.append(f"no height of the {ENDS[end]}: taken as {known[end]:g} m, as when it was measured")
     return replace(queries, ends=ends, notes=tuple(notes))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -167,35 +166,21 @@ def direction_warnings(
 
 def copies(position: np.ndarray, station: np.ndarray, level_db: np.ndarray, rows: Sequence[str]) -> list[str]:
     """Rows of one place and station: copies where the value is the same, repeated measurements where not."""
-    known = np.flatnonzero(np.isfinite(level_db))
-    if len(known) < 2:
-        return []
-    place = np.unique(position[known], axis=0, return_inverse=True)[1].reshape(-1)
-    link = np.unique(np.stack([place, station[known]], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-    order = np.argsort(link, kind="stable")
-    groups = np.split(known[order], np.flatnonzero(np.diff(link[order])) + 1)
-    same: list[tuple[int, int]] = []
-    repeated, spreads = 0, []
-    for group in groups:
-        if len(group) < 2:
-            continue
-        values = level_db[group]
-        first: dict[float, int] = {}
-        for row, value in zip(group.tolist(), values.tolist(), strict=True):
-            if value in first:
-                same.append((first[value], row))
-            first.setdefault(value, row)
-        if len(first) > 1:
-            repeated += 1
-            spreads.append(float(np.std(list(first), ddof=1)))
+    import pandas as pd  # here, as it takes half a second
+
+    where = np.unique(np.column_stack([position, station]), axis=0, return_inverse=True)[1].reshape(-1)
+    table = pd.DataFrame({"link": where, "level": level_db, "row": range(len(level_db))}).dropna()
+    table = table[np.isfinite(table["level"])].sort_values("link", kind="stable")
+    first = table.groupby(["link", "level"])["row"].transform("first")
     found = []
+    same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        pairs = some([f"{rows[b]} of {rows[a]}" for a, b in same])
-        found.append(f"copies (same place, station and level): {pairs}; leave them out")
-    if repeated:
+        found.append(f"copies (same place, station and level): {some(same)}; leave them out")
+    spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
+    if len(spreads):
         found.append(
-            f"{repeated} places were measured more than once by one station, with different levels "
-            f"(standard deviation {np.median(spreads):.2g} dB, median)"
+            f"{len(spreads)} places were measured more than once by one station, with different levels "
+            f"(standard deviation {spreads.median():.2g} dB, median)"
         )
     return found
 
@@ -285,11 +270,10 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
         if not missing.any() or missing.all():
             continue
         floor = float(np.percentile(level[~missing], 1))
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+        absent = np.flatnonzero(missing)
         scattered, around = 0, []
-        for start, stop in pairwise(edges):
-            if not missing[start]:
-                continue
+        for piece in np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1):
+            start, stop = int(piece[0]), int(piece[-1]) + 1
             beside = np.concatenate([level[max(0, start - 3) : start], level[stop : stop + 3]])
             beside = beside[np.isfinite(beside)]
             weak = bool(len(beside)) and float(np.median(beside)) < floor + WEAK_DB
@@ -297,9 +281,9 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
             if stop - start >= LONG_GAP and not (weak and ragged):
                 key = (rows[used[start]], rows[used[stop - 1]])
                 long[key].append(str(names[t]))
-                lengths[key] = int(stop - start)
+                lengths[key] = stop - start
             else:
-                scattered += int(stop - start)
+                scattered += stop - start
                 around += beside.tolist()
         often = scattered >= FEW * len(used)
         if often and around and np.median(around) < floor + WEAK_DB:

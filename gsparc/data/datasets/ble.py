@@ -35,15 +35,6 @@ def raw_of_ble(path: str | Path) -> Raw:
 
 
 class BLE(Campaign):
-    """Powers of a beacon at many places, at the sensors of a hall; see `raw_of_ble`.
+    """Powers of a beacon at many places, at the sensors of a hall; settings of `Campaign`."""
 
-    Args:
-        file: *.npz.
-        **rest: see `Campaign`.
-    """
-
-    choice = "ble"
-
-    def raw(self) -> Raw:
-        """Powers (S, T) of a moving transmitter at T stations."""
-        return raw_of_ble(self.file)
+    choice, reader = "ble", staticmethod(raw_of_ble)

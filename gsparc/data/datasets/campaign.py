@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -31,9 +31,11 @@ class Campaign(DataModule):
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
         stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
         level_steps: by station, rows from which it counts as another; see `gsparc.data.selection`.
+        **settings: what `reader` takes besides.
     """
 
     choice: ClassVar[str]  # of conf/dataset
+    reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/own-data.md
 
     def __init__(
         self,
@@ -45,19 +47,16 @@ class Campaign(DataModule):
         min_rssi_db: float | None = None,
         max_rows: int | None = None,
         level_steps: Mapping[str, Sequence[int]] | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
-        self.file = Path(file)
+        self.file, self.settings = Path(file), settings
         self.selection = Selection(stations, runs, min_rssi_db, max_rows)
         self.level_steps = rows_by_station(level_steps or {})
 
-    @abstractmethod
     def raw(self) -> Raw:
-        """The file's arrays, named as in docs/own-data.md.
-
-        Raises:
-            DataError: bad input.
-        """
+        """The file's arrays, named as in docs/own-data.md; `DataError` where they are bad."""
+        return self.reader(self.file, **self.settings)
 
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from gsparc.data.datasets.ble import raw_of_ble
 from gsparc.data.datasets.campaign import Campaign
@@ -21,37 +20,34 @@ from gsparc.data.tables import is_table
 log = logging.getLogger(__name__)
 
 
-class Own(Campaign):
-    """A file of the schema in docs/own-data.md, or a table; suspicious units are warned of.
+def raw_of_own(
+    path: str | Path,
+    columns: Mapping[str, object] | None = None,
+    stations_file: str | Path | None = None,
+) -> Raw:
+    """Read a file of the schema in docs/own-data.md, or a table under the schema's names; notes are logged.
 
     Args:
-        file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
+        path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
-        **rest: see `Campaign`.
+
+    Raises:
+        DataError: bad input, or a file of another campaign.
     """
+    raw, notes = raw_of(Path(path), columns, stations_file)
+    campaign = campaign_of(raw)
+    if campaign is not None:
+        raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
+    for note in notes:
+        log.info("%s: %s", path, note)
+    return raw
 
-    choice = "own"
 
-    def __init__(
-        self,
-        file: str | Path,
-        columns: Mapping[str, object] | None = None,
-        stations_file: str | Path | None = None,
-        **rest: Any,
-    ) -> None:
-        super().__init__(file, **rest)
-        self.columns, self.stations_file = columns or {}, stations_file
+class Own(Campaign):
+    """Measurements of one's own; suspicious units are warned of. Settings of `raw_of_own` and `Campaign`."""
 
-    def raw(self) -> Raw:
-        """The file's arrays, or the table's under the schema's names."""
-        raw, notes = raw_of(self.file, self.columns, self.stations_file)
-        campaign = campaign_of(raw)
-        if campaign is not None:
-            raise DataError(f"{self.file}: this is a file of dataset={campaign}; say dataset={campaign}")
-        for note in notes:
-            log.info("%s: %s", self.file, note)
-        return raw
+    choice, reader = "own", staticmethod(raw_of_own)
 
 
 LOADERS: dict[str, Callable[[Path], Raw]] = {
@@ -80,7 +76,7 @@ def read_any(
 
     Args:
         path: folder or file.
-        columns, stations_file: of a table, see `Own`.
+        columns, stations_file: of a table, see `raw_of_own`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.

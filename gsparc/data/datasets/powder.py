@@ -163,24 +163,20 @@ def _numbers(
     path: Path, names: Sequence[str], rows: Sequence[tuple[int, list[str]]], columns: Sequence[int]
 ) -> np.ndarray:
     """Cells (S, len(columns)) float64, NaN where a cell is empty."""
+    import pandas as pd  # here, as it takes half a second
+
     problems = Problems(path)
-    values = np.full((len(rows), len(columns)), np.nan)
-    for row, (line, cells) in enumerate(rows):
-        if len(cells) != len(names):
-            problems.add(f"{path}, line {line}", f"expected {len(names)} cells, found {len(cells)}")
-            continue
-        for k, column in enumerate(columns):
-            text = cells[column].strip()
-            if text.lower() in EMPTY:
-                continue
-            try:
-                values[row, k] = float(text)
-            except ValueError:
-                problems.add(f"{path}, line {line}, {names[column]}", f"expected a number, found {text!r}")
-        if len(problems) > Problems.LIMIT:
-            break
+    for line, cells in [row for row in rows if len(row[1]) != len(names)][: Problems.LIMIT]:
+        problems.add(f"{path}, line {line}", f"expected {len(names)} cells, found {len(cells)}")
     problems.raise_if_any()
-    return values
+    text = np.char.strip(np.array([[cells[column] for column in columns] for _, cells in rows]))
+    values = pd.to_numeric(text.ravel().astype(object), errors="coerce").reshape(text.shape)
+    wrong = np.isnan(values) & ~np.isin(np.char.lower(text), EMPTY)
+    for row, k in np.argwhere(wrong)[: Problems.LIMIT]:
+        where = f"{path}, line {rows[row][0]}, {names[columns[k]]}"
+        problems.add(where, f"expected a number, found {str(text[row, k])!r}")
+    problems.raise_if_any()
+    return np.asarray(values, np.float64)
 
 
 def _check_degrees(
@@ -252,26 +248,6 @@ def _rows_by_name(path: Path, text: str) -> Mapping[str, Any]:
 
 
 class Powder(Campaign):
-    """Powers of a walking transmitter at fixed stations; see `raw_of_powder`.
+    """Powers of a walking transmitter at fixed stations; settings of `raw_of_powder` and of `Campaign`."""
 
-    Args:
-        file, station_table, tx_height, station_height: see `raw_of_powder`.
-        **rest: see `Campaign`.
-    """
-
-    choice = "powder"
-
-    def __init__(
-        self,
-        file: str | Path,
-        station_table: str | Path | None = None,
-        tx_height: float = WALKER_M,
-        station_height: float = STATION_M,
-        **rest: Any,
-    ) -> None:
-        super().__init__(file, **rest)
-        self.station_table, self.heights = station_table, (tx_height, station_height)
-
-    def raw(self) -> Raw:
-        """Powers (S, T) of a moving transmitter at T stations."""
-        return raw_of_powder(self.file, self.station_table, *self.heights)
+    choice, reader = "powder", staticmethod(raw_of_powder)

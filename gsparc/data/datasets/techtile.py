@@ -162,20 +162,6 @@ def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
 
 
 class Techtile(Campaign):
-    """Channels of a moving transmitter at 42 ceiling antennas; see `raw_of_techtile`.
+    """Channels of a moving transmitter at 42 antennas; settings of `raw_of_techtile` and of `Campaign`."""
 
-    Args:
-        file: *.npz, or the release's *.nc.
-        antennas: places of the antennas of a NetCDF file; None: `techtile_antenna_locations.yml` beside it.
-        **rest: see `Campaign`.
-    """
-
-    choice = "techtile"
-
-    def __init__(self, file: str | Path, antennas: str | Path | None = None, **rest: Any) -> None:
-        super().__init__(file, **rest)
-        self.antennas = antennas
-
-    def raw(self) -> Raw:
-        """Channels (S, T) of a moving transmitter at T stations."""
-        return raw_of_techtile(self.file, self.antennas)
+    choice, reader = "techtile", staticmethod(raw_of_techtile)

@@ -13,10 +13,10 @@ import numpy as np
 from gsparc.data.blocks import is_big
 from gsparc.data.checks.plausibility import degree_warnings
 from gsparc.data.links.georeference import Georeference, bad_degrees
-from gsparc.data.links.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
+from gsparc.data.links.stations import by_carrier, ends_of, numbered, station_of_row, station_table
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
-from gsparc.data.schema import MEASUREMENTS, End, Links
+from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links
 from gsparc.data.selection import rows_of
 
 POWERS = ("rssi", "rssi_db")
