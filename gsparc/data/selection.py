@@ -18,7 +18,7 @@ from gsparc.data.blocks import taken
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
-from gsparc.data.raw import Raw, numbered_rows
+from gsparc.data.raw import Noted, Raw, numbered_rows
 from gsparc.data.schema import FIELDS, MEASUREMENTS, axes_from
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
@@ -61,38 +61,25 @@ class Selection:
             raise DataError(f"dataset.max_rows={rows}: expected a whole number, at least {FEWEST}")
 
 
-@dataclass(frozen=True)
-class Selected:
-    """What is left, and what was left out.
-
-    Attributes:
-        raw: the arrays that are kept.
-        notes: what was left out, one line each.
-    """
-
-    raw: Raw
-    notes: tuple[str, ...] = ()
-
-
-def select(raw: Raw, selection: Selection, source: str | Path) -> Selected:
+def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
     """Apply all settings: stations, runs, level, then number of rows.
 
     Raises:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
     notes: list[str] = []
-    steps: tuple[tuple[Callable[..., Selected], Any], ...] = (
+    steps: tuple[tuple[Callable[..., Noted], Any], ...] = (
         *((keep_stations, selection.stations), (keep_runs, selection.runs)),
         *((keep_above, selection.min_rssi_db), (keep_rows, selection.max_rows)),
     )
     for keep, setting in steps:
         if setting is not None:
-            part = keep(raw, setting, source)
-            raw, notes = part.raw, [*notes, *part.notes]
-    return Selected(raw, tuple(notes))
+            raw, said = keep(raw, setting, source)
+            notes += said
+    return Noted(raw, tuple(notes))
 
 
-def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -> Selected:
+def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -> Noted:
     """The links of some stations only; the others' columns, or rows of a long file, are left out.
 
     Args:
@@ -115,10 +102,10 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
         kept = take_rows(kept, rows, source)
         kept.arrays["station"] = np.searchsorted(chosen, of_row[rows])
         note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
-    return Selected(kept, (note,))
+    return Noted(kept, (note,))
 
 
-def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Selected:
+def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
     """The rows of some runs only.
 
     Raises:
@@ -134,7 +121,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Select
     return _kept(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
 
 
-def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
+def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     """Powers of at least `min_rssi_db` [dB]; what is below counts as not measured, not as not heard.
 
     Raises:
@@ -156,10 +143,10 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{said}: {int(low.sum())} links left out",) if low.any() else ()
     rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), said, source)
-    return Selected(rest.raw, (*links, *rest.notes))
+    return Noted(rest.raw, (*links, *rest.notes))
 
 
-def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Selected:
+def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
     """At most `max_rows` rows that cover the campaign as all rows do.
 
     The file's order is cut into `max_rows` stretches of equal length, and of each one row is drawn, with a
@@ -347,13 +334,13 @@ def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[s
     return found
 
 
-def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Selected:
+def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Noted:
     rows = np.flatnonzero(keep)
     _left(rows, said, source)
     if len(rows) == len(keep):
-        return Selected(raw)
+        return Noted(raw)
     note = f"{said}: {len(keep) - len(rows)} of {len(keep)} rows left out"
-    return Selected(take_rows(raw, rows, source), (note,))
+    return Noted(take_rows(raw, rows, source), (note,))
 
 
 def _left(rows: np.ndarray, said: str, source: str | Path) -> None:

@@ -14,7 +14,7 @@ from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
+from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
 from gsparc.data.tables import is_table
 
 log = logging.getLogger(__name__)
@@ -101,7 +101,7 @@ def read_any(
 
 def raw_of(
     path: Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
-) -> tuple[Raw, tuple[str, ...]]:
+) -> Noted:
     """The arrays of a file of the schema, or of a table, and how its columns were understood.
 
     Raises:
@@ -111,8 +111,7 @@ def raw_of(
         told = any(value is not None for value in (columns or {}).values())
         for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
-        return read_raw(path), ()
+        return Noted(read_raw(path))
     from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
 
-    found = understand_table(path, columns or {}, stations_file)
-    return found.raw, found.notes
+    return understand_table(path, columns or {}, stations_file)

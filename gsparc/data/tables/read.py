@@ -6,14 +6,14 @@ import difflib
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import nearest
-from gsparc.data.raw import Raw
+from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS
 from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
 from gsparc.data.tables.places import (
@@ -30,19 +30,6 @@ from gsparc.data.tables.sheet import Sheet, sheet_of
 log = logging.getLogger(__name__)
 
 NOTHING: Mapping[str, object] = {}
-
-
-@dataclass(frozen=True)
-class Table:
-    """What a table holds.
-
-    Attributes:
-        raw: arrays named as in the schema.
-        notes: what was guessed or converted, one line each.
-    """
-
-    raw: Raw
-    notes: tuple[str, ...]
 
 
 def read_table(
@@ -67,7 +54,7 @@ def read_table(
 
 def understand_table(
     path: str | Path, columns: Mapping[str, object] = NOTHING, stations_file: str | Path | None = None
-) -> Table:
+) -> Noted:
     """As `read_table`, with the notes."""
     sheet, notes = sheet_of(path)
     listed = None
@@ -84,7 +71,7 @@ def understand_table(
     level = chosen["rssi_db"][0] if "rssi_db" in chosen else None
     about = {} if level is None or level.unit is None else {"level_unit": schema_unit(level)}
     about |= {"level_unit": "dBW"} if "rssi" in chosen else {}
-    return Table(Raw(arrays, about), (*notes, *guessed, *builder.notes))
+    return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
 HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
