@@ -125,15 +125,15 @@ def _named(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
 def _parameters(kind: Any) -> dict[str, inspect.Parameter]:
     """What `kind` takes; what a dataset's class hands on by keyword is what its reader or its base takes."""
     known = dict(inspect.signature(kind).parameters)
-    if hasattr(kind, "reader"):
-        _, *settings = inspect.signature(kind.reader).parameters.values()  # without the file
-        named = {name: p for name, p in known.items() if p.kind is not p.VAR_KEYWORD}
-        return named | {p.name: p for p in settings}
-    base = kind.__base__ if isinstance(kind, type) else None
-    handed = [name for name, p in known.items() if p.kind is p.VAR_KEYWORD]
-    if handed and base is not DataModule and issubclass(base or object, DataModule):
-        known = {**_parameters(base), **{name: p for name, p in known.items() if name not in handed}}
-    return known
+    base = (kind.__base__ if isinstance(kind, type) else None) or object
+    more: dict[str, inspect.Parameter] = {}
+    if any(p.kind is p.VAR_KEYWORD for p in known.values()):
+        if base is not DataModule and issubclass(base, DataModule):
+            more = _parameters(base)
+        if hasattr(kind, "reader"):
+            _, *settings = inspect.signature(kind.reader).parameters.values()  # without the file or folder
+            more |= {p.name: p for p in settings}
+    return {name: p for name, p in {**more, **known}.items() if not more or p.kind is not p.VAR_KEYWORD}
 
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:

@@ -34,17 +34,17 @@ Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def load_argos(
     root: str | Path,
-    encode: Encoder | None = None,
+    encoder: Encoder | None = None,
     *,
     antenna: int | str = 0,
-    positions: str = "encoder",
+    positions: str | bool = "encoder",
     align: bool = True,
 ) -> Measurements:
     """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, 26) complex64.
 
     Args:
         root: the folder; `csidata-64.npy` is preferred where a folder has it.
-        encode: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
+        encoder: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
         antenna: number of the antenna to predict, or `all`.
         positions: `encoder`, or `true` where the folder has `positions.npy` (the stand-in).
         align: turn every snapshot by the phase and the mean delay of its own uplink. These are
@@ -53,7 +53,7 @@ def load_argos(
     Raises:
         DataError: anything is missing or wrong.
     """
-    root = Path(root)
+    root, positions, align = Path(root), str(positions).lower(), bool(align)  # `true` in YAML is no text
     expected = "`base_station:` with a list of antenna positions [m]"
     description = read_yaml(root / "base-station.yml", "the antennas' positions", expected)
     csi = _channels(root)
@@ -68,7 +68,7 @@ def load_argos(
     csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
     uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
     split = _split(root, len(csi))
-    where = _positions(root, positions, encode, uplink, split)
+    where = _positions(root, positions, encoder, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
@@ -222,29 +222,18 @@ class Argos(Release):
     """The Argos release or any folder in its layout.
 
     Args:
-        root, name, **rest: see `Release`.
-        antenna, positions, align: see `load_argos`.
+        root, **rest: see `Release` and `load_argos`.
         encoder: `file` or `folder`, and `EncoderSettings`.
     """
 
-    called = "Argos"
+    called, reader = "Argos", staticmethod(load_argos)
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        antenna: int | str = 0,
-        positions: str | bool = "encoder",
-        align: bool = True,
-        encoder: Mapping[str, Any] | None = None,
-        name: str = "argos",
-        **rest: Any,
+        self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
     ) -> None:
-        super().__init__(root, name, **rest)
-        self.antenna, self.align = antenna, bool(align)
-        self.positions = str(positions).lower()  # `true` in YAML is no text
         given = dict(encoder or {})
         file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
-        self.encoder = (room, EncoderSettings(**given), file)
+        super().__init__(root, encoder=encoder_for(room, EncoderSettings(**given), file), **rest)
 
     def missing(self) -> str:
         """See `Release`."""
@@ -253,11 +242,6 @@ class Argos(Release):
             f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
             "csidata.npy and base-station.yml into a folder and set dataset.root=FOLDER."
         )
-
-    def read(self, folder: Path) -> Measurements:
-        """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
-        encode = encoder_for(*self.encoder)
-        return load_argos(folder, encode, antenna=self.antenna, positions=self.positions, align=self.align)
 
 
 class ArgosSim(Argos):
@@ -273,9 +257,8 @@ class ArgosSim(Argos):
         name: str = "argos_sim",
         batch_size: int = 16,
     ) -> None:
-        super().__init__(
-            None, antenna, positions, align, encoder, name, stand_in=stand_in, batch_size=batch_size
-        )
+        about = {"antenna": antenna, "positions": positions, "align": align}
+        super().__init__(None, encoder, name=name, stand_in=stand_in, batch_size=batch_size, **about)
 
     def load(self) -> Measurements:
         """As `Argos.load`, without a word about the release."""

@@ -89,23 +89,30 @@ class Release(DataModule):
         root: the folder; absent: the stand-in.
         stand_in: used, loudly, when no root is given.
         name, batch_size: see `DataModule`.
+        **settings: what `reader` takes besides.
     """
 
-    called = ""  # the release, in messages
+    called = ""  # the release, in messages; in small letters the choice of conf/dataset
+    reader: ClassVar[Callable[..., Measurements]]  # what a folder holds
 
     def __init__(
-        self, root: str | Path | None, name: str, stand_in: StandIn | None = None, batch_size: int = 16
+        self,
+        root: str | Path | None = None,
+        name: str | None = None,
+        stand_in: StandIn | None = None,
+        batch_size: int = 16,
+        **settings: Any,
     ) -> None:
-        super().__init__(name, batch_size)
-        self.root, self.stand_in = None if root is None else Path(root), stand_in
+        super().__init__(name or self.called.lower(), batch_size)
+        self.root, self.stand_in, self.settings = None if root is None else Path(root), stand_in, settings
 
     @abstractmethod
     def missing(self) -> str:
         """Why the release is not used, and how to get it."""
 
-    @abstractmethod
     def read(self, folder: Path) -> Measurements:
         """A folder in the release's layout; `DataError` where something is missing or wrong."""
+        return self.reader(folder, **self.settings)
 
     def load(self) -> Measurements:
         """The release's measurements, or, loudly, the stand-in's."""

@@ -46,7 +46,7 @@ def load_rfid(
     *,
     gateway: str | None = None,
     wavelength_m: float = WAVELENGTH,
-    array: np.ndarray | None = None,
+    array: np.ndarray | Mapping[str, Any] | None = None,
     normalisation: str = "max",
 ) -> Measurements:
     """Read a folder in the release's layout; spectra stay uint8 (S, 90, 360).
@@ -55,7 +55,8 @@ def load_rfid(
         root: the folder.
         gateway: which receiver of gateway_info.yml; None takes the first.
         wavelength_m: carrier wavelength [m].
-        array: (M, 3) [m] element positions, receiver frame; None for the release's 4 x 4 array.
+        array: (M, 3) [m] element positions, receiver frame, or arguments of `planar_array`; None for the
+            release's 4 x 4 array.
         normalisation: how the published images were scaled.
 
     Raises:
@@ -73,13 +74,14 @@ def load_rfid(
     assert info is not None and positions is not None and spectra is not None
     count = len(positions)
     simulated = info.dataset == STAND_IN
+    given = {} if array is None else array
+    places = planar_array(**given) if isinstance(given, Mapping) else np.asarray(given, np.float64)
     return assemble(
         name=STAND_IN if simulated else "rfid", stand_in="rfid" if simulated else None,
         kind="spectrum", static_end="rx", tx=positions, rx=np.repeat(info.position[None], count, axis=0),
         rx_rotation=np.repeat(info.rotation[None], count, axis=0), target=spectra,
-        grid=SphereGrid.hemisphere(HEIGHT, WIDTH), normalisation=normalisation,
-        array=planar_array() if array is None else np.asarray(array, dtype=np.float64),
-        carrier_hz=LIGHT / wavelength_m, release_split=release_split,
+        grid=SphereGrid.hemisphere(HEIGHT, WIDTH), normalisation=str(normalisation),
+        array=places, carrier_hz=LIGHT / float(wavelength_m), release_split=release_split,
         row_names=[f"spectrum/{i:05d}.png" for i in range(1, count + 1)],
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
     )  # fmt: skip
@@ -232,33 +234,9 @@ def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray
 
 
 class RFID(Release):
-    """The RFID release (NeRF2, set s23) or any folder in its layout.
+    """The RFID release (NeRF2, set s23) or any folder in its layout; settings of `load_rfid`, `Release`."""
 
-    Args:
-        root, name, **rest: see `Release`.
-        array: rows, columns and spacing_m of the receiver's array, see `planar_array`; None: the release's.
-        gateway, wavelength_m, normalisation: see `load_rfid`.
-    """
-
-    called = "RFID"
-
-    def __init__(
-        self,
-        root: str | Path | None = None,
-        gateway: str | None = None,
-        wavelength_m: float = WAVELENGTH,
-        array: Mapping[str, Any] | None = None,
-        normalisation: str = "max",
-        name: str = "rfid",
-        **rest: Any,
-    ) -> None:
-        super().__init__(root, name, **rest)
-        self.settings: dict[str, Any] = {
-            "gateway": gateway,
-            "wavelength_m": float(wavelength_m),
-            "array": planar_array(**array) if array else None,
-            "normalisation": str(normalisation),
-        }
+    called, reader = "RFID", staticmethod(load_rfid)
 
     def missing(self) -> str:
         """See `Release`."""
@@ -273,4 +251,4 @@ class RFID(Release):
 
     def read(self, folder: Path) -> Measurements:
         """Spectra (S, 90, 360) uint8 of tags that move about a static gateway; stand-ins have no settings."""
-        return load_rfid(folder, **(self.settings if folder == self.root else {}))
+        return super().read(folder) if folder == self.root else load_rfid(folder)
