@@ -233,7 +233,8 @@ class Argos(Release):
     ) -> None:
         given = dict(encoder or {})
         file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
-        super().__init__(root, encoder=encoder_for(room, EncoderSettings(**given), file), **rest)
+        super().__init__(root, **rest)
+        self.encoder = (room, EncoderSettings(**given), file)
 
     def missing(self) -> str:
         """See `Release`."""
@@ -242,6 +243,10 @@ class Argos(Release):
             f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
             "csidata.npy and base-station.yml into a folder and set dataset.root=FOLDER."
         )
+
+    def read(self, folder: Path) -> Measurements:
+        """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
+        return load_argos(folder, encoder_for(*self.encoder), **self.settings)
 
 
 class ArgosSim(Argos):
