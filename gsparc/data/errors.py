@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import difflib
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+_Found = TypeVar("_Found")
 
 MOST = 300  # characters of a message: what was found may be a whole file in one line
 
@@ -12,6 +15,18 @@ MOST = 300  # characters of a message: what was found may be a whole file in one
 def shortened(text: str) -> str:
     """A text without its middle when it is long."""
     return text if len(text) <= MOST else f"{text[: MOST // 2]} ... {text[-MOST // 3 :]}"
+
+
+def some(names: Sequence[Any], count: int = 5) -> str:
+    """The first of several names, and how many more there are."""
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(map(str, names[:count])) + more
+
+
+def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
+    """`; did you mean 'gp'?`, or nothing when no known name is close."""
+    close = difflib.get_close_matches(name, known, 1, cutoff)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def reason(error: BaseException) -> str:
@@ -60,6 +75,14 @@ class Problems(list[str]):
             self.add(f"{where}, {name}", what)
         if len(names) > self.LIMIT:
             self.append(f"{where}: {what}; the same in {len(names) - self.LIMIT} more rows")
+
+    def attempt(self, read: Callable[[], _Found]) -> _Found | None:
+        """What `read` returns; None, and noted, where it raises `DataError`."""
+        try:
+            return read()
+        except DataError as error:
+            self.extend(error.problems)
+            return None
 
     def raise_if_any(self) -> None:
         """Raise `DataError` when anything was noted."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import os
 import shutil
 import time
@@ -23,6 +25,24 @@ def platform_cache() -> Path:
     return (Path(root) if root else Path.home() / ".cache") / "gsparc"
 
 
+def read_text(path: Path, missing: str, kind: str = "text") -> str:
+    """A text in UTF-8; `DataError` says `missing`, or that the file is not readable as `kind`."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise DataError(f"{path}: {missing}") from None
+    except (UnicodeDecodeError, OSError) as error:
+        raise DataError(f"{path}: not readable as {kind} ({reason(error)})") from None
+
+
+def read_csv(path: Path, missing: str) -> list[list[str]]:
+    """Cells of each line, between commas; `DataError` as of `read_text`."""
+    try:
+        return list(csv.reader(io.StringIO(read_text(path, missing, "CSV text"))))
+    except csv.Error as error:
+        raise DataError(f"{path}: not readable as CSV text ({error})") from None
+
+
 def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
     """A table in YAML.
 
@@ -34,10 +54,10 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
         DataError: missing, not readable, or no table.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: missing; expected {missing}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, OSError, ValueError, RecursionError) as error:
+        content = yaml.safe_load(read_text(path, f"missing; expected {missing}", "YAML"))
+    except DataError:
+        raise
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not readable as YAML ({reason(error)})") from None
     if not isinstance(content, Mapping):
         raise DataError(f"{path}: expected {expected}")

@@ -7,6 +7,7 @@ cut) may extrapolate badly into a square of floor that nobody walked (blocks), a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,22 +170,15 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.
                 continue
             squares = np.unique(np.floor(where[:, :2] / side), axis=0, return_inverse=True)[1]
             return InnerFolds("blocks", folds, squares.reshape(-1))
-    if settings.name == "grouped":
-        try:
-            every = make_split(where, settings).folds
-        except DataError:
-            every = ()
-        if every:
-            return _by_fold("grouped", [every[i] for i in rng.permutation(len(every))[:count]], len(where))
+    corners = [settings.corner]
     if settings.name == "corner":
         others = [corner for corner in CORNERS if corner != settings.corner]
-        corners = [*rng.permutation(others), settings.corner][:count]
-        try:
-            cut = [make_split(where, replace(settings, corner=str(c))).folds[0] for c in corners]
-        except DataError:
-            cut = []
-        if cut:
-            return _by_fold("corner", cut, len(where))
+        corners = [*map(str, rng.permutation(others)), settings.corner][:count]
+    if settings.name in ("grouped", "corner"):
+        with suppress(DataError):
+            cut = [f for corner in corners for f in make_split(where, replace(settings, corner=corner)).folds]
+            chosen = rng.permutation(len(cut))[:count] if settings.name == "grouped" else range(len(cut))
+            return _by_fold(settings.name, [cut[i] for i in chosen], len(where))
     settings = replace(settings, name="random")
     folds = tuple(
         make_split(where, settings, pair).folds[0] for pair in _pieces(len(where), settings, count, rng)

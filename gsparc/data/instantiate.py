@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
@@ -10,14 +9,13 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, nearest
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
     """`; did you mean 'gp'?`, or what there is when nothing is close."""
     known = list(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(sorted(known))}"
+    return nearest(name, known) or f"; there are {', '.join(sorted(known))}"
 
 
 def known_keys(config: Mapping[str, Any], kind: type, group: str, noun: str) -> Mapping[str, Any]:

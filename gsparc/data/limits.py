@@ -8,13 +8,14 @@ command line puts the group it stands in before that (`gsparc.evaluation.console
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from gsparc.data.errors import nearest
 
 
 class SettingError(ValueError):
@@ -39,8 +40,7 @@ class Limit:
         """Raise `SettingError` unless `value` is allowed for the setting called `name`."""
         if self.holds(value):
             return
-        near = difflib.get_close_matches(value, self.known, 1, 0.5) if isinstance(value, str) else []
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = nearest(value, self.known) if isinstance(value, str) else ""
         raise SettingError(f"{name}={value!r}: {self.words} is needed{hint}")
 
 

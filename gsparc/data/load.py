@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Mapping
 from importlib.resources import files
@@ -16,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, nearest
 from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
@@ -118,20 +117,23 @@ def _choices() -> dict[str, DictConfig]:
 
 def _named(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
     if str(name) not in choices:
-        close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        hint = nearest(str(name), choices, 0.4)
         raise DataError(f"dataset: {str(name)!r} is none of {', '.join(sorted(choices))}{hint}")
     return choices[str(name)]
 
 
 def _parameters(kind: Any) -> dict[str, inspect.Parameter]:
-    """What `kind` takes; what a dataset's class hands on by keyword is what its base takes."""
+    """What `kind` takes; what a dataset's class hands on by keyword is what its reader or its base takes."""
     known = dict(inspect.signature(kind).parameters)
-    base = kind.__base__ if isinstance(kind, type) else None
-    handed = [name for name, p in known.items() if p.kind is p.VAR_KEYWORD]
-    if handed and base is not DataModule and issubclass(base or object, DataModule):
-        known = {**_parameters(base), **{name: p for name, p in known.items() if name not in handed}}
-    return known
+    base = (kind.__base__ if isinstance(kind, type) else None) or object
+    more: dict[str, inspect.Parameter] = {}
+    if any(p.kind is p.VAR_KEYWORD for p in known.values()):
+        if base is not DataModule and issubclass(base, DataModule):
+            more = _parameters(base)
+        if hasattr(kind, "reader"):
+            _, *settings = inspect.signature(kind.reader).parameters.values()  # without the file or folder
+            more |= {p.name: p for p in settings}
+    return {name: p for name, p in {**more, **known}.items() if not more or p.kind is not p.VAR_KEYWORD}
 
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:

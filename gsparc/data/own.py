@@ -52,9 +52,14 @@ def load_own(path: str | Path) -> Measurements:
     Raises:
         DataError: anything is missing or wrong; all problems are listed with array and row.
     """
-    reading = interpret(read_raw(path), path)
+    return interpreted(read_raw(path), path)
+
+
+def interpreted(raw: Raw, source: str | Path) -> Measurements:
+    """The measurements of `interpret`; notes are logged."""
+    reading = interpret(raw, source)
     for note in reading.notes:
-        log.warning("%s: %s", path, note)
+        log.warning("%s: %s", source, note)
     return reading.data
 
 
@@ -151,7 +156,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     target, scale = _scaled(measured, values, mask, links.censored)
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
-        check.refuse_rows(measured, _infinite(target), huge)
+        check.refuse_rows(measured, _rows(target, _infinite), huge)
     if not (np.isfinite(scale) and scale > 0):
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
@@ -236,32 +241,30 @@ def _noise(check: Checker, measured: str, rows: int) -> np.ndarray | None:
 
 def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
     """Measured entries of `values` (S, ...) are finite; powers are not negative, decibels are decibels."""
-    measured = True if mask is None else mask
-    unmarked = "not finite; expected numbers (mark what was not measured in mask)"
-    with np.errstate(over="ignore"):
-        if mask is None:
-            check.refuse_rows(name, _infinite(values), unmarked)
-        else:
-            check.refuse_rows(name, ~np.isfinite(np.abs(values)) & measured, unmarked)
-    if name == "csi" or values.dtype.kind == "u":
-        return
-    with np.errstate(invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
+        unmarked = "not finite; expected numbers (mark what was not measured in mask)"
+        check.refuse_rows(name, _rows(values, _infinite, mask), unmarked)
+        if name == "csi" or values.dtype.kind == "u":
+            return
+        wanted, out = "linear power, at least 0 (is it in dB?)", _rows(values, lambda part: part < 0, mask)
         if name == "rssi_db":
-            bad = np.abs(values) > 400
-        else:
-            bad = values < 0 if mask is not None else _rows(values, lambda part: part < 0)
-    wanted = "dB between -400 and 400" if name == "rssi_db" else "linear power, at least 0 (is it in dB?)"
-    check.refuse_rows(name, bad if mask is None else bad & mask, f"out of range; expected {wanted}")
+            wanted, out = "dB between -400 and 400", _rows(values, lambda part: np.abs(part) > 400, mask)
+    check.refuse_rows(name, out, f"out of range; expected {wanted}")
 
 
-def _rows(values: np.ndarray, test: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Rows (S,) of `values` (S, ...) with an entry that passes `test`, a block at a time."""
-    parts = (values[part].reshape(len(values[part]), -1) for part in blocks(values))
-    return np.concatenate([test(part).any(1) for part in parts])
+def _rows(
+    values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
+    found = []
+    for part in blocks(values):
+        passed = test(values[part]) if mask is None else test(values[part]) & mask[part]
+        found.append(passed.reshape(len(passed), -1).any(1))
+    return np.concatenate(found)
 
 
 def _infinite(values: np.ndarray) -> np.ndarray:
-    return _rows(values, lambda part: ~np.isfinite(np.abs(part)))
+    return ~np.isfinite(np.abs(values))
 
 
 def _static(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.assemble import content_hash
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 from gsparc.data.raw import stored_archive
 
@@ -39,8 +39,7 @@ def load(path: str | Path) -> Autoencoder:
         model = Autoencoder(int(content["width"]), EncoderSettings(**content["settings"]))
         model.load_state_dict(content["model"])
     except Exception as error:  # whatever a damaged file raises
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise DataError(f"{path}: not a gsparc encoder ({reason})") from None
+        raise DataError(f"{path}: not a gsparc encoder ({reason(error)})") from None
     return model.eval().requires_grad_(False)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import End
+from gsparc.data.schema import ENDS, End
 from gsparc.data.tables import is_table
 from gsparc.data.tables.columns import Chosen, choose
 from gsparc.data.tables.heads import AXES
@@ -19,7 +19,6 @@ from gsparc.data.tables.places import Places, places
 from gsparc.data.tables.read import NOTHING
 from gsparc.data.tables.sheet import Sheet, sheet_of
 
-WORDS: dict[End, str] = {"rx": "receiver", "tx": "transmitter"}
 GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "station")
 
 
@@ -113,9 +112,7 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
         if named not in found or (len(moving) > 1 and not named and "" in ends):
             raise DataError(_missing(sheet, end, len(moving) > 1))
         ends[end] = found.pop(named)
-    other = [f"of the {WORDS[end]}" for end in WORDS if f"{end}_" in found] + ["without a name"] * (
-        "" in found
-    )
+    other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in found] + ["without a name"] * ("" in found)
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
     station = _words(sheet, chosen, "station")
@@ -125,13 +122,12 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:
-    heads = ", ".join(repr(head) for head in sheet.heads[:8] if head)
     axes = (
         f"columns.{end}_x=COLUMN and .{end}_y"
         if both
         else "columns.latitude=COLUMN and .longitude, or .x and .y"
     )
-    return f"{sheet.source}: no coordinates of the {WORDS[end]} among {heads}; say {axes}"
+    return f"{sheet.source}: no coordinates of the {ENDS[end]} among {sheet.first_heads()}; say {axes}"
 
 
 def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
@@ -153,7 +149,7 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
             raise DataError(f"{source}: {position[0]} and {pair[0]} both say where; leave one out")
         if len(pair) == 1 or not (position or pair):
             wanted = "latitude and longitude, or " if alone else ""
-            raise DataError(f"{source}: no places of the {WORDS[end]}; expected {wanted}{end}_position")
+            raise DataError(f"{source}: no places of the {ENDS[end]}; expected {wanted}{end}_position")
         if pair:
             shapes = [str(raw.arrays[name].shape) for name in pair]
             if shapes[0] != shapes[1]:
@@ -224,7 +220,7 @@ def _checked(queries: QueryPlaces) -> QueryPlaces:
         wrong = np.argwhere(~np.isfinite(values))
         if len(wrong):
             row, axis = wrong[0]
-            fault = f"{names[axis]} of the {WORDS[end]} is {values[row, axis]}; expected a finite number"
+            fault = f"{names[axis]} of the {ENDS[end]} is {values[row, axis]}; expected a finite number"
             raise DataError(f"{queries.source}, {queries.rows[row]}: {fault}")
         if where.degrees and bad_degrees(*where.across.T) is not None:
             faults = (bad_degrees(latitude, longitude) for latitude, longitude in where.across)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -47,6 +47,13 @@ class Raw:
     arrays: dict[str, np.ndarray]
     attributes: dict[str, Any] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
+
+
+class Noted(NamedTuple):
+    """What a file holds, or a part of it, and remarks for the user, one line each."""
+
+    raw: Raw
+    notes: tuple[str, ...] = ()
 
 
 def read_raw(path: str | Path) -> Raw:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Kind = Literal["spectrum", "csi", "rssi"]
 End = Literal["rx", "tx"]
+ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
+OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
 LIGHT = 299_792_458.0  # [m/s]
 
 
@@ -132,7 +134,7 @@ class Site:
     @property
     def moving_end(self) -> Literal["rx", "tx"]:
         """The end whose position is the query; the receiver where both move."""
-        return "tx" if self.static_end == "rx" else "rx"
+        return OTHER.get(self.static_end or "", "rx")
 
     def moving(self, tx: Tensor, rx: Pose) -> Tensor:
         """Positions [m] of what moves: (B, 3) of one end (or a receiver for all), or (B, 6) of both."""

@@ -18,7 +18,7 @@ from gsparc.data.blocks import taken
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
-from gsparc.data.raw import Raw, numbered_rows
+from gsparc.data.raw import Noted, Raw, numbered_rows
 from gsparc.data.schema import FIELDS, MEASUREMENTS, axes_from
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
@@ -61,38 +61,25 @@ class Selection:
             raise DataError(f"dataset.max_rows={rows}: expected a whole number, at least {FEWEST}")
 
 
-@dataclass(frozen=True)
-class Selected:
-    """What is left, and what was left out.
-
-    Attributes:
-        raw: the arrays that are kept.
-        notes: what was left out, one line each.
-    """
-
-    raw: Raw
-    notes: tuple[str, ...] = ()
-
-
-def select(raw: Raw, selection: Selection, source: str | Path) -> Selected:
+def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
     """Apply all settings: stations, runs, level, then number of rows.
 
     Raises:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
     notes: list[str] = []
-    steps: tuple[tuple[Callable[..., Selected], Any], ...] = (
+    steps: tuple[tuple[Callable[..., Noted], Any], ...] = (
         *((keep_stations, selection.stations), (keep_runs, selection.runs)),
         *((keep_above, selection.min_rssi_db), (keep_rows, selection.max_rows)),
     )
     for keep, setting in steps:
         if setting is not None:
-            part = keep(raw, setting, source)
-            raw, notes = part.raw, [*notes, *part.notes]
-    return Selected(raw, tuple(notes))
+            raw, said = keep(raw, setting, source)
+            notes += said
+    return Noted(raw, tuple(notes))
 
 
-def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -> Selected:
+def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -> Noted:
     """The links of some stations only; the others' columns, or rows of a long file, are left out.
 
     Args:
@@ -101,34 +88,24 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     Raises:
         DataError: the file has no stations, or not these.
     """
-    count = station_count(raw)
-    if count is None:
-        raise DataError(f"dataset.stations: {source} has no stations; expected station_position")
+    count = _stations(raw, "dataset.stations", source)
     names = [str(name) for name in raw.arrays.get("station_name", np.zeros(0, str)).ravel()]
     numbers = [known_station(w, names, count, f"dataset.stations={w}", source) for w in stations]
     chosen = np.unique([part for number in numbers for part in parts_of(number, names)])
     note = f"dataset.stations: {count - len(chosen)} of {count} stations left out"
-    arrays = {
-        name: array[chosen] if per_station(name, array, count) else array
-        for name, array in raw.arrays.items()
-    }
-    arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
-    if "station" in arrays:
-        rows = np.flatnonzero(np.isin(raw.arrays["station"], chosen))
+    kept = take_stations(raw, chosen, source)
+    kept.arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
+    if "station" in kept.arrays:
+        of_row = raw.arrays["station"]
+        rows = np.flatnonzero(np.isin(of_row, chosen))
         _left(rows, "dataset.stations", source)
-        kept = take_rows(replace(raw, arrays=arrays), rows, source)
-        renumbered = np.searchsorted(chosen, kept.arrays["station"])
-        total = len(raw.arrays["station"])
-        note += f", with them {total - len(rows)} of {total} rows"
-        return Selected(replace(kept, arrays={**kept.arrays, "station": renumbered}), (note,))
-    for name in (*MEASUREMENTS, "mask"):
-        if name in arrays:
-            refuse_columns(arrays[name], name, count, source)
-            arrays[name] = arrays[name][:, chosen]
-    return Selected(replace(raw, arrays=arrays), (note,))
+        kept = take_rows(kept, rows, source)
+        kept.arrays["station"] = np.searchsorted(chosen, of_row[rows])
+        note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
+    return Noted(kept, (note,))
 
 
-def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Selected:
+def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
     """The rows of some runs only.
 
     Raises:
@@ -144,7 +121,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Select
     return _kept(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
 
 
-def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
+def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     """Powers of at least `min_rssi_db` [dB]; what is below counts as not measured, not as not heard.
 
     Raises:
@@ -166,10 +143,10 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{said}: {int(low.sum())} links left out",) if low.any() else ()
     rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), said, source)
-    return Selected(rest.raw, (*links, *rest.notes))
+    return Noted(rest.raw, (*links, *rest.notes))
 
 
-def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Selected:
+def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
     """At most `max_rows` rows that cover the campaign as all rows do.
 
     The file's order is cut into `max_rows` stretches of equal length, and of each one row is drawn, with a
@@ -192,21 +169,57 @@ def take_rows(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
     Raises:
         DataError: an array has another number of rows than the measurement.
     """
-    count, stations = row_count(raw, source), station_count(raw)
-    raw = replace(raw, arrays={"row_name": numbered_rows(count), **raw.arrays})  # numbers stay the file's
-    arrays = {}
-    for name, array in raw.arrays.items():
-        arrays[name] = taken(array, rows) if _per_row(name, array, count, stations, source) else array
+    count = row_count(raw, source)
+    named = {"row_name": numbered_rows(count), **raw.arrays}  # numbers stay the file's
+    for name, array in named.items():
+        if _per_row(name, array, station_count(raw)) and (found := len(array) if array.ndim else 0) != count:
+            raise DataError(f"{source}, {name}: expected {count} rows as the measurement has, found {found}")
+    arrays = rows_of(named, rows, count, station_count(raw))
     if "path_offsets" in arrays:
         arrays |= _paths(raw, rows, count, source)
-    for name in SPLIT:
-        if name in arrays:
-            # Names of rows that are not there are left for whoever reads the split to refuse.
-            inside = np.isin(arrays[name], np.arange(count))
-            kept = np.flatnonzero(np.isin(rows, arrays[name]))
-            arrays[name] = np.concatenate([kept, arrays[name][~inside]])
     if any(name in arrays and not len(arrays[name]) for name in SPLIT):
         arrays = {name: array for name, array in arrays.items() if name not in SPLIT}
+    return replace(raw, arrays=arrays)
+
+
+def rows_of(
+    arrays: Mapping[str, np.ndarray], rows: np.ndarray, count: int, stations: int | None = None
+) -> dict[str, np.ndarray]:
+    """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits are renumbered.
+
+    Rows that a split names and that there are not are left for whoever reads the split to refuse.
+    """
+    found = dict(arrays)
+    for name, array in arrays.items():
+        if _per_row(name, array, stations) and array.ndim and len(array) == count:
+            found[name] = taken(array, rows)
+        elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
+            order = np.argsort(rows, kind="stable")
+            first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
+            outside = array[(array < 0) | (array >= count)]
+            found[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
+    return found
+
+
+def take_stations(raw: Raw, stations: np.ndarray, source: str | Path) -> Raw:
+    """The same file with the stations (n,) only, in their order; one may stand twice.
+
+    Rows of a long file stay as they are.
+
+    Raises:
+        DataError: a measurement has other columns than there are stations.
+    """
+    count = station_count(raw)
+    assert count is not None
+    arrays = dict(raw.arrays)
+    for name, array in raw.arrays.items():
+        if per_station(name, array, count):
+            arrays[name] = array[stations]
+        elif name in (*MEASUREMENTS, "mask") and "station" not in arrays:
+            if array.ndim < 2 or array.shape[1] != count:
+                wanted = f"expected a column for each of the {count} stations, or an array station"
+                raise DataError(f"{source}, {name}: {wanted}; found shape {array.shape}")
+            arrays[name] = array[:, stations]
     return replace(raw, arrays=arrays)
 
 
@@ -228,6 +241,13 @@ def station_count(raw: Raw) -> int | None:
         if name in raw.arrays and raw.arrays[name].ndim:
             return len(raw.arrays[name])
     return None
+
+
+def _stations(raw: Raw, said: str, source: str | Path) -> int:
+    count = station_count(raw)
+    if count is None:
+        raise DataError(f"{said}: {source} has no stations; expected station_position")
+    return count
 
 
 def _listed(name: str, given: Any) -> tuple[str | int, ...]:
@@ -287,50 +307,40 @@ def per_station(name: str, array: np.ndarray, count: int) -> bool:
     return array.ndim in STATION_AXES.get(name, ()) and len(array) == count
 
 
-def _per_row(name: str, array: np.ndarray, count: int, stations: int | None, source: str | Path) -> bool:
-    if name not in ALWAYS and array.ndim not in ROW_AXES.get(name, ()):
+def _per_row(name: str, array: np.ndarray, stations: int | None) -> bool:
+    """Whether an array has a row per sample, by its name, its axes and how many stations there are."""
+    if name == "carrier_hz" and array.ndim and len(array) == stations:
         return False
-    if name == "carrier_hz" and len(array) == stations:
-        return False
-    found = len(array) if array.ndim else 0
-    if found != count:
-        raise DataError(f"{source}, {name}: expected {count} rows as the measurement has, found {found}")
-    return True
+    return name in ALWAYS or array.ndim in ROW_AXES.get(name, ())
+
+
+def _runs(first: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """The numbers from each `first` (n,) on, `lengths` (n,) of them, one after the other."""
+    return np.repeat(first - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
 
 
 def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[str, np.ndarray]:
     offsets = raw.arrays["path_offsets"]
     if offsets.shape != (count + 1,) or offsets.dtype.kind not in "iu":
         raise DataError(f"{source}, path_offsets: expected {count + 1} whole numbers, found {offsets.shape}")
-    lengths = np.diff(offsets.astype(np.int64))
-    owner = np.repeat(np.arange(count), lengths.clip(0))
-    place = np.full(count, -1)
-    place[rows] = np.arange(len(rows))
-    kept = np.flatnonzero(place[owner] >= 0)
-    kept = kept[np.argsort(place[owner[kept]], kind="stable")]
-    found = {"path_offsets": np.concatenate([[0], np.cumsum(lengths[rows])])}
+    offsets = offsets.astype(np.int64)
+    lengths = np.diff(offsets).clip(0)[rows]
+    found = {"path_offsets": np.concatenate([[0], np.cumsum(lengths)])}
     for name in PATH_AXES:
         if name in raw.arrays:
-            if len(raw.arrays[name]) != len(owner):
-                raise DataError(f"{source}, {name}: expected {len(owner)} paths as path_offsets says")
-            found[name] = raw.arrays[name][kept]
+            if len(raw.arrays[name]) != offsets[-1]:
+                raise DataError(f"{source}, {name}: expected {offsets[-1]} paths as path_offsets says")
+            found[name] = raw.arrays[name][_runs(offsets[rows], lengths)]
     return found
 
 
-def refuse_columns(array: np.ndarray, name: str, count: int, source: str | Path) -> None:
-    """Refuse (DataError) what has no column for each of `count` stations."""
-    if array.ndim < 2 or array.shape[1] != count:
-        wanted = f"expected a column for each of the {count} stations, or an array station"
-        raise DataError(f"{source}, {name}: {wanted}; found shape {array.shape}")
-
-
-def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Selected:
+def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Noted:
     rows = np.flatnonzero(keep)
     _left(rows, said, source)
     if len(rows) == len(keep):
-        return Selected(raw)
+        return Noted(raw)
     note = f"{said}: {len(keep) - len(rows)} of {len(keep)} rows left out"
-    return Selected(take_rows(raw, rows, source), (note,))
+    return Noted(take_rows(raw, rows, source), (note,))
 
 
 def _left(rows: np.ndarray, said: str, source: str | Path) -> None:
@@ -374,35 +384,22 @@ def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | P
 
 
 def _split(raw: Raw, station: str, first: int, source: str | Path) -> Raw:
-    count, rows = station_count(raw), row_count(raw, source)
-    said = f"dataset.level_steps.{station}={first}"
-    if count is None:
-        raise DataError(f"{said}: {source} has no stations; expected station_position")
+    rows, said = row_count(raw, source), f"dataset.level_steps.{station}={first}"
+    count = _stations(raw, said, source)
     if not 0 < first < rows:
         raise DataError(f"{said}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
     names = [str(name) for name in raw.arrays.get("station_name", np.arange(count)).ravel()]
     number = known_station(station, names, count, said, source)
     last = parts_of(number, names)[-1]  # later steps divide the part after earlier ones
-    arrays = {
-        name: np.concatenate([array, array[number : number + 1]])
-        if per_station(name, array, count)
-        else array
-        for name, array in raw.arrays.items()
-    }
-    arrays["station_name"] = np.array([*names, f"{names[number]}{FROM_ROW}{first}"])
+    doubled = np.array([*range(count), last])
+    raw = replace(raw, arrays={**raw.arrays, "station_name": np.array(names)})
     after = np.arange(rows) >= first
+    if "station" not in raw.arrays:
+        raw.arrays["mask"] = measured_links(raw, source)
+    arrays = take_stations(raw, doubled, source).arrays
+    arrays["station_name"] = np.array([*names, f"{names[number]}{FROM_ROW}{first}"])
     if "station" in arrays:
-        of_row = arrays["station"]
-        arrays["station"] = np.where((of_row == last) & after, count, of_row)
-        return replace(raw, arrays=arrays)
-    measured = measured_links(raw, source)
-    for name in (*MEASUREMENTS, "mask"):
-        if name in arrays:
-            refuse_columns(arrays[name], name, count, source)
-    here = measured[:, last : last + 1] & after.reshape(-1, *[1] * (measured.ndim - 1))
-    mask = np.concatenate([measured, here], axis=1)
-    mask[:, last] &= ~after.reshape(-1, *[1] * (measured.ndim - 2))
-    for name in MEASUREMENTS:
-        if name in arrays:
-            arrays[name] = np.concatenate([arrays[name], arrays[name][:, last : last + 1]], axis=1)
-    return replace(raw, arrays={**arrays, "mask": mask})
+        arrays["station"] = np.where((arrays["station"] == last) & after, count, arrays["station"])
+    else:
+        arrays["mask"][~after, count] = arrays["mask"][after, last] = False
+    return replace(raw, arrays=arrays)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, nearest, reason
 from gsparc.data.files import whole_file
 
 log = logging.getLogger(__name__)
@@ -110,8 +109,7 @@ class SplitSettings:
 
     def __post_init__(self) -> None:
         if self.name not in NAMES:
-            close = difflib.get_close_matches(self.name, [*NAMES, "file"], n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
+            hint = nearest(self.name, (*NAMES, "file"), 0.6)
             raise DataError(f"split: {self.name!r} is none of {', '.join(NAMES)}, file{hint}")
         if not isinstance(self.seed, int):
             raise DataError(f"split.seed={self.seed}: a whole number is needed")
@@ -179,20 +177,21 @@ def make_split(
     """
     rows, left = len(positions), settings.leave_out
     absent = np.zeros(0, np.int64) if isinstance(left, int) else left_out(left, outliers, rows)
-    if len(absent):
-        rest = np.setdiff1d(np.arange(rows), absent)
-        return _of_the_rest(rest, positions, settings, release_split, place, station)
-    named = settings.name == "random" and release_split is not None and not settings.redraw
+    kept = np.setdiff1d(np.arange(rows), absent)
+    first = which = np.arange(len(kept))  # of the rows that stand for their places, and the place of each row
     if settings.name in ("stations", "runs"):
-        folds = _whole(station, settings)
-    elif place is not None and not named:
-        _, first, which = np.unique(place, return_index=True, return_inverse=True)
-        found = make_split(positions[first], settings)
-        which = which.reshape(-1)
-        folds = tuple(f.each(lambda part: np.flatnonzero(np.isin(which, part))) for f in found.folds)
+        found = _whole(None if station is None else station[kept], settings)
     else:
-        pairs = _pairs(positions, settings, release_split if named else None)
-        folds = tuple(_finish(i, train, test, positions, settings) for i, (train, test) in enumerate(pairs))
+        named = release_split if settings.name == "random" and not settings.redraw else None
+        if named is not None:
+            train, test = (np.searchsorted(kept, np.intersect1d(part, kept)) for part in named)
+            named = train, test
+        elif place is not None:
+            _, first, which = np.unique(place[kept], return_index=True, return_inverse=True)
+        where = positions[kept][first]
+        pairs = enumerate(_pairs(where, settings, named))
+        found = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
+    folds = tuple(fold.each(lambda part: kept[np.isin(which.reshape(-1), part)]) for fold in found)
     return Split(settings.name, folds, indices_hash(folds))
 
 
@@ -201,7 +200,7 @@ def _pairs(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """(training, test) rows of each fold, before thinning and validation."""
     if named is not None:
-        return [(np.sort(named[0]), np.sort(named[1]))]
+        return [named]
     if settings.name == "grouped":
         return _grouped(positions, settings)
     if settings.name == "corner":
@@ -335,25 +334,6 @@ def _check_rows(given: Any) -> None:
         good = all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
     if not good:
         raise DataError(f"split.leave_out={given}: expected outliers, or numbers of rows like [3, 17]")
-
-
-def _of_the_rest(
-    rest: np.ndarray,
-    positions: np.ndarray,
-    settings: SplitSettings,
-    release_split: tuple[np.ndarray, np.ndarray] | None,
-    place: np.ndarray | None,
-    station: np.ndarray | None,
-) -> Split:
-    """The split of rows `rest` (n,) sorted, as if there were no others."""
-    named = None
-    if release_split is not None:
-        train, test = (np.searchsorted(rest, np.intersect1d(part, rest)) for part in release_split)
-        named = train, test
-    where, which = (None if part is None else part[rest] for part in (place, station))
-    found = make_split(positions[rest], replace(settings, leave_out=()), named, None, where, which)
-    folds = tuple(fold.each(lambda part: rest[part]) for fold in found.folds)
-    return Split(found.name, folds, indices_hash(folds))
 
 
 def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import DataError, Problems, reason
-from gsparc.data.files import read_yaml
+from gsparc.data.errors import DataError, Problems
+from gsparc.data.files import read_text, read_yaml
 from gsparc.data.instantiate import suggest
+from gsparc.data.limits import finite
 
 EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`), or a mesh *.obj"
 SIMULATED = {  # of scenes that are simulated: known, and not needed here
@@ -78,8 +79,8 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
         walls = []
     for number, wall in enumerate(walls):
         where = f"{path}: walls[{number}]"
-        corners = _numbers(wall.get("corners_m") if isinstance(wall, dict) else wall)
-        if corners is None or corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
+        corners = finite(wall.get("corners_m") if isinstance(wall, dict) else wall)
+        if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
             problems.add(where, "expected corners_m: [[x, y, z], ...] of at least 3 corners [m]")
         elif area(corners) < SMALLEST_M2:
             problems.add(where, "its corners lie on a line")
@@ -100,14 +101,14 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
         if key not in ("size_m", "boxes_m", "reflection"):
             problems.add(path, f"room.{key}: no such key{suggest(str(key), ['size_m', 'boxes_m'])}")
     if room.get("size_m") is not None:
-        size = _numbers(room["size_m"])
-        if size is None or size.shape != (3,) or not (size > 0).all():
+        size = finite(room["size_m"])
+        if size.shape != (3,) or not (size > 0).all():
             problems.add(path, f"room.size_m={room['size_m']}: expected three lengths above 0 [m]")
         else:
             faces = box_faces(np.zeros(3), size)
     if room.get("boxes_m"):
-        found = _numbers(room["boxes_m"])
-        if found is None or found.shape[1:] != (2, 3) or not (found[:, 0] < found[:, 1]).all():
+        found = finite(room["boxes_m"])
+        if found.shape[1:] != (2, 3) or not (found[:, 0] < found[:, 1]).all():
             problems.add(
                 path, "room.boxes_m: expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
             )
@@ -118,13 +119,7 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
 
 def _mesh(path: Path, problems: Problems) -> SceneWalls:
     """Faces of all objects; texture, normals and materials are not read."""
-    nothing = SceneWalls((), np.zeros((0, 2, 3)))
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
-        return problems.add(path, "missing; expected a mesh *.obj") or nothing
-    except (UnicodeDecodeError, OSError) as error:
-        return problems.add(path, f"not readable as text ({reason(error)})") or nothing
+    lines = read_text(path, "missing; expected a mesh *.obj").splitlines()
     corners: list[list[float]] = []
     faces: list[np.ndarray] = []
     for number, line in enumerate(lines, 1):
@@ -187,12 +182,3 @@ def uneven(corners: np.ndarray) -> float:
     """Largest distance of corners (C, 3) from their plane [m]."""
     normal = normal_of(corners)
     return float(np.abs((corners - corners.mean(0)) @ (normal / np.linalg.norm(normal))).max())
-
-
-def _numbers(values: Any) -> np.ndarray | None:
-    """As finite float64, or None."""
-    try:
-        found = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return found if np.isfinite(found).all() else None

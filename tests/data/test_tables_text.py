@@ -74,3 +74,8 @@ def test_thousands_between_semicolons_were_decimals_without_a_question(write, x,
     notes = understand_table(write(f"x;y;rssi\n{x};5412013;-80\n448,291;5412100;-81\n")).notes
     said = [note for note in notes if note.startswith("decimal commas")]
     assert len(said) == 1 and ("448,262 is 448.262; if commas stand between thousands" in said[0]) == asked
+
+
+def test_a_comment_mark_after_an_empty_cell_was_a_crash(write):
+    with pytest.raises(DataError, match=r"line 3: begins with '# 3.*: a row, or a comment\?"):
+        read_table(write("x\ty\trssi\n1\t2\t-70\n\t# 3\t-70\n", "a.tsv"))

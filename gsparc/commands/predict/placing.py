@@ -10,8 +10,8 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
-from gsparc.data.query_places import WORDS, QueryPlaces
-from gsparc.data.schema import End, Site
+from gsparc.data.query_places import QueryPlaces
+from gsparc.data.schema import ENDS, End, Site
 from gsparc.prediction.predictor import usual_heights
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
@@ -31,12 +31,12 @@ def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
             continue
         if end not in known:
             low, high = site.moving_box[:, 2::3][:, -1 if end == "rx" else 0] + site.origin[2]
-            several = f"the {WORDS[end]} was measured at heights from {low:g} to {high:g} m"
+            several = f"the {ENDS[end]} was measured at heights from {low:g} to {high:g} m"
             say = f"say columns.{'' if len(ends) == 1 else end + '_'}height=NUMBER, or give it in the file"
             raise DataError(f"{queries.source}: no height, and {several}; {say}")
         height = np.full(len(queries), known[end])
         ends[end] = replace(where, height=height)
-        notes.append(f"no height of the {WORDS[end]}: taken as {known[end]:g} m, as when it was measured")
+        notes.append(f"no height of the {ENDS[end]}: taken as {known[end]:g} m, as when it was measured")
     return replace(queries, ends=ends, notes=tuple(notes))
 
 

@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.checks import outliers
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.errors import some
+from gsparc.data.schema import ENDS, Measurements, Site
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.ops import SphereGrid
 
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
-ENDS = {"rx": "receiver", "tx": "transmitter"}
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """(topic, sentence) pairs about a dataset."""
     site = data.site
-    places = places_of(data)
+    carrier = "unknown; give frequency_hz, and effects that need the phase become available"
+    if site.carrier_hz is not None:
+        carrier = f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
+    tones = site.subcarriers_hz
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
-        ("neighbours", neighbours(places, site.wavelength)),
+        ("neighbours", neighbours(places_of(data), site.wavelength)),
+        *(("units?", hint) for hint in suspicious_values(data)),
+        *(("outliers?", said) for said in outliers.warnings(data)),
+        ("carrier", carrier),
     ]
-    lines += [("units?", hint) for hint in suspicious_values(data)]
-    lines += [("outliers?", said) for said in outliers.warnings(data)]
-    carrier = "unknown; give frequency_hz, and effects that need the phase become available"
-    if site.carrier_hz is not None:
-        carrier = f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
-    lines.append(("carrier", carrier))
-    if site.subcarriers_hz is not None and len(site.subcarriers_hz) > 1:
-        span = np.ptp(site.subcarriers_hz) / 1e6
-        lines.append(("band", f"{len(site.subcarriers_hz)} subcarriers over {span:.6g} MHz"))
+    if tones is not None and len(tones) > 1:
+        lines.append(("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz"))
     if site.grid is not None:
         lines.append(("grid", _grid(site.grid)))
     if site.array is not None:
@@ -98,7 +95,7 @@ def _static(site: Site) -> str:
         lost = len(site.stations) - len(known)
         box = f" in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(known, axis=0))} m" if len(known) else ""
         box += f", {lost} of them at unknown places" if lost else ""
-        return f"the {end}, {len(site.stations)} stations{box}: {_some(site.stations.name)}"
+        return f"the {end}, {len(site.stations)} stations{box}: {some(site.stations.name, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64
@@ -114,11 +111,6 @@ def _moving(data: Measurements) -> str:
         f"{end}, in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(places, axis=0))} m"
         for end, places in ends.items()
     )
-
-
-def _some(names: Sequence[str], count: int = 4) -> str:
-    more = f" and {len(names) - count} more" if len(names) > count else ""
-    return ", ".join(names[:count]) + more
 
 
 def suspicious_values(data: Measurements) -> list[str]:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gsparc.data.blocks import blocks
+from gsparc.data.errors import some
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Measurements
 
@@ -18,7 +19,6 @@ FEW = 0.02  # share of the rows, at least one row
 GAP_DB = 50.0  # to the next row: no step of a receiver between two of its neighbours is as high
 FAR = 10.0  # times the farthest distance of the others from the median place
 FAR_M = 50.0  # and this much farther: in a small box nothing is far
-NAMED = 5  # rows in a message
 
 
 def too_strong(peaks: np.ndarray) -> np.ndarray:
@@ -70,9 +70,8 @@ def warnings(data: Measurements) -> list[str]:
     """One sentence for each kind of outlier, with the names of the first rows."""
     said = []
     for what, rows in outliers(data).items():
-        names = ", ".join(data.row_names[i] for i in rows[:NAMED])
-        more = f" and {len(rows) - NAMED} more" if len(rows) > NAMED else ""
-        said.append(f"{names}{more}: {what}; if they are wrong, leave them out with split.leave_out=outliers")
+        names = some([data.row_names[i] for i in rows])
+        said.append(f"{names}: {what}; if they are wrong, leave them out with split.leave_out=outliers")
     return said
 
 

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, level_steps
 from gsparc.data.checks.outliers import too_far
+from gsparc.data.errors import some
 from gsparc.data.schema import Measurements
 
-NAMED = 5  # rows or stations in a line
+NAMED = 5  # wild rows that a station may have, however few its rows
 HIGHEST_DBM = 60.0  # a kilowatt received
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
@@ -53,7 +53,7 @@ def position_warnings(position: np.ndarray, rows: Sequence[str]) -> list[str]:
     lost = too_far(position)
     found = []
     if lost.any():
-        which = _some(rows, np.flatnonzero(lost))
+        which = some([rows[i] for i in np.flatnonzero(lost).tolist()])
         found.append(f"{which}: far outside the region of all others; a lost fix of the receiver?")
     return found + _units(position[~lost])
 
@@ -166,36 +166,21 @@ def direction_warnings(
 
 def copies(position: np.ndarray, station: np.ndarray, level_db: np.ndarray, rows: Sequence[str]) -> list[str]:
     """Rows of one place and station: copies where the value is the same, repeated measurements where not."""
-    known = np.flatnonzero(np.isfinite(level_db))
-    if len(known) < 2:
-        return []
-    place = np.unique(position[known], axis=0, return_inverse=True)[1].reshape(-1)
-    link = np.unique(np.stack([place, station[known]], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-    order = np.argsort(link, kind="stable")
-    groups = np.split(known[order], np.flatnonzero(np.diff(link[order])) + 1)
-    same: list[tuple[int, int]] = []
-    repeated, spreads = 0, []
-    for group in groups:
-        if len(group) < 2:
-            continue
-        values = level_db[group]
-        first: dict[float, int] = {}
-        for row, value in zip(group.tolist(), values.tolist(), strict=True):
-            if value in first:
-                same.append((first[value], row))
-            first.setdefault(value, row)
-        if len(first) > 1:
-            repeated += 1
-            spreads.append(float(np.std(list(first), ddof=1)))
+    import pandas as pd  # here, as it takes half a second
+
+    where = np.unique(np.column_stack([position, station]), axis=0, return_inverse=True)[1].reshape(-1)
+    table = pd.DataFrame({"link": where, "level": level_db, "row": range(len(level_db))}).dropna()
+    table = table[np.isfinite(table["level"])].sort_values("link", kind="stable")
+    first = table.groupby(["link", "level"])["row"].transform("first")
     found = []
+    same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        pairs = [f"{rows[b]} of {rows[a]}" for a, b in same[:NAMED]]
-        more = f" and {len(same) - NAMED} more" if len(same) > NAMED else ""
-        found.append(f"copies (same place, station and level): {', '.join(pairs)}{more}; leave them out")
-    if repeated:
+        found.append(f"copies (same place, station and level): {some(same)}; leave them out")
+    spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
+    if len(spreads):
         found.append(
-            f"{repeated} places were measured more than once by one station, with different levels "
-            f"(standard deviation {np.median(spreads):.2g} dB, median)"
+            f"{len(spreads)} places were measured more than once by one station, with different levels "
+            f"(standard deviation {spreads.median():.2g} dB, median)"
         )
     return found
 
@@ -207,7 +192,9 @@ def wild_rows(
     found = []
     for t, bad, most in wild_of(station, level_db):
         where = f"station {names[t]}: " if len(names) > 1 else ""
-        found.append(f"{where}{_some(rows, bad)}: up to {most:.0f} dB from the rows around; wrong?")
+        found.append(
+            f"{where}{some([rows[i] for i in bad])}: up to {most:.0f} dB from the rows around; wrong?"
+        )
     return found
 
 
@@ -283,11 +270,10 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
         if not missing.any() or missing.all():
             continue
         floor = float(np.percentile(level[~missing], 1))
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+        absent = np.flatnonzero(missing)
         scattered, around = 0, []
-        for start, stop in pairwise(edges):
-            if not missing[start]:
-                continue
+        for piece in np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1):
+            start, stop = int(piece[0]), int(piece[-1]) + 1
             beside = np.concatenate([level[max(0, start - 3) : start], level[stop : stop + 3]])
             beside = beside[np.isfinite(beside)]
             weak = bool(len(beside)) and float(np.median(beside)) < floor + WEAK_DB
@@ -295,9 +281,9 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
             if stop - start >= LONG_GAP and not (weak and ragged):
                 key = (rows[used[start]], rows[used[stop - 1]])
                 long[key].append(str(names[t]))
-                lengths[key] = int(stop - start)
+                lengths[key] = stop - start
             else:
-                scattered += int(stop - start)
+                scattered += stop - start
                 around += beside.tolist()
         often = scattered >= FEW * len(used)
         if often and around and np.median(around) < floor + WEAK_DB:
@@ -327,16 +313,8 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
     return found
 
 
-def _some(rows: Sequence[str], which: np.ndarray) -> str:
-    more = f" and {len(which) - NAMED} more" if len(which) > NAMED else ""
-    return ", ".join(str(rows[i]) for i in which[:NAMED]) + more
-
-
 def _of(who: list[str], total: int) -> str:
-    if total == 1:
-        return ""
-    more = f" and {len(who) - NAMED} more" if len(who) > NAMED else ""
-    return f" of station{'s' * (len(who) > 1)} {', '.join(who[:NAMED])}{more}"
+    return "" if total == 1 else f" of station{'s' * (len(who) > 1)} {some(who)}"
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,9 @@ import numpy as np
 
 from gsparc.data.assemble import assemble, check_positions, rounded_rms
 from gsparc.data.datasets.campaign import Release, StandIn, simulated
-from gsparc.data.errors import DataError, Problems
+from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
+from gsparc.data.limits import finite
 from gsparc.data.position_encoder import EncoderSettings, encoder_for
 from gsparc.data.schema import Measurements
 
@@ -33,17 +34,17 @@ Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def load_argos(
     root: str | Path,
-    encode: Encoder | None = None,
+    encoder: Encoder | None = None,
     *,
     antenna: int | str = 0,
-    positions: str = "encoder",
+    positions: str | bool = "encoder",
     align: bool = True,
 ) -> Measurements:
     """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, 26) complex64.
 
     Args:
         root: the folder; `csidata-64.npy` is preferred where a folder has it.
-        encode: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
+        encoder: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
         antenna: number of the antenna to predict, or `all`.
         positions: `encoder`, or `true` where the folder has `positions.npy` (the stand-in).
         align: turn every snapshot by the phase and the mean delay of its own uplink. These are
@@ -52,7 +53,7 @@ def load_argos(
     Raises:
         DataError: anything is missing or wrong.
     """
-    root = Path(root)
+    root, positions, align = Path(root), str(positions).lower(), bool(align)  # `true` in YAML is no text
     expected = "`base_station:` with a list of antenna positions [m]"
     description = read_yaml(root / "base-station.yml", "the antennas' positions", expected)
     csi = _channels(root)
@@ -67,7 +68,7 @@ def load_argos(
     csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
     uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
     split = _split(root, len(csi))
-    where = _positions(root, positions, encode, uplink, split)
+    where = _positions(root, positions, encoder, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
@@ -131,12 +132,7 @@ def published_figures(
 def _channels(root: Path) -> np.ndarray:
     path = root / "csidata-64.npy"
     path = path if path.exists() else root / "csidata.npy"
-    try:
-        csi = np.load(path, allow_pickle=False)
-    except FileNotFoundError:
-        raise DataError(f"{path}: missing; expected complex channels [N, antennas, 52]") from None
-    except (ValueError, OSError) as error:
-        raise DataError(f"{path}: not readable ({' '.join(str(error).split())})") from None
+    csi = _loaded(path, "expected complex channels [N, antennas, 52]")
     if csi.ndim != 3 or csi.shape[2] != 2 * UPLINK or csi.dtype.kind != "c":
         expected = f"complex [N, antennas, {2 * UPLINK}]"
         raise DataError(f"{path}: expected {expected}, found {csi.dtype} {csi.shape}")
@@ -149,13 +145,19 @@ def _channels(root: Path) -> np.ndarray:
     return csi
 
 
+def _loaded(path: Path, expected: str) -> np.ndarray:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except FileNotFoundError:
+        raise DataError(f"{path}: missing; {expected}") from None
+    except (ValueError, OSError) as error:
+        raise DataError(f"{path}: not readable ({reason(error)})") from None
+
+
 def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndarray:
     key = f"base_station_{count}" if f"base_station_{count}" in description else "base_station"
-    try:
-        places = np.array(description.get(key), dtype=np.float64)
-    except (TypeError, ValueError):
-        places = np.zeros(0)
-    if places.shape != (count, 3) or not np.isfinite(places).all():
+    places = finite(description.get(key))
+    if places.shape != (count, 3):
         raise DataError(
             f"{root / 'base-station.yml'}: {key} has shape {places.shape}; expected {count} x 3 metres, "
             "one antenna per line"
@@ -180,16 +182,10 @@ def _split(root: Path, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
     except ValueError as error:
         raise DataError(f"{paths[0].parent}: an index file is not a list of row numbers ({error})") from None
     every = np.concatenate([train, test])
-    if (
-        not len(train)
-        or not len(test)
-        or len(np.unique(every)) != len(every)
-        or every.min() < 0
-        or every.max() >= rows
-    ):
-        raise DataError(
-            f"{root}: the index files are empty, name a row twice, or one outside 0 to {rows - 1}"
-        )
+    once = len(np.intersect1d(every, np.arange(rows))) == len(every)
+    if not (len(train) and len(test) and once):
+        fault = f"the index files are empty, name a row twice, or one outside 0 to {rows - 1}"
+        raise DataError(f"{root}: {fault}")
     return train, test
 
 
@@ -201,10 +197,7 @@ def _positions(
     split: tuple[np.ndarray, np.ndarray] | None,
 ) -> np.ndarray:
     if positions == "true":
-        path = root / "positions.npy"
-        if not path.exists():
-            raise DataError(f"{path}: missing; true positions exist in the stand-in only")
-        return _true_positions(path, len(uplink))
+        return _true_positions(root / "positions.npy", len(uplink))
     if positions != "encoder" or encode is None:
         raise DataError(f"dataset.positions={positions!r}: expected encoder or true")
     rows = np.arange(len(uplink)) if split is None else split[0]
@@ -212,10 +205,10 @@ def _positions(
 
 
 def _true_positions(path: Path, rows: int) -> np.ndarray:
-    try:
-        places = np.load(path, allow_pickle=False).astype(np.float64)
-    except (ValueError, TypeError, OSError) as error:
-        raise DataError(f"{path}: not readable ({' '.join(str(error).split())})") from None
+    places = _loaded(path, "true positions exist in the stand-in only")
+    if places.dtype.kind not in "biuf":
+        raise DataError(f"{path}: not readable (expected real numbers, found dtype {places.dtype})")
+    places = places.astype(np.float64)
     if places.shape != (rows, 3):
         turned = "; transposed?" if places.shape == (3, rows) else ""
         raise DataError(f"{path}: expected shape ({rows}, 3) [m], found {places.shape}{turned}")
@@ -229,28 +222,18 @@ class Argos(Release):
     """The Argos release or any folder in its layout.
 
     Args:
-        root, name, **rest: see `Release`.
-        antenna, positions, align: see `load_argos`.
+        root, **rest: see `Release` and `load_argos`.
         encoder: `file` or `folder`, and `EncoderSettings`.
     """
 
-    called = "Argos"
+    called, reader = "Argos", staticmethod(load_argos)
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        antenna: int | str = 0,
-        positions: str | bool = "encoder",
-        align: bool = True,
-        encoder: Mapping[str, Any] | None = None,
-        name: str = "argos",
-        **rest: Any,
+        self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
     ) -> None:
-        super().__init__(root, name, **rest)
-        self.antenna, self.align = antenna, bool(align)
-        self.positions = str(positions).lower()  # `true` in YAML is no text
         given = dict(encoder or {})
         file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
+        super().__init__(root, **rest)
         self.encoder = (room, EncoderSettings(**given), file)
 
     def missing(self) -> str:
@@ -263,8 +246,7 @@ class Argos(Release):
 
     def read(self, folder: Path) -> Measurements:
         """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
-        encode = encoder_for(*self.encoder)
-        return load_argos(folder, encode, antenna=self.antenna, positions=self.positions, align=self.align)
+        return load_argos(folder, encoder_for(*self.encoder), **self.settings)
 
 
 class ArgosSim(Argos):
@@ -280,9 +262,8 @@ class ArgosSim(Argos):
         name: str = "argos_sim",
         batch_size: int = 16,
     ) -> None:
-        super().__init__(
-            None, antenna, positions, align, encoder, name, stand_in=stand_in, batch_size=batch_size
-        )
+        about = {"antenna": antenna, "positions": positions, "align": align}
+        super().__init__(None, encoder, name=name, stand_in=stand_in, batch_size=batch_size, **about)
 
     def load(self) -> Measurements:
         """As `Argos.load`, without a word about the release."""

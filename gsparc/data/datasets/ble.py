@@ -7,19 +7,17 @@ frequency_hz () [Hz]
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
-from gsparc.data.raw import Raw, read_raw, renamed
+from gsparc.data.raw import Raw, read_raw
 
 LAYOUT = {
-    "mobile_position": Expected(("S", 3), place=True),
+    "mobile_position": Expected(("S", 3), place=True, field="tx_position"),
     "station_position": Expected(("T", 3), place=True),
     "rssi_db": Expected(("S", "T")),
-    "station": Expected(("T",), TEXT, optional=True),
-    "frequency_hz": Expected((), optional=True),
+    "station": Expected(("T",), TEXT, optional=True, field="station_name"),
+    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
 }
-NAMES = {"mobile_position": "tx_position", "station": "station_name", "frequency_hz": "carrier_hz"}
 
 
 def raw_of_ble(path: str | Path) -> Raw:
@@ -33,23 +31,10 @@ def raw_of_ble(path: str | Path) -> Raw:
         DataError: no such file, or an array is missing or wrong; all problems with array and row.
     """
     raw = read_raw(path)
-    check_layout(raw, path, LAYOUT)
-    known = Raw({name: raw.arrays[name] for name in LAYOUT if name in raw.arrays})
-    return Raw(renamed(known, NAMES).arrays, {**raw.attributes, "layout": "ble"})
+    return Raw(check_layout(raw, path, LAYOUT), {**raw.attributes, "layout": "ble"})
 
 
 class BLE(Campaign):
-    """Powers of a beacon at many places, at the sensors of a hall; see `raw_of_ble`.
+    """Powers of a beacon at many places, at the sensors of a hall; settings of `Campaign`."""
 
-    Args:
-        file: *.npz.
-        name: of run directories.
-        **rest: see `Campaign`.
-    """
-
-    def __init__(self, file: str | Path, name: str = "ble", **rest: Any) -> None:
-        super().__init__(file, name, **rest)
-
-    def raw(self) -> Raw:
-        """Powers (S, T) of a moving transmitter at T stations."""
-        return raw_of_ble(self.file)
+    choice, reader = "ble", staticmethod(raw_of_ble)

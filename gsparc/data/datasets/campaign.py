@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -28,34 +28,35 @@ class Campaign(DataModule):
 
     Args:
         file: what `raw` reads.
-        name, batch_size: see `DataModule`.
+        name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
         stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
         level_steps: by station, rows from which it counts as another; see `gsparc.data.selection`.
+        **settings: what `reader` takes besides.
     """
+
+    choice: ClassVar[str]  # of conf/dataset
+    reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/own-data.md
 
     def __init__(
         self,
         file: str | Path,
-        name: str,
+        name: str | None = None,
         batch_size: int = 16,
         stations: Sequence[str | int] | None = None,
         runs: Sequence[str | int] | None = None,
         min_rssi_db: float | None = None,
         max_rows: int | None = None,
         level_steps: Mapping[str, Sequence[int]] | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(name, batch_size)
-        self.file = Path(file)
+        super().__init__(name or self.choice, batch_size)
+        self.file, self.settings = Path(file), settings
         self.selection = Selection(stations, runs, min_rssi_db, max_rows)
         self.level_steps = rows_by_station(level_steps or {})
 
-    @abstractmethod
     def raw(self) -> Raw:
-        """The file's arrays, named as in docs/own-data.md.
-
-        Raises:
-            DataError: bad input.
-        """
+        """The file's arrays, named as in docs/own-data.md; `DataError` where they are bad."""
+        return self.reader(self.file, **self.settings)
 
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
@@ -88,23 +89,30 @@ class Release(DataModule):
         root: the folder; absent: the stand-in.
         stand_in: used, loudly, when no root is given.
         name, batch_size: see `DataModule`.
+        **settings: what `reader` takes besides.
     """
 
-    called = ""  # the release, in messages
+    called = ""  # the release, in messages; in small letters the choice of conf/dataset
+    reader: ClassVar[Callable[..., Measurements]]  # what a folder holds
 
     def __init__(
-        self, root: str | Path | None, name: str, stand_in: StandIn | None = None, batch_size: int = 16
+        self,
+        root: str | Path | None = None,
+        name: str | None = None,
+        stand_in: StandIn | None = None,
+        batch_size: int = 16,
+        **settings: Any,
     ) -> None:
-        super().__init__(name, batch_size)
-        self.root, self.stand_in = None if root is None else Path(root), stand_in
+        super().__init__(name or self.called.lower(), batch_size)
+        self.root, self.stand_in, self.settings = None if root is None else Path(root), stand_in, settings
 
     @abstractmethod
     def missing(self) -> str:
         """Why the release is not used, and how to get it."""
 
-    @abstractmethod
     def read(self, folder: Path) -> Measurements:
         """A folder in the release's layout; `DataError` where something is missing or wrong."""
+        return self.reader(folder, **self.settings)
 
     def load(self) -> Measurements:
         """The release's measurements, or, loudly, the stand-in's."""
@@ -158,16 +166,18 @@ class Expected:
         kinds: allowed kinds of NumPy's dtypes, one of those above.
         place: whether rows are coordinates [m], all of which must be finite and on Earth.
         optional: whether the array may be absent.
+        field: of the schema that it is read as; None: the one of its name.
     """
 
     shape: tuple[str | int, ...]
     kinds: str = REAL
     place: bool = False
     optional: bool = False
+    field: str | None = None
 
 
-def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> None:
-    """Refuse arrays that do not fit `layout`; a letter's size is that of the first array that has it.
+def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> dict[str, np.ndarray]:
+    """The arrays of `layout` by field of the schema; a letter's size is that of the first array that has it.
 
     Raises:
         DataError: all that is missing, of another shape or type, or no place, with array and row.
@@ -193,6 +203,7 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
                 what = f"expected finite coordinates in metres, none beyond {FARTHEST:.0e}"
                 problems.add_rows(where, rows, what)
     problems.raise_if_any()
+    return {of.field or name: raw.arrays[name] for name, of in layout.items() if name in raw.arrays}
 
 
 def _fits(found: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from gsparc.data.datasets.ble import raw_of_ble
 from gsparc.data.datasets.campaign import Campaign
@@ -15,43 +14,40 @@ from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
+from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
 from gsparc.data.tables import is_table
 
 log = logging.getLogger(__name__)
 
 
-class Own(Campaign):
-    """A file of the schema in docs/own-data.md, or a table; suspicious units are warned of.
+def raw_of_own(
+    path: str | Path,
+    columns: Mapping[str, object] | None = None,
+    stations_file: str | Path | None = None,
+) -> Raw:
+    """Read a file of the schema in docs/own-data.md, or a table under the schema's names; notes are logged.
 
     Args:
-        file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
-        name: of run directories.
+        path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
-        **rest: see `Campaign`.
+
+    Raises:
+        DataError: bad input, or a file of another campaign.
     """
+    raw, notes = raw_of(Path(path), columns, stations_file)
+    campaign = campaign_of(raw)
+    if campaign is not None:
+        raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
+    for note in notes:
+        log.info("%s: %s", path, note)
+    return raw
 
-    def __init__(
-        self,
-        file: str | Path,
-        name: str = "own",
-        columns: Mapping[str, object] | None = None,
-        stations_file: str | Path | None = None,
-        **rest: Any,
-    ) -> None:
-        super().__init__(file, name, **rest)
-        self.columns, self.stations_file = columns or {}, stations_file
 
-    def raw(self) -> Raw:
-        """The file's arrays, or the table's under the schema's names."""
-        raw, notes = raw_of(self.file, self.columns, self.stations_file)
-        campaign = campaign_of(raw)
-        if campaign is not None:
-            raise DataError(f"{self.file}: this is a file of dataset={campaign}; say dataset={campaign}")
-        for note in notes:
-            log.info("%s: %s", self.file, note)
-        return raw
+class Own(Campaign):
+    """Measurements of one's own; suspicious units are warned of. Settings of `raw_of_own` and `Campaign`."""
+
+    choice, reader = "own", staticmethod(raw_of_own)
 
 
 LOADERS: dict[str, Callable[[Path], Raw]] = {
@@ -80,7 +76,7 @@ def read_any(
 
     Args:
         path: folder or file.
-        columns, stations_file: of a table, see `Own`.
+        columns, stations_file: of a table, see `raw_of_own`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
@@ -105,7 +101,7 @@ def read_any(
 
 def raw_of(
     path: Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
-) -> tuple[Raw, tuple[str, ...]]:
+) -> Noted:
     """The arrays of a file of the schema, or of a table, and how its columns were understood.
 
     Raises:
@@ -115,8 +111,7 @@ def raw_of(
         told = any(value is not None for value in (columns or {}).values())
         for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
-        return read_raw(path), ()
+        return Noted(read_raw(path))
     from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
 
-    found = understand_table(path, columns or {}, stations_file)
-    return found.raw, found.notes
+    return understand_table(path, columns or {}, stations_file)

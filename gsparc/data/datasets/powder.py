@@ -22,6 +22,7 @@ import numpy as np
 
 from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
 from gsparc.data.errors import DataError, Problems, shortened
+from gsparc.data.files import read_csv, read_text
 from gsparc.data.raw import Raw, read_raw
 
 CARRIER_HZ = 462.7e6
@@ -35,13 +36,13 @@ TIMES = ("timestamp", "time", "date", "datetime")
 EMPTY = ("", "nan", "none", "null", "na", "n/a")
 SLACK_M = 1.0  # an affine map from degrees to metres is good to centimetres over a campus
 LAYOUT = {
-    "mobile_position": Expected(("S", 2), place=True),
+    "mobile_position": Expected(("S", 2), place=True, field="tx_position"),
     "station_position": Expected(("T", 2), place=True),
     "rssi_db": Expected(("S", "T")),
-    "station": Expected(("T",), TEXT, optional=True),
+    "station": Expected(("T",), TEXT, optional=True, field="station_name"),
     "latitude": Expected(("S",), optional=True),
     "longitude": Expected(("S",), optional=True),
-    "frequency_hz": Expected((), optional=True),
+    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
 }
 
 
@@ -80,19 +81,14 @@ def raw_of_powder(
 
 
 def _of_npz(raw: Raw, path: Path) -> Raw:
-    check_layout(raw, path, LAYOUT)
-    held = raw.arrays
-    arrays = {"rssi_db": held["rssi_db"], "carrier_hz": held.get("frequency_hz", np.array(CARRIER_HZ))}
-    if "station" in held:
-        arrays["station_name"] = held["station"]
-    if "latitude" in held and "longitude" in held:
-        degrees = np.stack([held["latitude"], held["longitude"]], axis=1).astype(np.float64)
-        stations = _degrees_of(held["station_position"], held["mobile_position"], degrees, path)
-        geographic = {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
-        geographic |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
-        return Raw({**arrays, **geographic}, raw.attributes)
-    metric = {"tx_position": held["mobile_position"], "station_position": held["station_position"]}
-    return Raw({**arrays, **metric}, raw.attributes)
+    held = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
+    parts = [held.pop(name) for name in ("latitude", "longitude") if name in held]
+    if len(parts) == 2:
+        degrees = np.stack(parts, axis=1).astype(np.float64)
+        stations = _degrees_of(held.pop("station_position"), held.pop("tx_position"), degrees, path)
+        held |= {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
+        held |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
+    return Raw(held, raw.attributes)
 
 
 def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: Path) -> np.ndarray:
@@ -156,15 +152,8 @@ def _of_csv(path: Path, table: Path) -> Raw:
 
 def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and the other lines with their numbers; blank ones are none."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [
-                (i, cells) for i, cells in enumerate(csv.reader(file), 1) if any(c.strip() for c in cells)
-            ]
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file; expected single_tx.csv of the POWDER release") from None
-    except (UnicodeDecodeError, csv.Error, OSError) as error:
-        raise DataError(f"{path}: not readable as CSV text ({error})") from None
+    found = read_csv(path, "no such file; expected single_tx.csv of the POWDER release")
+    lines = [(i, cells) for i, cells in enumerate(found, 1) if any(c.strip() for c in cells)]
     if len(lines) < 2:
         raise DataError(f"{path}: no rows; expected a header and a line per place")
     return lines[0][1], lines[1:]
@@ -174,24 +163,20 @@ def _numbers(
     path: Path, names: Sequence[str], rows: Sequence[tuple[int, list[str]]], columns: Sequence[int]
 ) -> np.ndarray:
     """Cells (S, len(columns)) float64, NaN where a cell is empty."""
+    import pandas as pd  # here, as it takes half a second
+
     problems = Problems(path)
-    values = np.full((len(rows), len(columns)), np.nan)
-    for row, (line, cells) in enumerate(rows):
-        if len(cells) != len(names):
-            problems.add(f"{path}, line {line}", f"expected {len(names)} cells, found {len(cells)}")
-            continue
-        for k, column in enumerate(columns):
-            text = cells[column].strip()
-            if text.lower() in EMPTY:
-                continue
-            try:
-                values[row, k] = float(text)
-            except ValueError:
-                problems.add(f"{path}, line {line}, {names[column]}", f"expected a number, found {text!r}")
-        if len(problems) > Problems.LIMIT:
-            break
+    for line, cells in [row for row in rows if len(row[1]) != len(names)][: Problems.LIMIT]:
+        problems.add(f"{path}, line {line}", f"expected {len(names)} cells, found {len(cells)}")
     problems.raise_if_any()
-    return values
+    text = np.char.strip(np.array([[cells[column] for column in columns] for _, cells in rows]))
+    values = pd.to_numeric(text.ravel().astype(object), errors="coerce").reshape(text.shape)
+    wrong = np.isnan(values) & ~np.isin(np.char.lower(text), EMPTY)
+    for row, k in np.argwhere(wrong)[: Problems.LIMIT]:
+        where = f"{path}, line {rows[row][0]}, {names[columns[k]]}"
+        problems.add(where, f"expected a number, found {str(text[row, k])!r}")
+    problems.raise_if_any()
+    return np.asarray(values, np.float64)
 
 
 def _check_degrees(
@@ -215,14 +200,8 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
     Raises:
         DataError: missing, not readable, or no pair of degrees.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise DataError(
-            f"{path}: missing; expected the stations' coordinates, name the file with dataset.station_table"
-        ) from None
-    except (UnicodeDecodeError, OSError) as error:
-        raise DataError(f"{path}: not readable as text ({error})") from None
+    expected = "the stations' coordinates, name the file with dataset.station_table"
+    text = read_text(path, f"missing; expected {expected}")
     content = _rows_by_name(path, text) if path.suffix.lower() == ".csv" else _literal(path, text)
     problems, places = Problems(path), {}
     for name, value in content.items():
@@ -269,26 +248,6 @@ def _rows_by_name(path: Path, text: str) -> Mapping[str, Any]:
 
 
 class Powder(Campaign):
-    """Powers of a walking transmitter at fixed stations; see `raw_of_powder`.
+    """Powers of a walking transmitter at fixed stations; settings of `raw_of_powder` and of `Campaign`."""
 
-    Args:
-        file, station_table, tx_height, station_height: see `raw_of_powder`.
-        name: of run directories.
-        **rest: see `Campaign`.
-    """
-
-    def __init__(
-        self,
-        file: str | Path,
-        station_table: str | Path | None = None,
-        tx_height: float = WALKER_M,
-        station_height: float = STATION_M,
-        name: str = "powder",
-        **rest: Any,
-    ) -> None:
-        super().__init__(file, name, **rest)
-        self.station_table, self.heights = station_table, (tx_height, station_height)
-
-    def raw(self) -> Raw:
-        """Powers (S, T) of a moving transmitter at T stations."""
-        return raw_of_powder(self.file, self.station_table, *self.heights)
+    choice, reader = "powder", staticmethod(raw_of_powder)

@@ -8,7 +8,6 @@ train_index.txt, test_index.txt   optional, both or none: one number per line
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +20,8 @@ from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.blocks import empty
 from gsparc.data.datasets.campaign import Release
 from gsparc.data.errors import DataError, Problems
-from gsparc.data.files import read_yaml
+from gsparc.data.files import read_csv, read_text, read_yaml
+from gsparc.data.limits import finite
 from gsparc.data.own_checks import quaternion_to_matrix
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
@@ -46,7 +46,7 @@ def load_rfid(
     *,
     gateway: str | None = None,
     wavelength_m: float = WAVELENGTH,
-    array: np.ndarray | None = None,
+    array: np.ndarray | Mapping[str, Any] | None = None,
     normalisation: str = "max",
 ) -> Measurements:
     """Read a folder in the release's layout; spectra stay uint8 (S, 90, 360).
@@ -55,7 +55,8 @@ def load_rfid(
         root: the folder.
         gateway: which receiver of gateway_info.yml; None takes the first.
         wavelength_m: carrier wavelength [m].
-        array: (M, 3) [m] element positions, receiver frame; None for the release's 4 x 4 array.
+        array: (M, 3) [m] element positions, receiver frame, or arguments of `planar_array`; None for the
+            release's 4 x 4 array.
         normalisation: how the published images were scaled.
 
     Raises:
@@ -73,13 +74,14 @@ def load_rfid(
     assert info is not None and positions is not None and spectra is not None
     count = len(positions)
     simulated = info.dataset == STAND_IN
+    given = {} if array is None else array
+    places = planar_array(**given) if isinstance(given, Mapping) else np.asarray(given, np.float64)
     return assemble(
         name=STAND_IN if simulated else "rfid", stand_in="rfid" if simulated else None,
         kind="spectrum", static_end="rx", tx=positions, rx=np.repeat(info.position[None], count, axis=0),
         rx_rotation=np.repeat(info.rotation[None], count, axis=0), target=spectra,
-        grid=SphereGrid.hemisphere(HEIGHT, WIDTH), normalisation=normalisation,
-        array=planar_array() if array is None else np.asarray(array, dtype=np.float64),
-        carrier_hz=LIGHT / wavelength_m, release_split=release_split,
+        grid=SphereGrid.hemisphere(HEIGHT, WIDTH), normalisation=str(normalisation),
+        array=places, carrier_hz=LIGHT / float(wavelength_m), release_split=release_split,
         row_names=[f"spectrum/{i:05d}.png" for i in range(1, count + 1)],
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
     )  # fmt: skip
@@ -94,22 +96,10 @@ class _Gateway(NamedTuple):
     rotation: np.ndarray
 
 
-def _numbers(value: object, count: int) -> np.ndarray | None:
-    """`value` as (count,) float64, or None when it is anything else than that many finite numbers."""
-    if not isinstance(value, list) or len(value) != count:
-        return None
-    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
-        return None
-    numbers = np.array(value, dtype=np.float64)
-    return numbers if np.isfinite(numbers).all() else None
-
-
 def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gateway | None:
     entry = "entries like `gateway1: {position: [x, y, z], orientation: [x, y, z, w]}`"
-    try:
-        content = read_yaml(path, "the gateway's position and orientation", entry)
-    except DataError as error:
-        problems.extend(error.problems)
+    content = problems.attempt(lambda: read_yaml(path, "the gateway's position and orientation", entry))
+    if content is None:
         return None
     gateways = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
     if not gateways:
@@ -118,12 +108,12 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
     if name not in gateways:
         return problems.add(path, f"no gateway named {name!r}; there are {', '.join(gateways)}")
     given = [gateways[name].get(key) for key in ("position", "orientation")]
-    position, orientation = _numbers(given[0], 3), _numbers(given[1], 4)
-    if position is None:
+    position, orientation = map(finite, given)
+    if position.shape != (3,):
         problems.add(path, f"{name}: position is {given[0]}; expected three finite numbers [m]")
     else:
         check_positions(problems, str(path), position[None], [f"{name}: position"])
-    if orientation is None:
+    if orientation.shape != (4,):
         expected = "expected a quaternion of four finite numbers (x, y, z, w)"
         return problems.add(path, f"{name}: orientation is {given[1]}; {expected}")
     try:
@@ -131,18 +121,15 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
     except ValueError as error:
         return problems.add(path, f"{name}: orientation: {error}")
     dataset = str(content.get("dataset_name", "unnamed"))
-    return None if position is None else _Gateway(dataset, name, position, rotation)
+    return _Gateway(dataset, name, position, rotation)
 
 
 def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     """Tag positions (S, 3) float64 [m]."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except FileNotFoundError:
-        return problems.add(path, "missing; expected a header x,y,z and one row per spectrum")
-    except (UnicodeDecodeError, csv.Error, OSError) as error:
-        return problems.add(path, f"not readable as CSV text ({error})")
+    missing = "missing; expected a header x,y,z and one row per spectrum"
+    rows = problems.attempt(lambda: read_csv(path, missing))
+    if rows is None:
+        return None
     while rows and not any(cell.strip() for cell in rows[-1]):
         rows.pop()
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
@@ -220,13 +207,12 @@ def _read_split(root: Path, count: int | None, problems: Problems) -> tuple[np.n
 
 
 def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray | None:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except (UnicodeDecodeError, OSError) as error:
-        return problems.add(path, f"not readable as text ({error})")
+    text = problems.attempt(lambda: read_text(path, "missing"))
+    if text is None:
+        return None
     rows: list[int] = []
     first_line: dict[int, int] = {}
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         text = line.strip().removesuffix(".png")
         if not text:
             continue
@@ -248,33 +234,9 @@ def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray
 
 
 class RFID(Release):
-    """The RFID release (NeRF2, set s23) or any folder in its layout.
+    """The RFID release (NeRF2, set s23) or any folder in its layout; settings of `load_rfid`, `Release`."""
 
-    Args:
-        root, name, **rest: see `Release`.
-        array: rows, columns and spacing_m of the receiver's array, see `planar_array`; None: the release's.
-        gateway, wavelength_m, normalisation: see `load_rfid`.
-    """
-
-    called = "RFID"
-
-    def __init__(
-        self,
-        root: str | Path | None = None,
-        gateway: str | None = None,
-        wavelength_m: float = WAVELENGTH,
-        array: Mapping[str, Any] | None = None,
-        normalisation: str = "max",
-        name: str = "rfid",
-        **rest: Any,
-    ) -> None:
-        super().__init__(root, name, **rest)
-        self.settings: dict[str, Any] = {
-            "gateway": gateway,
-            "wavelength_m": float(wavelength_m),
-            "array": planar_array(**array) if array else None,
-            "normalisation": str(normalisation),
-        }
+    called, reader = "RFID", staticmethod(load_rfid)
 
     def missing(self) -> str:
         """See `Release`."""
@@ -289,4 +251,4 @@ class RFID(Release):
 
     def read(self, folder: Path) -> Measurements:
         """Spectra (S, 90, 360) uint8 of tags that move about a static gateway; stand-ins have no settings."""
-        return load_rfid(folder, **(self.settings if folder == self.root else {}))
+        return super().read(folder) if folder == self.root else load_rfid(folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -11,11 +10,9 @@ import numpy as np
 
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
-from gsparc.data.own import interpret
+from gsparc.data.own import interpreted
 from gsparc.data.raw import Raw, read_raw, renamed
 from gsparc.data.schema import Measurements
-
-log = logging.getLogger(__name__)
 
 TARGETS = ("spectrum", "csi", "rssi")
 STORED = {"spectrum": "spectrum", "csi": "csi", "rssi": "received_power"}  # array that a target is read from
@@ -81,10 +78,7 @@ def _load(path: str | Path, target: str | None) -> Measurements:
     held = [name for name in TARGETS if STORED[name] in raw.arrays]
     if target not in held:
         raise DataError(f"dataset.target={target}: {path} holds {' and '.join(held)}")
-    reading = interpret(read_as(raw, target), path)
-    for note in reading.notes:
-        log.warning("%s: %s", path, note)
-    return reading.data
+    return interpreted(read_as(raw, target), path)
 
 
 def read_as(raw: Raw, target: str) -> Raw:

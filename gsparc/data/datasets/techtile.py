@@ -20,14 +20,14 @@ import numpy as np
 from gsparc.data.datasets.campaign import COMPLEX, FLAGS, LABELS, TEXT, Campaign, Expected, check_layout
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
-from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf, read_raw, renamed
+from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf, read_raw
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
 CHANNEL = 1  # of the two antennas of a tile, the one that received
 ANTENNAS = "techtile_antenna_locations.yml"
 NPZ = {
     "tx_position": Expected(("S", 3), place=True),
-    "rx_antenna_position": Expected(("T", 3), place=True),
+    "rx_antenna_position": Expected(("T", 3), place=True, field="station_position"),
     "csi": Expected(("S", "T"), COMPLEX),
     "frequency_hz": Expected(()),
     "mask": Expected(("S", "T"), FLAGS, optional=True),
@@ -69,10 +69,8 @@ def raw_of_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw
     if path.suffix.lower() in NETCDF_SUFFIXES:
         return _of_release(_with_experiments(read_netcdf(path), path), path, antennas)
     raw = read_raw(path)
-    check_layout(raw, path, NPZ)
-    known = Raw({name: raw.arrays[name] for name in NPZ if name in raw.arrays})
-    named = renamed(known, {"rx_antenna_position": "station_position"})
-    return Raw(named.arrays, {"name": "techtile", **raw.attributes, "layout": "techtile"})
+    about = {"name": "techtile", **raw.attributes, "layout": "techtile"}
+    return Raw(check_layout(raw, path, NPZ), about)
 
 
 def _with_experiments(raw: Raw, path: Path) -> Raw:
@@ -94,8 +92,7 @@ def _with_experiments(raw: Raw, path: Path) -> Raw:
 
 
 def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
-    check_layout(raw, path, RELEASE)
-    held = raw.arrays
+    held = check_layout(raw, path, RELEASE)
     hosts = held["hostname"].astype(str)
     places = held.get("rx_antenna_position")
     if places is None:
@@ -165,21 +162,6 @@ def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
 
 
 class Techtile(Campaign):
-    """Channels of a moving transmitter at 42 ceiling antennas; see `raw_of_techtile`.
+    """Channels of a moving transmitter at 42 antennas; settings of `raw_of_techtile` and of `Campaign`."""
 
-    Args:
-        file: *.npz, or the release's *.nc.
-        antennas: places of the antennas of a NetCDF file; None: `techtile_antenna_locations.yml` beside it.
-        name: of run directories.
-        **rest: see `Campaign`.
-    """
-
-    def __init__(
-        self, file: str | Path, antennas: str | Path | None = None, name: str = "techtile", **rest: Any
-    ) -> None:
-        super().__init__(file, name, **rest)
-        self.antennas = antennas
-
-    def raw(self) -> Raw:
-        """Channels (S, T) of a moving transmitter at T stations."""
-        return raw_of_techtile(self.file, self.antennas)
+    choice, reader = "techtile", staticmethod(raw_of_techtile)

@@ -13,13 +13,13 @@ import numpy as np
 from gsparc.data.blocks import is_big
 from gsparc.data.checks.plausibility import degree_warnings
 from gsparc.data.links.georeference import Georeference, bad_degrees
-from gsparc.data.links.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
+from gsparc.data.links.stations import by_carrier, ends_of, numbered, station_of_row, station_table
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
-from gsparc.data.schema import End, Links
+from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links
+from gsparc.data.selection import rows_of
 
 POWERS = ("rssi", "rssi_db")
-PER_ROW = ("noise_variance", "rx_orientation", "rx_rotation", "run", "row_name", "received_power")
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 STATION_FIELDS = ("station", "station_position", "station_name", "station_orientation", "sensitivity_db")
 
@@ -102,7 +102,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         assert which is not None
         links = Links(OTHER[moving], stations, which, place, run=run)
     else:
-        check.raw = _unrolled(check.raw, measured, moving, count)
+        check.raw = _unrolled(check.raw, measured, count)
         links = Links(
             OTHER[moving], stations, np.tile(np.arange(count), rows), np.repeat(place, count),
             run=None if run is None else np.repeat(run, count),
@@ -119,20 +119,15 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     return _valid(check, measured, links, of_level, count)  # type: ignore[arg-type]
 
 
-def _unrolled(raw: Raw, measured: str, moving: End, count: int) -> Raw:
+def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
     """Rows of a wide file, one for each station."""
-    arrays = dict(raw.arrays)
-    rows = len(arrays[measured])
-    for name in (measured, "mask"):
-        if name in arrays and arrays[name].shape[:2] == (rows, count):
-            arrays[name] = arrays[name].reshape(rows * count, *arrays[name].shape[2:])
-    for name in (f"{moving}_position", *PER_ROW):
-        if name in arrays and arrays[name].ndim and len(arrays[name]) == rows:
-            arrays[name] = np.repeat(arrays[name], count, axis=0)
-    for name in ("split_train", "split_test"):
-        if name in arrays and arrays[name].ndim == 1 and arrays[name].dtype.kind in "iu":
-            arrays[name] = (arrays[name][:, None] * count + np.arange(count)).reshape(-1)
-    return replace(raw, arrays=arrays)
+    rows = len(raw.arrays[measured])
+    wide = {name: raw.arrays[name] for name in (measured, "mask") if name in raw.arrays}
+    for name, array in wide.items():
+        if array.shape[:2] == (rows, count):
+            wide[name] = array.reshape(rows * count, *array.shape[2:])
+    other = {name: array for name, array in raw.arrays.items() if name not in (*MEASUREMENTS, "mask")}
+    return replace(raw, arrays=rows_of(other, np.repeat(np.arange(rows), count), rows, count) | wide)
 
 
 def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
@@ -186,7 +181,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
         _note_lost(check, measured, links, keep, censored)
-        _keep(check.raw, measured, keep)
+        arrays.update(rows_of(arrays, np.flatnonzero(keep), len(keep)))
         parts = {name: getattr(links, name) for name in ("station", "place", "run")}
         pick = {name: value[keep] for name, value in parts.items() if value is not None}
         links = replace(links, **pick)
@@ -195,23 +190,6 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         arrays["mask"] = ~censored if "mask" not in arrays else arrays["mask"].astype(bool) & ~censored
         return replace(links, censored=censored)
     return links
-
-
-def _keep(raw: Raw, measured: str, keep: np.ndarray) -> None:
-    """Drop rows, and renumber those that a split names."""
-    arrays, rows = raw.arrays, len(keep)
-    number = np.cumsum(keep) - 1
-    for name in ("split_train", "split_test"):
-        if name in arrays and arrays[name].dtype.kind in "iu" and arrays[name].ndim == 1:
-            index = arrays[name]
-            index = index[(index >= 0) & (index < rows)]
-            arrays[name] = number[index[keep[index]]]
-    for name in (measured, "mask", "rx_position", "tx_position", *PER_ROW):
-        array = arrays.get(name)
-        if array is None or array.ndim == 0 or len(array) != rows:
-            continue
-        if array.ndim > 1 or not name.endswith("_position"):
-            arrays[name] = array[keep]
 
 
 def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:

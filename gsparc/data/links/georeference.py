@@ -58,13 +58,12 @@ class Georeference:
         Raises:
             DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
         """
-        latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
         fault = bad_degrees(latitude, longitude)
         if fault is not None:
             raise DataError(fault)
-        there = np.broadcast_arrays(longitude, latitude)
-        east, north = (np.full(there[0].shape, v) for v in (self.longitude, self.latitude))
-        azimuth, _, distance = _WGS84.inv(east, north, there[0], there[1])
+        there = np.atleast_1d(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
+        places = [np.array(v) for v in np.broadcast_arrays(self.longitude, self.latitude, *there)]
+        azimuth, _, distance = _WGS84.inv(places[0], places[1], places[2], places[3])
         angle = np.radians(azimuth)
         return np.stack([distance * np.sin(angle), distance * np.cos(angle)], axis=-1)
 

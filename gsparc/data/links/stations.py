@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker, is_unit, quaternion_to_matrix
-from gsparc.data.schema import End, Links, Stations
+from gsparc.data.schema import ENDS, OTHER, End, Links, Stations
 
-OTHER: dict[End, End] = {"rx": "tx", "tx": "rx"}
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 
 
@@ -52,8 +51,7 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
     table, which = places[few]
     if len(table) * LINKS_PER_STATION > len(rx) or len(table) * 2 > len(places[OTHER[few]][0]):
         return Links(None, run=run)
-    end = "transmitter" if few == "tx" else "receiver"
-    check.notes.append(f"the {end} stands at {len(table)} places: taken as {len(table)} stations")
+    check.notes.append(f"the {ENDS[few]} stands at {len(table)} places: taken as {len(table)} stations")
     stations = Stations(table, tuple(str(i) for i in range(len(table))))
     moving = rx if few == "tx" else tx
     return Links(few, stations, which.reshape(-1).astype(np.int64), numbered(moving), run=run)

@@ -10,7 +10,9 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
+from gsparc.data.errors import some
 from gsparc.data.tables.heads import (
     AXES,
     END_WORDS,
@@ -33,6 +35,12 @@ from gsparc.data.tables.sheet import Sheet
 
 LEVELS = ("rssi_db", "rssi")
 CHANNELS = ("csi_re", "csi_im")
+MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS)
+# Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
+ONE_OF = (
+    MEASURED,
+    *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS),
+)
 # Beside the word for a level: which radio, antenna or cell it is of.
 PLAIN = {
     *("wifi", "wlan", "lte", "nr", "5g", "gsm", "umts", "ble", "bluetooth", "lora", "zigbee"),
@@ -45,24 +53,18 @@ REPEATED = 4  # rows for each name of a column that may hold stations
 
 
 @dataclass(frozen=True)
-class Column:
+class Column(Head):
     """A column, or a number that stands for one.
 
     Attributes:
-        role: one of `heads.KINDS`.
         head: of the column; None for a number.
-        label: name of a station or number of a frequency, where there are several.
-        unit: None for the schema's.
         value: the number, or the first and the last of evenly spaced ones.
-        word: what in the head was recognised; empty where the column was said.
+        **rest: see `Head`; no unit is the schema's, no word a column that was said.
     """
 
-    role: str
-    head: str | None
-    label: str = ""
-    unit: Unit | None = None
+    role: str = ""
+    head: str | None = None
     value: tuple[float, ...] = ()
-    word: str = ""
 
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
         """(S,) float64 in the schema's unit, NaN where there is no value; None, and noted, where unusable."""
@@ -93,11 +95,9 @@ def choose(
     chosen: Chosen = {}
     labelled = set(labelled)
     for key, value in said.items():
-        if value is not None:
-            role = OTHER_NAMES.get(key, key)
-            columns = _said(sheet, key, role, value)
-            if columns:
-                chosen[role] = columns
+        columns = () if value is None else _said(sheet, key, value)
+        if columns:
+            chosen[columns[0].role] = columns
     if sheet.problems:
         return chosen, []
     taken = {column.head for columns in chosen.values() for column in columns}
@@ -106,36 +106,25 @@ def choose(
         found = understand(head) if head and head not in taken else Head()
         if head not in taken and head in labelled:
             found = Head("rssi_db", label=head, word="station")
-        if (
-            found.role is None
-            or (only is not None and found.role not in only)
-            or _settled(found.role, chosen)
-        ):
+        role = found.role
+        if not role or (only is not None and role not in only) or _settled(role, chosen):
             continue
         if found.strange:
-            sheet.refuse(
-                f"[{found.strange}] is no known unit; expected one of {known(KINDS[found.role])}", head
-            )
-        guesses.setdefault(found.role, []).append(
-            Column(found.role, head, found.label, found.unit, word=found.word)
-        )
-    _one_measurement(sheet, guesses)
-    for end in ENDS:
-        _one_system(sheet, guesses, end)
+            sheet.refuse(f"[{found.strange}] is no known unit; expected one of {known(KINDS[role])}", head)
+        guesses.setdefault(role, []).append(Column(**vars(found), head=head))
+    _one_way(sheet, guesses)
     notes = []
     for role, candidates in guesses.items():
         one_each = role in CHANNELS or "station" not in {**chosen, **guesses}  # of a row: tones, or stations
-        several = role in MANY and len(candidates) > 1 and one_each
-        several &= (
-            all(column.label for column in candidates) and len({column.word for column in candidates}) == 1
-        )
+        several = role in MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
+        several &= len({column.word for column in candidates}) == 1
         exact = [column for column in candidates if column.head == role]
         if len(candidates) > 1 and not several and not exact:
             _ambiguous(sheet, role, candidates)
             continue
         if role in LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled):
-            fault = "a received level or power, or something else? if it is one, say dataset.columns."
-            sheet.refuse(f"{fault}{role}={candidates[0].head}", candidates[0].head or "")
+            fault = "a received level or power, or something else? if it is one, say "
+            sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
             continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact:
@@ -147,8 +136,7 @@ def choose(
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head and head not in used]
     if unused:
-        more = f" and {len(unused) - 8} more" if len(unused) > 8 else ""
-        notes.append(f"not used: column{'s' * (len(unused) > 1)} {', '.join(unused[:8])}{more}")
+        notes.append(f"not used: column{'s' * (len(unused) > 1)} {some(unused, 8)}")
     if "station" not in chosen and not any(columns[0].label for columns in chosen.values()):
         notes += _perhaps_stations(sheet, used)
     return chosen, notes
@@ -157,9 +145,8 @@ def choose(
 def _perhaps_stations(sheet: Sheet, used: Container[str | None]) -> list[str]:
     """Columns that repeat few words and are called an end: without them all transmitters would be one."""
     found = []
-    for head in (head for head in sheet.heads if head and head not in used):
-        if not set(words_of(head)) & set(END_WORDS):
-            continue
+    ends = [head for head in sheet.heads if head not in used and set(words_of(head)) & set(END_WORDS)]
+    for head in ends:
         distinct = len(set(sheet.words(head).tolist()) - {""})
         if 2 <= distinct <= len(sheet) // REPEATED:
             found.append(
@@ -169,8 +156,8 @@ def _perhaps_stations(sheet: Sheet, used: Container[str | None]) -> list[str]:
     return found
 
 
-def _said(sheet: Sheet, key: str, role: str, value: object) -> tuple[Column, ...]:
-    where = f"dataset.columns.{key}={value}"
+def _said(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
+    role, where = OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
     if role not in KINDS:
         close = difflib.get_close_matches(key, [*KINDS, *OTHER_NAMES], 1, 0.4)
         hint = f"; did you mean {close[0]}?" if close else f"; known are {', '.join(KINDS)}"
@@ -178,7 +165,7 @@ def _said(sheet: Sheet, key: str, role: str, value: object) -> tuple[Column, ...
     text = str(value).strip()
     head = _head(sheet, text)
     if head is not None:
-        return (Column(role, head, unit=_unit(head, role)),)
+        return (Column(role, unit=_unit(head, role), head=head),)
     if "*" in text and role in MANY:
         heads = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
         before, _, after = text.partition("*")
@@ -186,25 +173,17 @@ def _said(sheet: Sheet, key: str, role: str, value: object) -> tuple[Column, ...
         if heads and "*" not in after:
             labels = [unit_of(label)[0].strip() for label in labels]
             pairs = zip(heads, labels, strict=True)
-            return tuple(Column(role, h, label, _unit(h, role)) for h, label in pairs)
+            return tuple(Column(role, label, _unit(h, role), head=h) for h, label in pairs)
         fault = "expected one * only" if "*" in after else "no column is called so"
         return sheet.problems.add(where, fault) or ()
-    numbers = tuple(_number(part) for part in text.split(":"))
+    numbers = tuple(pd.to_numeric(np.array(text.split(":"), object), errors="coerce").tolist())
     constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
-        return (Column(role, None, value=numbers),)
+        return (Column(role, value=numbers),)
     close = difflib.get_close_matches(text.lower(), [h.lower() for h in sheet.heads], 1, 0.4)
     near = next((h for h in sheet.heads if close and h.lower() == close[0]), None)
-    there = ", ".join(repr(h) for h in sheet.heads[:8] if h)
-    hint = f"; did you mean {near!r}?" if near else f"; there are {there}"
+    hint = f"; did you mean {near!r}?" if near else f"; there are {sheet.first_heads()}"
     return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 def _head(sheet: Sheet, text: str) -> str | None:
@@ -225,47 +204,24 @@ def _unit(head: str, role: str) -> Unit | None:
 
 def _settled(role: str, said: Chosen) -> bool:
     """Whether what was said leaves no room for a guess of `role`."""
-    if role in said:
-        return True
-    measurements = (*LEVELS, *CHANNELS)
-    if role in measurements and any(name in said for name in measurements):
-        partner = {"csi_re": "csi_im", "csi_im": "csi_re"}.get(role)
-        return partner not in said
-    for end in ENDS:
-        metres, degrees = _systems(end)
-        for here, other in ((metres, degrees), (degrees, metres)):
-            if role in here and any(name in said for name in other):
-                return True
-    return False
+    other = [way for ways in ONE_OF if role in sum(ways, ()) for way in ways if role not in way]
+    return role in said or any(name in said for way in other for name in way)
 
 
-def _systems(end: str) -> tuple[tuple[str, str], tuple[str, str]]:
-    return (f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")
-
-
-def _one_system(sheet: Sheet, guesses: dict[str, list[Column]], end: str) -> None:
-    """Refuse an end that has both metres and degrees."""
-    metres, degrees = ([c for r in roles for c in guesses.get(r, ())] for roles in _systems(end))
-    if metres and degrees:
-        fault = (
-            f"{_names(metres)} and {_names(degrees)} both say where; say dataset.columns.{metres[0].role}="
-        )
-        fault += f"{metres[0].head} or dataset.columns.{degrees[0].role}={degrees[0].head}"
-        sheet.refuse(fault)
-        for column in (*metres, *degrees):
-            guesses.pop(column.role, None)
-
-
-def _one_measurement(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
-    """Refuse columns of several measurements: levels and powers, or powers and channels."""
-    found = [guesses[name] for name in (*LEVELS, "csi_re") if name in guesses]
-    if len(found) < 2:
-        return
-    first = [columns[0] for columns in found]
-    choices = " or ".join(f"dataset.columns.{c.role}={c.head}" for c in first)
-    sheet.refuse(f"{_names(first)} are different measurements; say {choices}")
-    for name in (*LEVELS, *CHANNELS):
-        guesses.pop(name, None)
+def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
+    """Refuse several measurements (levels, powers, channels), and an end that has both metres and degrees."""
+    for ways in ONE_OF:
+        found = [[column for role in way for column in guesses.get(role, ())] for way in ways]
+        found = [columns for columns in found if columns]
+        if len(found) < 2:
+            continue
+        first = [columns[0] for columns in found]
+        fault = f"{' and '.join(map(_names, found))} both say where"
+        if ways is MEASURED:
+            fault = f"{_names(first)} are different measurements"
+        sheet.refuse(f"{fault}; say {' or '.join(map(_choice, first))}")
+        for role in sum(ways, ()):
+            guesses.pop(role, None)
 
 
 def _is_plain(column: Column, stations: Container[str]) -> bool:
@@ -289,11 +245,15 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
             sheet.refuse(f"{said}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
 
 
+def _choice(column: Column) -> str:
+    """The setting that says what a column is."""
+    return f"dataset.columns.{column.role}={column.head}"
+
+
 def _ambiguous(sheet: Sheet, role: str, columns: list[Column]) -> None:
-    choice = f"dataset.columns.{role}={columns[0].head}"
     stations = role in LEVELS and all(c.label for c in columns)
     more = f", or dataset.columns.{role}='NAME_*' where they are stations" if stations else ""
-    sheet.refuse(f"{_names(columns)} could each be {role}; say which: {choice}{more}")
+    sheet.refuse(f"{_names(columns)} could each be {role}; say which: {_choice(columns[0])}{more}")
 
 
 def _names(columns: Iterable[Column]) -> str:

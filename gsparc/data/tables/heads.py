@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -124,10 +124,10 @@ def understand(text: str) -> Head:
         last = UNITS[words[-1]]
         cut = re.sub(rf"[\W_]*{re.escape(words[-1])}\W*$", "", plain, flags=re.IGNORECASE)
         found = _role(words[:-1], last, cut)
-        if found.role is not None and suits(found.role, last):
+        if found.role and suits(found.role, last):
             return found
     found = _role(words, unit, plain)
-    return Head(found.role, found.label, unit, found.word, strange)
+    return replace(found, unit=unit, strange=strange)
 
 
 def suits(role: str, unit: Unit) -> bool:

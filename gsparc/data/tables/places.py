@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -122,11 +122,13 @@ class StationList:
         names: (T,).
         places: (T,).
         extra: (T,) arrays by name: `sensitivity_db`, `carrier_hz`.
+        index: (S,) which station each row of another table is of; None where each has a column there.
     """
 
     names: tuple[str, ...]
     places: Places
-    extra: dict[str, np.ndarray]
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
+    index: np.ndarray | None = None
 
 
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:

@@ -6,13 +6,15 @@ import difflib
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from gsparc.data.raw import Raw
+from gsparc.data.errors import nearest
+from gsparc.data.raw import Noted, Raw
+from gsparc.data.schema import ENDS
 from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
 from gsparc.data.tables.places import (
     PER_STATION,
@@ -28,19 +30,6 @@ from gsparc.data.tables.sheet import Sheet, sheet_of
 log = logging.getLogger(__name__)
 
 NOTHING: Mapping[str, object] = {}
-
-
-@dataclass(frozen=True)
-class Table:
-    """What a table holds.
-
-    Attributes:
-        raw: arrays named as in the schema.
-        notes: what was guessed or converted, one line each.
-    """
-
-    raw: Raw
-    notes: tuple[str, ...]
 
 
 def read_table(
@@ -65,7 +54,7 @@ def read_table(
 
 def understand_table(
     path: str | Path, columns: Mapping[str, object] = NOTHING, stations_file: str | Path | None = None
-) -> Table:
+) -> Noted:
     """As `read_table`, with the notes."""
     sheet, notes = sheet_of(path)
     listed = None
@@ -82,20 +71,10 @@ def understand_table(
     level = chosen["rssi_db"][0] if "rssi_db" in chosen else None
     about = {} if level is None or level.unit is None else {"level_unit": schema_unit(level)}
     about |= {"level_unit": "dBW"} if "rssi" in chosen else {}
-    return Table(Raw(arrays, about), (*notes, *guessed, *builder.notes))
+    return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
-ENDS = {"rx": "receiver", "tx": "transmitter"}
 HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
-
-
-@dataclass(frozen=True)
-class _Stations:
-    """Names (T,), station of each row (S,) or None in the wide layout, and places (T,)."""
-
-    names: tuple[str, ...]
-    index: np.ndarray | None
-    places: Places
 
 
 class Builder:
@@ -125,10 +104,8 @@ class Builder:
         """Add the measurement; its quantity."""
         role = next((name for name in (*LEVELS, *CHANNELS) if name in self.chosen), None)
         if role is None:
-            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
-            return self.refuse(
-                f"no column of levels, powers or channels among {heads}; say dataset.columns.rssi_db=COLUMN"
-            )
+            fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
+            return self.refuse(f"{fault}; say dataset.columns.rssi_db=COLUMN")
         if role in CHANNELS:
             self._channels()
             return role
@@ -191,10 +168,8 @@ class Builder:
         if self.sheet.problems:
             return
         if not found:
-            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
-            return self.refuse(
-                f"no coordinates among {heads}; say dataset.columns.x=COLUMN and .y, or .latitude, .longitude"
-            )
+            fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
+            return self.refuse(f"{fault}, or .latitude, .longitude")
         if len(found) == 3:
             return self.refuse(
                 "coordinates of rx, of tx and of an end without a name; expected two ends, rename one"
@@ -229,7 +204,7 @@ class Builder:
             named = ["tx_"]
         return named[0][:2], found.pop(named[0])
 
-    def _stations(self, measured: str | None, found: dict[str, Places]) -> _Stations | None:
+    def _stations(self, measured: str | None, found: dict[str, Places]) -> StationList | None:
         """The stations, where there are; an end that is their place is taken out of `found`."""
         where = places(self.sheet, self.chosen, "station_")
         labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
@@ -257,7 +232,7 @@ class Builder:
         names = tuple(map(str, distinct))
         if where is not None:
             each = one_each(self.sheet, where, index, names)
-            return None if each is None else _Stations(names, index, each)
+            return None if each is None else StationList(names, each, index=index)
         if self.sheet.problems:
             return None
         ends = [end for end in ("tx_", "rx_") if end in found] if len(found) > 1 else []
@@ -265,7 +240,7 @@ class Builder:
             each = one_each(self.sheet, found[end], index, names, ask=True)
             if each is not None:
                 found.pop(end)
-                return _Stations(names, index, each)
+                return StationList(names, each, index=index)
         if ends:
             one_each(self.sheet, found[ends[0]], index, names)
             return None
@@ -273,11 +248,11 @@ class Builder:
             nowhere = np.full((len(names), 3), np.nan)
             degrees = next(iter(found.values())).degrees
             self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
-            return _Stations(names, index, Places(nowhere[:, :2], nowhere[:, 2], degrees))
+            return StationList(names, Places(nowhere[:, :2], nowhere[:, 2], degrees), index=index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
 
-    def _wide(self, labels: tuple[str, ...], where: Places | None) -> _Stations | None:
+    def _wide(self, labels: tuple[str, ...], where: Places | None) -> StationList | None:
         if self.listed is None:
             hint = "in one place for all columns" if where is not None else "without places"
             return self.refuse(
@@ -292,15 +267,12 @@ class Builder:
                 self.refuse(f"no column of the listed station {name!r}, but {head!r}; the same?")
         if self.sheet.problems:
             return None
-        if silent:
-            self.notes.append(
-                f"listed, but without a column: {', '.join(silent[:8])}{', ...' * (len(silent) > 8)}"
-            )
+        self._note_silent("without a column", silent)
         order = np.array([self.listed.names.index(label) for label in labels])
         for role in PER_STATION:
             if role in self.listed.extra:
                 self.arrays[role] = self.listed.extra[role][order]
-        return _Stations(labels, None, self.listed.places.take(order))
+        return StationList(labels, self.listed.places.take(order))
 
     def _all_listed(self, words: np.ndarray, head: str | None) -> None:
         """Refuse names that the list of stations does not have."""
@@ -308,21 +280,23 @@ class Builder:
         for word in dict.fromkeys(words[words != ""].tolist()):
             if word in self.listed.names:
                 continue
-            close = difflib.get_close_matches(word, self.listed.names, 1, 0.5)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
+            hint = nearest(word, self.listed.names)
             place = "the heads"
             if head is not None:
                 place = f"column {head!r}, {self.sheet.rows[int(np.argmax(words == word))]}"
             self.sheet.problems.add(f"{self.sheet.source}, {place}", f"{word!r} is no listed station{hint}")
 
-    def _by_list(self, words: np.ndarray) -> _Stations:
+    def _by_list(self, words: np.ndarray) -> StationList:
         assert self.listed is not None
         index = pd.Index(self.listed.names).get_indexer(words)
         self.arrays |= self.listed.extra
-        silent = [name for i, name in enumerate(self.listed.names) if i not in set(index.tolist())]
-        if silent:
-            self.notes.append(f"listed, but in no row: {', '.join(silent[:8])}{', ...' * (len(silent) > 8)}")
-        return _Stations(self.listed.names, index, self.listed.places)
+        heard = set(index.tolist())
+        self._note_silent("in no row", [n for i, n in enumerate(self.listed.names) if i not in heard])
+        return replace(self.listed, index=index)
+
+    def _note_silent(self, where: str, names: list[str]) -> None:
+        if names:
+            self.notes.append(f"listed, but {where}: {', '.join(names[:8])}{', ...' * (len(names) > 8)}")
 
     def _second_in_degrees(self, found: dict[str, Places]) -> Places | None:
         """Of two ends in degrees, the one with fewer places, which are then stations."""
@@ -331,7 +305,7 @@ class Builder:
         few = min(found, key=lambda end: len(np.unique(found[end].all(), axis=0)))
         return found.pop(few)
 
-    def _unnamed(self, where: Places) -> _Stations | None:
+    def _unnamed(self, where: Places) -> StationList | None:
         """Stations told apart by their places alone."""
         values, index = np.unique(where.all(), axis=0, return_inverse=True)
         if len(values) > max(1, len(self.sheet) // 2):
@@ -339,9 +313,10 @@ class Builder:
                 f"{len(values)} places of stations in {len(self.sheet)} rows; stations stay where they are"
             )
         each = Places(values[:, :2], values[:, 2] if values.shape[1] > 2 else None, where.degrees)
-        return _Stations(tuple(f"station {i}" for i in range(len(values))), index.reshape(-1), each)
+        names = tuple(f"station {i}" for i in range(len(values)))
+        return StationList(names, each, index=index.reshape(-1))
 
-    def _add_stations(self, stations: _Stations, degrees: bool) -> None:
+    def _add_stations(self, stations: StationList, degrees: bool) -> None:
         if stations.places.degrees != degrees:
             words = ("degrees", "metres") if degrees else ("metres", "degrees")
             return self.refuse(

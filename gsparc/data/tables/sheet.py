@@ -45,6 +45,10 @@ class Sheet:
     def __len__(self) -> int:
         return len(self.rows)
 
+    def first_heads(self) -> str:
+        """The first heads, for messages."""
+        return ", ".join(repr(head) for head in self.heads[:8] if head)
+
     def where(self, head: str) -> str:
         """How messages name a column."""
         return f"{self.source}, column {head!r}"
@@ -142,13 +146,7 @@ OTHERS = {
 }
 
 
-@dataclass(frozen=True)
-class _Lines:
-    """Lines with something in them, and their numbers from 1."""
-
-    text: list[str]
-    number: list[int]
-    comment_before: str  # the last comment before the first of them
+Lines = dict[int, str]  # those with something in them, by their numbers from 1
 
 
 def read_text(path: Path) -> tuple[Sheet, list[str]]:
@@ -161,17 +159,19 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     text, encoding = _decoded(path)
     if encoding != "UTF-8":
         notes.append(f"read as {encoding}")
-    lines = _lines(text)
-    if not lines.text:
+    lines, comment = _lines(text)
+    if not lines:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
-    said = re.fullmatch(r"sep=(.)", lines.text[0].strip())
+    said = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
     if said:  # Excel's own hint
-        lines = _Lines(lines.text[1:], lines.number[1:], "")
-    delimiter = said[1] if said else _delimiter(lines)
-    if delimiter is None or not lines.text:
-        fault = f"line 1 ({lines.text[0][:40]!r}) is a single column" if lines.text else "no heads"
+        del lines[min(lines)]
+        comment = ""
+    delimiter = said[1] if said else _delimiter(list(lines.values()), comment)
+    if delimiter is None or not lines:
+        fault = f"line 1 ({lines[min(lines)][:40]!r}) is a single column" if lines else "no heads"
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
-    lines, dropped = _without_comments(_with_heads(lines, delimiter, source), delimiter, source)
+    lines = _with_heads(lines, comment, delimiter, source)
+    lines, dropped = _without_comments(lines, delimiter, source)
     notes += dropped
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
@@ -180,15 +180,14 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
             where = f"columns {heads.index(head) + 1} and {i + 1}"
             raise DataError(f"{source}: {where} are both named {head!r}; rename one")
     if not rows:
-        raise DataError(f"{source}: line {lines.number[0]} names columns, but there are no rows below it")
+        raise DataError(f"{source}: line {min(lines)} names columns, but there are no rows below it")
     frame = pd.DataFrame(rows, dtype=object)
-    decimal = "." if delimiter == "," and not _quoted_decimals(text, frame) else _decimal(frame)
+    decimal, said_so = _decimal(text, frame, delimiter)
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
-    if decimal == ",":
-        notes.append("decimal commas" + _perhaps_thousands(frame))
+    notes += said_so
     columns = tuple(frame[i] for i in range(len(heads)))
-    return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines.number[1:]), decimal), notes
+    return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines)[1:], decimal), notes
 
 
 def _decoded(path: Path) -> tuple[str, str]:
@@ -213,9 +212,9 @@ def _decoded(path: Path) -> tuple[str, str]:
         return content.decode("cp1252", errors="replace"), "Windows-1252, as it is not UTF-8"
 
 
-def _lines(text: str) -> _Lines:
-    found: list[str] = []
-    numbers: list[int] = []
+def _lines(text: str) -> tuple[Lines, str]:
+    """The lines, and the last comment before the first of them."""
+    found: Lines = {}
     comment = ""
     # Not str.splitlines, which also ends lines at characters that may stand in a cell.
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
@@ -223,9 +222,8 @@ def _lines(text: str) -> _Lines:
         if stripped.startswith(COMMENTS) and not found:
             comment = stripped.lstrip("#%/ ")
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
-            found.append(line)
-            numbers.append(number)
-    return _Lines(found, numbers, comment)
+            found[number] = line
+    return found, comment
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -236,13 +234,13 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
 
 
-def _delimiter(lines: _Lines) -> str | None:
+def _delimiter(lines: list[str], comment: str) -> str | None:
     """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
     best: tuple[bool, float, int, str] | None = None
-    sample = lines.text[:LOOKED_AT]
+    sample = lines[:LOOKED_AT]
     for delimiter in DELIMITERS:
         count = len(_cells(sample[0], delimiter))
-        said = _cells(lines.comment_before, delimiter) if lines.comment_before else []
+        said = _cells(comment, delimiter) if comment else []
         heads = len(said) == count and any(understand(cell).role for cell in said)
         if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
             continue
@@ -252,18 +250,18 @@ def _delimiter(lines: _Lines) -> str | None:
     return None if best is None else best[3]
 
 
-def _with_heads(lines: _Lines, delimiter: str, source: str) -> _Lines:
+def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Lines:
     """The lines, the first of them heads; a comment before values is taken for them where it fits."""
-    first = _cells(lines.text[0], delimiter)
-    values = all(_is_number(cell) for cell in first)
-    heads = _cells(lines.comment_before, delimiter) if lines.comment_before else []
+    first = _cells(lines[min(lines)], delimiter)
+    heads = _cells(comment, delimiter) if comment else []
     named = [sum(understand(cell).role is not None for cell in cells) for cells in (heads, first)]
-    fits = len(heads) == len(first) and not all(_is_number(cell) for cell in heads)
+    fits = len(heads) == len(first) and not all(map(_is_number, heads))
+    values = all(map(_is_number, first))
     if not values and not (fits and named[0] > named[1]):
         return lines
     if fits:
-        return _Lines([lines.comment_before, *lines.text], [lines.number[0] - 1, *lines.number], "")
-    fault = f"line {lines.number[0]} holds numbers; expected the names of the columns above them"
+        return {min(lines) - 1: comment, **lines}
+    fault = f"line {min(lines)} holds numbers; expected the names of the columns above them"
     raise DataError(f"{source}: {fault}")
 
 
@@ -271,88 +269,79 @@ def _is_number(cell: str) -> bool:
     return re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE) is not None
 
 
-def _without_comments(lines: _Lines, delimiter: str, source: str) -> tuple[_Lines, list[str]]:
+def _without_comments(lines: Lines, delimiter: str, source: str) -> tuple[Lines, list[str]]:
     """The lines without comments below the heads, and a note.
 
     A line that begins like a comment and has as many cells as there are heads is a row, as stations may be
     called #1; it is refused where it may be a row that somebody took out.
     """
-    marked = [i for i, line in enumerate(lines.text) if i and line.lstrip().startswith(COMMENTS)]
+    heads, *below = lines
+    marked = [n for n in below if lines[n].lstrip().startswith(COMMENTS)]
     if not marked:
         return lines, []
-    at = f"line {lines.number[marked[0]]}"
-    count = len(_cells(lines.text[0], delimiter))
-    like = {n: lines.text[n].lstrip(" #%/") for n in marked}  # between spaces a mark may be a cell
-    if all(
-        count not in (len(_cells(lines.text[i], delimiter)), len(_cells(like[i], delimiter))) for i in marked
-    ):
-        kept = sorted(set(range(len(lines.text))) - set(marked))
-        note = f"{len(marked)} comments below the heads, the first in {at}"
-        return _Lines([lines.text[i] for i in kept], [lines.number[i] for i in kept], ""), [note]
-    first = [_cells(line, delimiter)[0].strip() for line in lines.text]
-    plain = [cell for i, cell in enumerate(first) if i and i not in set(marked)]
+    cells = {n: _cells(line, delimiter) for n, line in lines.items()}
+    like = [_cells(lines[n].lstrip(" #%/"), delimiter) for n in marked]  # between spaces a mark may be a cell
+    if all(len(cells[heads]) != len(row) for row in (*like, *(cells[n] for n in marked))):
+        note = f"{len(marked)} comments below the heads, the first in line {marked[0]}"
+        return {n: line for n, line in lines.items() if n not in set(marked)}, [note]
+    first = {n: row[0].strip() for n, row in cells.items()}
+    plain = [first[n] for n in below if n not in set(marked)]
     numbers = bool(plain) and all(map(_is_number, plain))
-    for i in marked:
-        mark = next(mark for mark in COMMENTS if first[i].startswith(mark))
-        name = first[i].removeprefix(mark).strip('"')
-        if not name.strip() or name[0].isspace() or name in first or (numbers and _is_number(name)):
-            fault = f"begins with {first[i][:20]!r}: a row, or a comment? quote the cell or take the line out"
-            raise DataError(f"{source}, line {lines.number[i]}: {fault}")
-    return lines, [f"{len(marked)} rows begin with {first[marked[0]]!r} or the like, the first in {at}"]
+    for n in marked:
+        mark = next((mark for mark in COMMENTS if first[n].startswith(mark)), "")  # none in an empty cell
+        name = first[n].removeprefix(mark).strip('"')
+        is_row = name.strip() and not name[0].isspace() and name not in first.values()
+        if not is_row or (numbers and _is_number(name)):
+            begin = (first[n] or lines[n].strip())[:20]
+            fault = f"begins with {begin!r}: a row, or a comment? quote the cell or take the line out"
+            raise DataError(f"{source}, line {n}: {fault}")
+    at = f"the first in line {marked[0]}"
+    return lines, [f"{len(marked)} rows begin with {first[marked[0]]!r} or the like, {at}"]
 
 
-def _rectangular(lines: _Lines, delimiter: str, source: str) -> list[list[str]]:
+def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
     """All cells; quotes that stay open, and lines with more or fewer cells than heads, are refused."""
-    problems = Problems(source)
-    for line, number in zip(lines.text, lines.number, strict=True):
+    for n, line in lines.items():
         if line.count('"') % 2:
-            fault = (
-                "a quotation mark is not closed on this line; close it, or remove the line break in the cell"
-            )
-            raise DataError(f"{source}, line {number}: {fault}")
-    cells = [_cells(line, delimiter) for line in lines.text]
-    counts = [len(row) for row in cells]
-    wrong = [i for i, count in enumerate(counts) if count != counts[0]]
-    if wrong and len(wrong) == len(counts) - 1 and len(set(counts[1:])) == 1:
+            fault = "a quotation mark is not closed on this line; close it, or remove the line break in"
+            raise DataError(f"{source}, line {n}: {fault} the cell")
+    cells = [_cells(line, delimiter) for line in lines.values()]
+    count, *counts = map(len, cells)
+    if counts and len(set(counts)) == 1 and counts[0] != count:
         hint = "; decimal commas need semicolons or tabs between columns" if delimiter == "," else ""
-        longer = cells[1:] if counts[1] > counts[0] else cells[:1]
-        if abs(counts[1] - counts[0]) == 1 and not any(row[-1].strip() for row in longer):
+        longer = cells[1:] if counts[0] > count else cells[:1]
+        if abs(counts[0] - count) == 1 and not any(row[-1].strip() for row in longer):
             hint = ", the last of them empty: end heads and rows alike"
-        fault = f"{counts[0]} heads, but every line below has {counts[1]} cells{hint}"
-        raise DataError(f"{source}, line {lines.number[0]}: {fault}")
-    names = (f"line {lines.number[i]} ({counts[i]} cells)" for i in wrong)
+        fault = f"{count} heads, but every line below has {counts[0]} cells{hint}"
+        raise DataError(f"{source}, line {min(lines)}: {fault}")
+    problems, below = Problems(source), list(lines)[1:]
+    names = (f"line {n} ({found} cells)" for n, found in zip(below, counts, strict=True) if found != count)
     mark = DELIMITERS.get(delimiter, delimiter)
-    problems.add_rows(source, names, f"expected {counts[0]} cells between {mark}, as there are heads")
+    problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")
     problems.raise_if_any()
     return cells
 
 
-def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
-    """Whether cells in quotes hold decimal commas between commas, not marks between thousands alone."""
-    if '"' not in text:
-        return False
-    cells = pd.concat([frame[i] for i in frame.columns])
-    return bool((cells.str.fullmatch(DECIMAL_COMMA) & ~cells.str.fullmatch(THOUSANDS)).any())
+def _decimal(text: str, frame: pd.DataFrame, delimiter: str) -> tuple[str, list[str]]:
+    """The mark that most numbers have that have one, and a note where it is a comma.
 
-
-def _perhaps_thousands(frame: pd.DataFrame) -> str:
-    """A question where all cells with a comma may be marked between thousands; else nothing."""
+    Between commas it can be one in quoted cells alone; where all cells with a comma may be marked between
+    thousands, the note asks.
+    """
+    if delimiter == "," and '"' not in text:
+        return ".", []
     cells = pd.concat([frame[i] for i in frame.columns])
     marked = cells[cells.str.fullmatch(DECIMAL_COMMA)]
-    if not marked.str.fullmatch(THOUSANDS).all():
-        return ""
+    thousands = bool(marked.str.fullmatch(THOUSANDS).all())
+    some = pd.concat([frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)] for i in frame.columns])
+    commas, points = (some.str.fullmatch(mark).sum() for mark in (DECIMAL_COMMA, DECIMAL_POINT))
+    if (delimiter == "," and thousands) or commas <= points:
+        return ".", []
+    if not thousands:
+        return ",", ["decimal commas"]
     first = marked.iloc[0].strip()
-    return f": {first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
-
-
-def _decimal(frame: pd.DataFrame) -> str:
-    """The mark that most numbers have that have one."""
-    counts = [0, 0]
-    for i in frame.columns:
-        for cell in frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)]:
-            counts[0] += re.fullmatch(DECIMAL_COMMA, cell) is not None
-            counts[1] += re.fullmatch(DECIMAL_POINT, cell) is not None
-    return "," if counts[0] > counts[1] else "."
+    hint = f"{first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
+    return ",", [f"decimal commas: {hint}"]
 
 
 def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
