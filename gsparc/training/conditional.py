@@ -86,13 +86,13 @@ class ConditionalField(nn.Module, ABC):
     def terms(self) -> tuple[str, ...]:
         """Terms that are computed, as in `model.effects`: `phase`, `power`, `residual` and so on."""
 
-    @abstractmethod
     def loss(self, batch: Batch) -> Tensor:
-        """Loss per row (B,), differentiable in the parameters.
+        """Loss per row (B,), differentiable in the parameters; of a field that has any.
 
         The negative log density [nats per real entry] of each row given the others of the batch: the
         leave-one-out predictive density.
         """
+        raise NotImplementedError(f"{type(self).__name__} has nothing that gradient steps move")
 
     @abstractmethod
     def condition(self, data: Measurements, rows: np.ndarray) -> None:

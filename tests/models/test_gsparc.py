@@ -183,6 +183,7 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(fields, "LEAST_GAIN", -math.inf)
+    monkeypatch.setattr(solutions, "HOPELESS", math.inf)
     fitted = fit("channels", budget_s=8.0)  # less leaves no time to complete them on a busy machine
     field = fitted.method.field
     assert isinstance(field, Mixture) and sum(field.weights) == pytest.approx(1)
@@ -198,6 +199,13 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     batch = asked(fitted)
     one, two = (m.predict(batch.tx, batch.rx).mean for m in (fitted.method, again))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
+
+
+def test_a_search_is_left_out_where_few_sources_promise_nothing(monkeypatch, caplog):
+    monkeypatch.setattr(solutions, "HOPELESS", 0.0)
+    fitted = fit("channels", budget_s=8.0)
+    assert "init=sources is left out: few sources miss" in caplog.text
+    assert "sources" not in str(fitted.method.facts()["model/init"]).replace("few sources", "").split("+")
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,12 @@ from small_worlds import LAW, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
 from gsparc.models.powers import waves
-from gsparc.models.powers.field import PowerField, left_out_losses
+from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.learning import Own
 from gsparc.models.powers.together.rows import link_rows
 from gsparc.models.powers.together.terms import Terms
 from gsparc.ops import Pose
-from gsparc.processes.density import gram_of
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
@@ -40,23 +39,10 @@ def field_of_one_station() -> Arrays:
     field.condition(data, np.arange(50))
     batch = data.batch(np.arange(50, 60))
     left = field.left_out()
-    loss = field.loss(data.batch(np.arange(20)))
-    slope = torch.autograd.grad(loss.sum(), [field.log_lengths])
     return _seen(field(batch.tx, batch.rx)) | {
         "left_out": left.mean.numpy(), "left_variance": left.variance.numpy(),
         "mean_at": field.mean_at(batch.tx, batch.rx).detach().numpy(),
-        "loss": loss.detach().numpy(), "slope": slope[0].numpy(),
     }  # fmt: skip
-
-
-def density_of_powers() -> Arrays:
-    """Negative log density of each power given the others."""
-    places = spread(40, 1)
-    told, about = rows(places), trend(places)
-    at = torch.from_numpy(places)
-    gram = gram_of(torch.from_numpy(TWO.parameters()), torch.cdist(at, at), about.terms(at))
-    values = torch.from_numpy(told.decibels) - about.mean(at)
-    return {"density": left_out_losses(gram, values, torch.tensor(TWO.amplitude).double().log()).numpy()}
 
 
 def _stations(quiet: bool) -> object:
@@ -87,7 +73,7 @@ def _together(quiet: bool) -> Arrays:
     moved = field(far, Pose(batch.rx.position + torch.tensor([1.0, 0, 0]), batch.rx.rotation))
     return _seen(field.answer(batch)) | {
         "left_out": left.mean.numpy(), "left_variance": left.variance.numpy(),
-        "losses": field.loss(data.batch(np.arange(30))).numpy(), "unheard": moved.mean.numpy(),
+        "unheard": moved.mean.numpy(),
         "unheard_variance": moved.variance.numpy(),
     }  # fmt: skip
 

@@ -21,6 +21,7 @@ from gsparc.models.image_sources.element_factors import direct_path, element_fac
 from gsparc.models.image_sources.ensemble import (
     affordable_rows,
     at_noise_floor,
+    beaten,
     ensemble_weights,
     refined,
     search_many,
@@ -178,6 +179,8 @@ class ImageSourceGP(FramedMethod):
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in found], self.noise_floor)
         ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
+        if beaten(min(member.left_out for member in found), self._rival):
+            ended = "far behind another solution"
         ended += ", ended by the time budget" if budget.limited else ""
         notes.append(f"{len(found)} of {self.searches} searches ({ended}), {counts} sources")
         counted = Counter(kinds(scene.sources, box_of(self.members[0].rows, scene.transmitter)))

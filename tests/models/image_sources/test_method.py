@@ -142,6 +142,14 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
     assert "1 of 3 searches (within 0 s, ended by the time budget)" in report.notes[0]
 
 
+def test_a_search_far_behind_another_solution_is_the_last(tmp_path):
+    _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1)
+    method = ImageSourceGP(searches=4, search_rows=60, margin=1.0, max_sources=2, clutter=False)
+    report = method.fit(data, fold, FitContext(tmp_path, rival=1e-9))
+    assert "searches (far behind another solution)" in report.notes[0]
+    assert len(method.members) <= torch.get_num_threads()
+
+
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
     method = ImageSourceGP(searches=8, search_rows=60, margin=1.0)

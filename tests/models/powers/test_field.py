@@ -135,44 +135,6 @@ def test_left_out_rows_are_predicted_without_them():
         assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
 
 
-@pytest.mark.parametrize("two", [True, False])
-def test_slopes_of_the_loss(two):
-    data = town(20)
-    field, batch = small_field(data, two), data.batch(np.arange(20))
-    field.loss(batch).sum().backward()
-    with torch.no_grad():
-        for name, parameter in field.named_parameters():
-            if name == "share_logit" and not two:
-                continue
-            flat, slopes = parameter.view(-1), parameter.grad.view(-1)
-            for i in range(min(len(flat), 4)):
-                ends, value = [], flat[i].item()
-                for step in (-1e-5, 1e-5):
-                    flat[i] = value + step
-                    ends.append(float(field.loss(batch).sum()))
-                flat[i] = value
-                assert float(slopes[i]) == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-4, abs=1e-6), name
-
-
-def test_the_loss_is_the_density_of_each_row_given_the_others():
-    data = town(12)
-    field = small_field(data)
-    field.condition(data, np.arange(12))
-    found, loss = field.left_out(), field.loss(data.batch(np.arange(12)))
-    slope = math.log(10) / 10 * found.mean[:, 0]
-    spread = (found.variance.sqrt() / slope).square()
-    error = torch.from_numpy(db(found.mean) - db(data.targets(np.arange(12))))
-    told = 0.5 * (torch.log(2 * math.pi * spread) + error**2 / spread)
-    assert torch.allclose(loss, told.double(), rtol=1e-3)
-
-
-def test_rows_that_were_not_measured_cost_nothing():
-    data = weak(town(30), 0.3)
-    silent = torch.from_numpy(data.censored)
-    loss = small_field(data).loss(data.batch(np.arange(30)))
-    assert silent.any() and not loss[silent].any() and loss[~silent].all()
-
-
 def test_state_makes_it_again(blocked, tmp_path):
     data, field, _ = blocked
     torch.save(field.state(), tmp_path / "field.pt")

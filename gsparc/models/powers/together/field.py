@@ -20,9 +20,9 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.models.per_station import SAME_PLACE_M
 from gsparc.models.powers.groups import Gain
 from gsparc.models.powers.together.learning import Own, gain_of_places, learn_own, learn_strength
-from gsparc.models.powers.together.rows import LinkRows, link_rows, places_of
+from gsparc.models.powers.together.rows import link_rows, places_of
 from gsparc.models.powers.together.terms import LAW_DB, TALL, Terms
-from gsparc.models.target_rows import TINY_POWER, entry_variance, from_real
+from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
 from gsparc.processes.posterior import Exact
@@ -142,24 +142,6 @@ class JointPowerField(ConditionalField):
     def answer(self, batch: Batch) -> Posterior:
         """See `ConditionalField`; two stations may stand at one place."""
         return self.forward(batch.tx, batch.rx, batch.station)
-
-    def loss(self, batch: Batch) -> Tensor:
-        """See `ConditionalField`; rows that were not measured cost 0."""
-        losses = torch.zeros(len(batch), dtype=torch.float64)
-        used = torch.ones(len(batch), dtype=torch.bool)
-        if batch.mask is not None:
-            used = batch.mask.flatten(1).all(1)
-        if not used.any():
-            return losses
-        places, number = (part[used].numpy() for part in self._asked(batch.tx, batch.rx, batch.station))
-        decibels = 10 * batch.target.flatten(1)[used, 0].double().clamp_min(TINY_POWER).log10().numpy()
-        rows = LinkRows(places, decibels, np.zeros(len(places), bool), number, used.nonzero()[:, 0].numpy())
-        posterior = self.own.given(rows, self.heard, self.seed)
-        for one in rows.stations:
-            error, variance = posterior.left_out(one)
-            density = 0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi))
-            losses[torch.from_numpy(rows.of(one).index)] = density
-        return losses
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
