@@ -85,12 +85,12 @@ def _real(value: Any) -> bool:
 
 
 def finite(given: Any) -> np.ndarray:
-    """Numbers as float64 in the shape in which they were given; (0,) where one of them is not finite."""
+    """Numbers as float64 in the shape in which they were given; (0,) where one is none, or not finite."""
     try:
-        found = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
+        boxed = np.array(given, dtype=object)
+    except ValueError:  # rows of different lengths
         return np.zeros(0)
-    return found if np.isfinite(found).all() else np.zeros(0)
+    return boxed.astype(np.float64) if all(map(_real, boxed.flat)) else np.zeros(0)
 
 
 def setting(default: Any, limit: Limit) -> Any:
