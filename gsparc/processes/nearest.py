@@ -156,8 +156,9 @@ class Nearest(Posterior):
         """Of rows (B, k), see `weights_of`."""
         kernel = self.prior.kernel
         if isinstance(kernel, Kernel) and served(queries):
-            noise = self.noise + JITTER
-            found = nearest_weights(queries, self.places, noise, index, kernel.lengths, kernel.shares)
+            found = nearest_weights(
+                queries, self.places, self._solvable, index, kernel.lengths, kernel.shares
+            )
             if found is None:
                 raise NotPositiveDefiniteError("a covariance of near rows is not positive definite")
             return found
@@ -166,6 +167,11 @@ class Nearest(Posterior):
     @cached_property
     def _columns(self) -> Tensor:
         return self.prior.columns(self.places)
+
+    @cached_property
+    def _solvable(self) -> Tensor:
+        """Noise (n,) that lets any system be solved; of a million rows, made once."""
+        return self.noise + JITTER
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
