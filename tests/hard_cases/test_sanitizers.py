@@ -35,6 +35,9 @@ def test_a_box_that_leaves_the_image():
 """
 
 
+pytestmark = pytest.mark.timeout(1500)  # the build takes seven processor minutes, beside other tests
+
+
 def build() -> Path:
     """The sanitized module; made again when a source has changed."""
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in SOURCES)).hexdigest()[:16]
