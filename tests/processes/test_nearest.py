@@ -16,7 +16,7 @@ from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.reduced import reduced
 from gsparc.processes import neighbourhood, powers
 from gsparc.processes.covering import covering
-from gsparc.processes.kernel import Kernel
+from gsparc.processes.kernel import Kernel, SmoothRough
 from gsparc.processes.nearest import Nearest, Values
 from gsparc.processes.nearest import given as given_places
 from gsparc.processes.neighbourhood import NEIGHBOURS
@@ -212,3 +212,15 @@ def test_near_rows_do_not_choose_a_process_of_a_thousand_times_the_power():
     batch = data.batch(fold.test)
     error = (method.predict(batch.tx, batch.rx).mean / batch.target).clamp_min(1e-30).log10() * 10
     assert error.square().mean().sqrt() < 6.0
+
+
+def test_a_kernel_of_other_correlations_was_answered_as_a_sum_of_matern():
+    rng = np.random.default_rng(0)
+    places, values = rng.uniform(0, 1, (40, 3)), torch.from_numpy(rng.normal(size=(40, 1)))
+    prior = Prior(SmoothRough.of_one(0.5, 0.1))
+    queries = torch.from_numpy(rng.uniform(0, 1, (5, 3)))
+    near = given_places(prior, Values.of(places, values), 0, most=40).answer(queries)
+    exact = Exact.of(prior, torch.from_numpy(places), values).answer(queries)
+    assert torch.allclose(near.mean, exact.mean, atol=1e-6) and torch.allclose(
+        near.left, exact.left, atol=1e-6
+    )

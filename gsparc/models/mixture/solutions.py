@@ -210,9 +210,6 @@ def _held(
     return LeftOutRows(np.concatenate(groups), mean, variance)
 
 
-log = logging.getLogger(__name__)
-
-
 def weigh(
     field: Method, data: Measurements, fold: Fold, left: LeftOut | None, distance: float | None
 ) -> tuple[tuple[Method, float] | None, float | None]:
