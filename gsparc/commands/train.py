@@ -139,7 +139,10 @@ def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=config.baselines, cache=platform_cache(),
         )  # fmt: skip
-        run = {"seed": int(config.seed), "model/limited_by_clock": fitted.limited_by}
+        run: dict[str, Any] = {"seed": int(config.seed), "model/limited_by_clock": fitted.limited_by}
+        if fitted.cost.stages:
+            run["model/cost"] = fitted.cost.described(fitted.limited_by)
+            run["time/unused_s"] = fitted.cost.unused_s
         facts = {**found.facts, **provenance(), **run}
         # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
         numbers = {k: v for k, v in facts.items() if isinstance(v, (int, float))}
@@ -217,6 +220,8 @@ def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
         log.log(level, text, method.name, options)
     for note in report.notes:
         log.info("%s", note)
+    if report.cost.stages:
+        log.info("cost: %s", report.cost.described(report.limited_by))
 
 
 def objective_of(config: DictConfig, kind: Kind) -> str:

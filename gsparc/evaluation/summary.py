@@ -114,7 +114,8 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         ],
     }
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
-    return [*seen.get(prefix, []), *run_conditions(facts), *rest]
+    cost = [f"cost: {facts['model/cost']}"] if facts.get("model/cost") else []
+    return [*seen.get(prefix, []), *run_conditions(facts), *rest, *cost]
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:

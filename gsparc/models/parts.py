@@ -23,6 +23,7 @@ from gsparc.models import checkpoint
 from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.cost import Cost
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +66,7 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
 def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
     """For the `extra` of a finished part's checkpoint: what `fit` compares, and the report."""
     said = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
+    said |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
     return {**said, **Origin.of(data, fold, context).marks()}
 
 
@@ -81,7 +83,8 @@ def _taken(method: Method, data: Measurements, fold: Fold, context: FitContext, 
     Origin.of(data, fold, context).refuse_other(stored)
     method.restore(data.site, stored.state)
     extra = stored.extra
-    return FitReport(float(extra["train_s"]), tuple(extra.get("notes", ())), extra.get("limited_by"))
+    cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
+    return FitReport(float(extra["train_s"]), tuple(extra.get("notes", ())), extra.get("limited_by"), cost)
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:

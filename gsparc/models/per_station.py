@@ -30,6 +30,7 @@ from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.cost import Cost
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
@@ -129,6 +130,7 @@ class PerStation(Method):
         left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
         kept = self.wrapped.resumable and context.run_dir != Path()
         limited: Clock | None = None
+        cost = Cost()
         if kept and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
@@ -162,8 +164,9 @@ class PerStation(Method):
             budget.charge(Spent(earlier, earlier))
             self._copies[number] = copy
             limited = less_repeatable(limited, report.limited_by)
+            cost += report.cost
             notes += [f"{name}: {note}" for note in report.notes]
-        return FitReport(budget.counted.wall, tuple(notes), limited)
+        return FitReport(budget.counted.wall, tuple(notes), limited, cost)
 
     def _numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
         """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.

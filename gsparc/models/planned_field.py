@@ -44,6 +44,7 @@ from gsparc.processes.posterior import approximated
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.conditional import ConditionalField, learns
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.cost import Cost
 from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.keep_best import SHORT, KeepBest
 from gsparc.training.module import GaussianModule
@@ -150,8 +151,10 @@ class PlannedField(LearnedField):
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         log.info("%d Gaussians, %d gradient steps kept", self.size(), self.steps)
-        _log_cost(spent, report.seconds)
-        return report
+        unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
+        if self._alone:
+            unused = {name: s for name, s in spent.items() if name != "averaged process"}
+        return replace(report, cost=Cost(spent, unused))
 
     @property
     def _alone(self) -> bool:
@@ -214,12 +217,14 @@ class PlannedField(LearnedField):
             self.field.condition(data, known)
         seconds = budget.counted.wall
         stages = {name: report.seconds for name, report in reports.items()}
+        gain = _late_gain(reports)
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
-        _log_cost(stages, seconds)
+        weighed = {*kept, "weighing", "final weights", *(("gradient steps",) if self.steps else ())}
+        cost = Cost(stages, {name: spent for name, spent in stages.items() if name not in weighed}, gain)
         notes = [note for name in self.started.split("+") for note in reports[name].notes]
         limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return FitReport(seconds, tuple(notes), limited)
+        return FitReport(seconds, tuple(notes), limited, cost)
 
     def _aligned(self, data: Measurements, known: np.ndarray, context: FitContext) -> Measurements:
         """Channels of several runs in the phase and level of one, by the waves that explain rows (n,)."""
@@ -470,7 +475,9 @@ class PlannedField(LearnedField):
         }
 
 
-def _log_cost(stages: dict[str, float], seconds: float) -> None:
-    """The log's last line of a fit: seconds of each stage, and of all."""
-    said = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
-    log.info("cost: %s; %.1f s in all", said, seconds)
+def _late_gain(reports: dict[str, FitReport]) -> float | None:
+    """Least held-out error of solutions found in the first half of their seconds, over that of all."""
+    ends = np.cumsum([one.seconds for one in reports.values()])
+    early = [one for one, end in zip(reports.values(), ends, strict=True) if end <= ends[-1] / 2]
+    first, last = solutions.least_error(early), solutions.least_error(reports.values())
+    return first / max(last, 1e-12) if np.isfinite(first) else None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from gsparc.data.splits import FileSettings, SplitSettings
+from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import NOTHING, Clock, Spent, TimeBudget
 
 if TYPE_CHECKING:
@@ -28,11 +29,15 @@ class FitReport:
         seconds: that it took, validations too [s].
         notes: what a reader must know (early stop, dropped components), one line each.
         limited_by: the clock whose seconds decided something, so that another machine's result may differ.
+        cost: of each stage.
+        error: of rows held out, a share of their energy; NaN where none were.
     """
 
     seconds: float
     notes: tuple[str, ...] = ()
     limited_by: Clock | None = None
+    cost: Cost = NO_COST
+    error: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from gsparc.models import parts
 from gsparc.models.method import Method
 from gsparc.models.per_station import for_links
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import Clock, less_repeatable
 
 
@@ -73,6 +74,7 @@ class Outcome:
         score_s: seconds that scoring took [s].
         notes: what the first fold's fit said.
         limited_by: the clock whose seconds decided something: on another machine the result may be another.
+        cost: of all fits together.
     """
 
     methods: tuple[Method, ...]
@@ -82,6 +84,7 @@ class Outcome:
     score_s: float
     notes: tuple[str, ...]
     limited_by: Clock | None = None
+    cost: Cost = NO_COST
 
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
         """The same fits scored on other data, such as displaced queries."""
@@ -121,6 +124,7 @@ def fit_and_score(
     """
     methods, seconds, processor, notes = [], [], [], []
     limited: Clock | None = None
+    cost = NO_COST
     for number, fold in enumerate(split.folds):
         there, rows = (data, fold) if learned is None else learned(data, fold)
         method, settings = for_links(make, there), context(number)
@@ -129,9 +133,10 @@ def fit_and_score(
         processor.append(time.process_time() - before)
         seconds.append(report.seconds)
         limited = less_repeatable(limited, report.limited_by)
+        cost += report.cost
         notes += [note for note in report.notes if number == 0]
         methods.append(method)
         if keep is not None:
             keep(number, method, report)
-    found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes), limited)
+    found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes), limited, cost)
     return found if eval_on is None else found.scored_on(data, split, eval_on)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,6 @@ def find(
         plans.append((part, init, 1.0))
     found: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
-    missed: dict[str, float] = {}
     for name, settings, share in plans:
         part = name.split()[-1]
         least = SEARCH_LOOKS * factor_s(settings.search_rows) if part in SEARCHES else 0.0
@@ -83,7 +83,7 @@ def find(
             log.info("init=%s is left out: the seconds are too few for a search", name)
             budget.limited = True
             continue
-        if part in SEARCHES and (why := _hopeless(name, missed)) is not None:
+        if part in SEARCHES and (why := _hopeless(name, reports)) is not None:
             log.info("init=%s is left out: %s", name, why)
             continue
         within = replace(context, budget_s=share * max(until_s - budget.spent, LEAST_S))
@@ -91,7 +91,7 @@ def find(
             within = replace(within, run_dir=Path(), resume=None)
         try:
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
-            within = replace(within, leave_out=leave_out, rival=min(missed.values(), default=math.inf))
+            within = replace(within, leave_out=leave_out, rival=least_error(reports.values()))
             clutter = effects.visibility is not False
             with late_when(budget.over):
                 field, report = INITIALISERS[part](data, rows, settings, clutter, within)
@@ -110,22 +110,30 @@ def find(
             log.info("init=%s is left out: %s", name, error)
             found.pop(name, None)
             continue
-        reports[name] = report
         if field.held is not None:
             target = comparable(data.batch(field.held.rows).target, data.site)
-            missed[name] = solution_weights.error(comparable(field.held.mean, data.site), target)
+            miss = solution_weights.error(comparable(field.held.mean, data.site), target)
+            report = replace(report, error=miss)
+        reports[name] = report
     return found, reports
 
 
-def _hopeless(name: str, missed: dict[str, float]) -> str | None:
+def least_error(reports: Iterable[FitReport]) -> float:
+    """Of rows held out, by the best of some solutions; infinity where none says."""
+    return min((one.error for one in reports if not math.isnan(one.error)), default=math.inf)
+
+
+def _hopeless(name: str, reports: dict[str, FitReport]) -> str | None:
     """Why a search would gain nothing, by what one of `FEW` sources missed; None where it may.
 
     Args:
         name: of the search.
-        missed: shares of the energy of held-out rows, of solutions found before.
+        reports: of solutions found before.
     """
-    few, waves = missed.get(f"few {name}", 0.0), missed.get("diffuse", math.inf)
-    if few <= HOPELESS * waves:
+    if f"few {name}" not in reports or "diffuse" not in reports:
+        return None
+    few, waves = reports[f"few {name}"].error, reports["diffuse"].error
+    if not few > HOPELESS * waves:
         return None
     return f"few sources miss {few:.3f} of the energy, waves from all around {waves:.3f}"
 
