@@ -71,6 +71,11 @@ def switch(*more: str) -> Limit:
     return Limit(f"one of {', '.join(words)}", lambda v: isinstance(v, bool) or v in more, words)
 
 
+def or_word(limit: Limit, word: str) -> Limit:
+    """The same, or a word."""
+    return Limit(f"{limit.words}, or {word}", lambda v: v == word or limit.holds(v), (*limit.known, word))
+
+
 def or_null(limit: Limit) -> Limit:
     """The same, or nothing."""
     return Limit(f"{limit.words}, or null", lambda v: v is None or limit.holds(v), limit.known)

@@ -136,6 +136,7 @@ class PlannedField(LearnedField):
             self.most_steps = 0
         choices, _ = resolve(self.settings, self.init.name, data.site)
         steps = total_steps(context) if self.most_steps is None else self.most_steps
+        steps = 0 if choices.closed_form and self.closed_forms_end else steps
         log.info(
             "training %s by rendering: %d Gaussians, terms %s, init=%s, at most %d steps; callbacks %s",
             GaussianModule.__name__, self.settings.field.count, self.effects, choices.init, steps,
@@ -150,11 +151,12 @@ class PlannedField(LearnedField):
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
+        spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
         log.info("%d Gaussians, %d gradient steps kept", self.size(), self.steps)
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}
-        return replace(report, cost=Cost(spent, unused))
+        return _with_cost(report, Cost(spent, unused))
 
     @property
     def _alone(self) -> bool:
@@ -221,10 +223,10 @@ class PlannedField(LearnedField):
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
         weighed = {*kept, "weighing", "final weights", *(("gradient steps",) if self.steps else ())}
-        cost = Cost(stages, {name: spent for name, spent in stages.items() if name not in weighed}, gain)
+        unused = {name: spent for name, spent in stages.items() if name not in weighed}
         notes = [note for name in self.started.split("+") for note in reports[name].notes]
         limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return FitReport(seconds, tuple(notes), limited, cost)
+        return _with_cost(FitReport(seconds, tuple(notes), limited), Cost(stages, unused, gain))
 
     def _aligned(self, data: Measurements, known: np.ndarray, context: FitContext) -> Measurements:
         """Channels of several runs in the phase and level of one, by the waves that explain rows (n,)."""
@@ -266,8 +268,10 @@ class PlannedField(LearnedField):
         if isinstance(getattr(getattr(field, "process", None), "posterior", None), Nearest):
             log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
             return 0, field.count > 0
-        if not learns(field):
-            log.info("gradient steps: none, nothing to move")
+        steps = self._most_steps(context)
+        if not (steps and learns(field)):
+            why = "nothing to move" if steps else "weights are in closed form (model.steps=N takes some)"
+            log.info("gradient steps: none, %s", why)
             return 0, field.count > 0
         each = factor_s(min(len(fold.train), MOST_FACTORED))  # about what a validation takes
         if (BEFORE + AFTER) * each + LEAST_STEPS_S > budget.seconds - budget.spent:
@@ -280,7 +284,6 @@ class PlannedField(LearnedField):
             log.info("gradient steps: none, no seconds are left")
             return 0, True
         inner = context.within("steps", resume=None)
-        steps = self._most_steps(context)
         module = GaussianModule(field, self.loss, self.rates, steps, inner.run_dir, Pace(steps, left))
         files = GsparcCheckpointIO(self, context.config_yaml, {"stage": "steps"})
         try:
@@ -292,6 +295,8 @@ class PlannedField(LearnedField):
         return ran.steps, True
 
     def _most_steps(self, context: FitContext) -> int:
+        if self.closed_forms_end:
+            return 0
         return total_steps(context) if self.most_steps is None else self.most_steps
 
     def best_stations(
@@ -473,6 +478,12 @@ class PlannedField(LearnedField):
             "model/variance_explained": self.explained,
             "time/init_s": self.init_s,
         }
+
+
+def _with_cost(report: FitReport, cost: Cost) -> FitReport:
+    """The report of a fit, whose last line is what it cost."""
+    log.info("cost: %s", cost.described(report.limited_by))
+    return replace(report, cost=cost)
 
 
 def _late_gain(reports: dict[str, FitReport]) -> float | None:

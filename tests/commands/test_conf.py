@@ -86,7 +86,7 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
     assert set(still_open(model)) == {
         "emission.encoding.kind", "emission.activation", "emission.init_bias", "effects.image",
         "effects.array", "effects.moving_array", "effects.phase", "effects.power", "effects.visibility",
-        "effects.residual",
+        "effects.residual", "steps",
     }  # fmt: skip
 
 

@@ -258,6 +258,9 @@ def weigh(
             weight = solution_weights.weights([own, plain], target, np.arange(len(val)))[1]
     if left is not None:
         rows.append(_left_out(left, distance))
+        if explained is None:
+            own, target = (torch.from_numpy(part) for part in (rows[-1].own, rows[-1].target))
+            explained = solution_weights.explained(own, target, True)
     if spectra:
         weight = solution_weights.share_of_second(rows)
     log.info(

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as L
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.inner_folds import cut_inside
-from gsparc.data.limits import check_arguments, or_null, switch, whole
+from gsparc.data.limits import check_arguments, or_null, or_word, switch, whole
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
@@ -64,7 +64,8 @@ class LearnedField(Method):
         init: where Gaussians come from; `auto` solves the emission in closed form where it can.
         refit: after validation, train again on training and validation rows together.
         keep_best: end with the parameters of the best validation, and end early when none is better.
-        steps: of gradient, at most; None: `trainer.max_steps`. 0 after a closed-form start: it is the answer.
+        steps: of gradient, at most; None: `trainer.max_steps`; `auto`: none after a start in closed form,
+            which they did not better on held-out rows, else `trainer.max_steps`.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
@@ -87,16 +88,19 @@ class LearnedField(Method):
         init: InitSettings | None = None,
         refit: bool = True,
         keep_best: bool = True,
-        steps: int | None = None,
+        steps: int | Literal["auto"] | None = None,
         guesses: Sequence[str] = (),
     ) -> None:
-        check_arguments(locals(), refit=switch(), keep_best=switch(), steps=or_null(whole(0)))
+        check_arguments(
+            locals(), refit=switch(), keep_best=switch(), steps=or_null(or_word(whole(0), "auto"))
+        )
         response = response or ResponseSettings()
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
         self.refit, self.guesses = refit, tuple(guesses)
-        self.keep_best, self.most_steps = keep_best, steps
+        self.keep_best, self.most_steps = keep_best, None if steps == "auto" else steps
+        self.closed_forms_end = steps == "auto"
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self.choices: Choices | None = None
@@ -172,7 +176,8 @@ class LearnedField(Method):
     def _solved(self, fold: Fold) -> bool:
         """Whether a closed-form start is the answer: few validation rows choose steps by chance."""
         assert self.choices is not None
-        return self.choices.closed_form and (self.most_steps == 0 or self._told_by_few(fold))
+        ends = self.most_steps == 0 or self.closed_forms_end
+        return self.choices.closed_form and (ends or self._told_by_few(fold))
 
     def _told_by_few(self, fold: Fold) -> bool:
         return self.keep_best and len(fold.val) < LEAST_TOLD

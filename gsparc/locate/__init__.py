@@ -1,0 +1,1 @@
+"""Where something was heard: positions from spectra, channels, powers and fingerprints."""

@@ -1,0 +1,1 @@
+"""Published ways from features to a place, behind one protocol."""

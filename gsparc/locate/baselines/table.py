@@ -1,0 +1,51 @@
+"""Baselines of localisation by name, on snapshots of any kind."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from gsparc.locate.baselines import neighbours, network, probabilistic, process
+from gsparc.locate.baselines.interface import Locator
+from gsparc.locate.snapshots import Snapshots
+
+BASELINES: dict[str, Callable[[np.ndarray, np.ndarray], Locator]] = {
+    "nearest": partial(neighbours.fit, counts=(1,)),
+    "knn": partial(neighbours.fit, weighted=False),
+    "weighted_knn": neighbours.fit,
+    "kernel": probabilistic.fit,
+    "gp": process.fit,
+    "mlp": network.fit,
+}
+
+
+def features(heard: Snapshots) -> np.ndarray:
+    """Real rows (n, P), NaN where nothing was heard.
+
+    Of channels the real and imaginary parts after the first value that was heard was turned to be real and
+    positive, so that a common phase changes nothing.
+    """
+    values = heard.values.numpy()
+    if not np.iscomplexobj(values):
+        return values
+    there = ~np.isnan(values.real)
+    first = values[np.arange(len(values)), there.argmax(1)]
+    turned = values * (first.conj() / np.maximum(np.abs(first), 1e-30))[:, None]
+    return np.hstack([turned.real, turned.imag])
+
+
+def located_by(name: str, trained: Snapshots, heard: Snapshots) -> tuple[np.ndarray, float]:
+    """Places (n, 3) [m, local] of a baseline that learned from snapshots of known places, and ms of each.
+
+    Raises:
+        ValueError: no such baseline, or rows that cannot be learned from.
+    """
+    if name not in BASELINES:
+        raise ValueError(f"against: no baseline {name!r}; there are {', '.join(BASELINES)}")
+    found = BASELINES[name](features(trained), trained.place[:, :3])
+    started = time.perf_counter()
+    place = found.locate(features(heard)).place
+    return place, (time.perf_counter() - started) / max(len(heard), 1) * 1e3

@@ -1,0 +1,51 @@
+"""How far a field is trusted to say where, from snapshots that it did not learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from gsparc.locate.likelihood import Trust
+from gsparc.locate.search import Looked
+
+TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
+LOOKS = 120
+
+
+def calibrated(held: Sequence[Looked], places: np.ndarray, share: float, start: Trust) -> Trust:
+    """The trust under which places that were held out are most likely, with an area that holds a share.
+
+    The first three numbers maximise the mean log density at the true places, a proper score; the level is
+    then the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
+    "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
+    the share of places that are exchangeable with these.
+
+    Args:
+        held: of each snapshot.
+        places: (n, 3), where they were heard [m, local].
+        share: of places, to be held.
+        start: of the search.
+    """
+    cells = [one.cells.holding(place) for one, place in zip(held, places, strict=True)]
+    spans = np.log([INFLATIONS, TEMPERATURES, TAILS]).T
+
+    def of(point: np.ndarray) -> Trust:
+        inflation, temperature, tail = np.exp(np.clip(point, *spans))
+        return Trust(float(inflation), float(temperature), float(tail))
+
+    def surprise(point: np.ndarray) -> float:
+        trust = of(point)
+        return -float(np.mean([one.by(trust).log_density[i] for one, i in zip(held, cells, strict=True)]))
+
+    first = np.log([start.inflation, start.temperature, start.tail])
+    simplex = first + np.vstack([np.zeros(3), np.diag([1.0, -1.5, 1.0])])
+    found = minimize(
+        surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
+    )
+    trust = of(found.x)
+    levels = np.sort([one.by(trust).level(place) for one, place in zip(held, places, strict=True)])
+    rank = int(np.ceil((len(levels) + 1) * share))
+    return replace(trust, level=float(levels[rank - 1]) if rank <= len(levels) else 1.0)

@@ -1,0 +1,85 @@
+"""Where one can stand, as boxes that are halved where it matters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+THIN = 0.02  # of the longest side: what is shorter is no axis
+REACH = 3.0  # times the median distance between neighbouring trained places, within which one can stand
+
+
+@dataclass(frozen=True)
+class Cells:
+    """G boxes that do not overlap.
+
+    Attributes:
+        centre: (G, 3) [m, local].
+        edge: (G, 3) [m]; 0 along axes that the site does not have.
+    """
+
+    centre: np.ndarray
+    edge: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+    @property
+    def size(self) -> np.ndarray:
+        """Length, area or volume (G,) [m, m^2, m^3]."""
+        return np.where(self.edge > 0, self.edge, 1.0).prod(1)
+
+    def at(self, chosen: np.ndarray) -> Cells:
+        """The cells `chosen`."""
+        return Cells(self.centre[chosen], self.edge[chosen])
+
+    def halved(self) -> Cells:
+        """Each in two along every axis."""
+        corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), -1).reshape(-1, 3)
+        live = self.edge.max(0) > 0
+        corners = np.unique(np.where(live, corners, 0.0), axis=0)
+        centre = self.centre[:, None] + corners * self.edge[:, None]
+        edge = np.broadcast_to(self.edge[:, None] / 2, centre.shape)
+        return Cells(centre.reshape(-1, 3), edge.reshape(-1, 3))
+
+    def with_others(self, others: Cells) -> Cells:
+        """Both."""
+        return Cells(np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge]))
+
+    def holding(self, place: np.ndarray) -> int:
+        """The cell that a place (3,) is in, or that is nearest to it."""
+        outside = (np.abs(self.centre - place) - self.edge / 2).clip(0) * (self.edge > 0)
+        return int((outside.sum(1) + 1e-6 * np.linalg.norm(self.centre - place, axis=1)).argmin())
+
+
+def cover(trained: np.ndarray, most: int, around: bool) -> Cells:
+    """About `most` equal cells of the box of trained places (n, 3) [m].
+
+    Args:
+        trained: local.
+        most: cells of the whole box.
+        around: whether only cells near trained places are kept, as in a building one walked through.
+
+    Raises:
+        ValueError: all places are one.
+    """
+    low, extent = trained.min(0), np.ptp(trained, axis=0)
+    live = extent > THIN * extent.max()
+    if not live.any() or not extent.max() > 0:
+        raise ValueError("locate: the model was trained at a single place")
+    step = (extent[live].prod() / most) ** (1 / live.sum())
+    count = np.where(live, np.maximum(np.ceil(extent / step), 1), 1).astype(int)
+    edge = np.where(live, extent / count, 0.0)
+    middle = np.median(trained, axis=0)
+    sides = [
+        low[i] + edge[i] * (np.arange(count[i]) + 0.5) if live[i] else middle[i : i + 1] for i in range(3)
+    ]
+    centre = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
+    if around:
+        tree = cKDTree(np.unique(trained, axis=0))
+        apart = np.median(tree.query(tree.data, k=min(2, tree.n))[0][:, -1])
+        near = tree.query(centre)[0] <= max(REACH * apart, np.linalg.norm(edge))
+        centre = centre[near]
+    return Cells(centre, np.broadcast_to(edge, centre.shape).copy())

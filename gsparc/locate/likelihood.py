@@ -1,0 +1,148 @@
+"""How well snapshots fit places: squared errors by their variance, and log-likelihoods of them.
+
+n snapshots of P values against mean and variance of the same values at G places. What differs by chance
+between snapshots is taken out: the phase of a carrier, a device's offset in decibels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+MOST = 4_000_000  # entries of an array (n, P, G) at a time
+TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Of n snapshots at G places.
+
+    Attributes:
+        squared: (n, G) sum of squared errors, each by its variance.
+        size: (n, G) sum of logarithms of variances.
+        count: (n,) real numbers that were compared.
+        silent: (n, G) log probability that what was not heard is not heard; 0 where all was.
+    """
+
+    squared: Tensor
+    size: Tensor
+    count: Tensor
+    silent: Tensor
+
+    def __add__(self, other: Misfit) -> Misfit:
+        """At the places of both, of the same snapshots."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("squared", "size", "silent"))
+        squared, size, silent = (torch.cat(pair, 1) for pair in pairs)
+        return Misfit(squared, size, self.count, silent)
+
+    def at(self, places: Tensor) -> Misfit:
+        """At places (g,) by number."""
+        parts = (part[:, places] for part in (self.squared, self.size, self.silent))
+        squared, size, silent = parts
+        return Misfit(squared, size, self.count, silent)
+
+    def of(self, snapshot: int) -> Misfit:
+        """Of one snapshot."""
+        one = slice(snapshot, snapshot + 1)
+        return Misfit(self.squared[one], self.size[one], self.count[one], self.silent[one])
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How far a field's own variances are trusted.
+
+    Errors of nearby pixels, tones and stations are not independent, which the temperature answers for, and
+    some snapshots are worse than all others (somebody stood in the way), which the tail does: variances of a
+    snapshot are known up to a factor of a scaled inverse chi-square distribution, so that its likelihood is
+    that of a multivariate t (K. L. Lange et al., "Robust statistical modeling using the t distribution", JASA
+    84 (1989)).
+
+    Attributes:
+        inflation: of variances.
+        temperature: share of the values in (0, 1] that count as independent.
+        tail: degrees of freedom.
+        level: mass of the area that holds the promised share of places.
+    """
+
+    inflation: float = 1.0
+    temperature: float = 0.1
+    tail: float = 4.0
+    level: float = 0.9
+
+    def log_likelihood(self, misfit: Misfit) -> Tensor:
+        """(n, G), up to a constant of each snapshot."""
+        squared = self.temperature / self.inflation * misfit.squared
+        count = self.temperature * misfit.count[:, None]
+        spread = (self.tail + count) * torch.log1p(squared / self.tail)
+        return -0.5 * (spread + self.temperature * misfit.size) + self.temperature * misfit.silent
+
+
+def of_spectra(values: Tensor, mean: Tensor, variance: Tensor) -> Misfit:
+    """Of spectra (n, P) by means (G, P) and variances of a pixel (G, 1)."""
+    spread = variance[:, 0].clamp_min(TINY)
+    squared = values.square().sum(1)[:, None] - 2 * values @ mean.T + mean.square().sum(1)
+    size = (values.shape[1] * spread.log()).expand(squared.shape)
+    count = torch.full((len(values),), float(values.shape[1]), dtype=values.dtype)
+    return Misfit(squared.clamp_min(0) / spread, size, count, torch.zeros_like(squared))
+
+
+def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: bool) -> Misfit:
+    """Of complex values (n, P), NaN where missing, by means and variances (G, P).
+
+    Without a known phase each snapshot is turned to where it fits best.
+    """
+    heard, seen = _where(values)
+    mean, precision, log_variance = _known(mean, variance)
+    power = heard.abs().square() @ precision.T + seen @ (mean.abs().square() * precision).T
+    overlap = heard @ (mean.conj() * precision).T
+    gain = overlap.real if phase_known else overlap.abs()
+    squared = 2 * (power - 2 * gain).clamp_min(0)
+    return Misfit(squared, 2 * seen @ log_variance.T, 2 * seen.sum(1), torch.zeros_like(squared))
+
+
+def of_levels(
+    values: Tensor, mean: Tensor, variance: Tensor, offset_db: float = 0.0, floor: Tensor | None = None
+) -> Misfit:
+    """Of powers (n, P) [dB], NaN where missing, by means (G, P) [dB] and variances (G, P) [dB^2].
+
+    Args:
+        values: what was heard.
+        mean, variance: of the places; NaN where a station has no prediction.
+        offset_db: standard deviation of an offset that all powers of a snapshot share [dB]; it is integrated
+            out in closed form.
+        floor: (n, P) levels [dB] below which a silent power lies, NaN of those that were heard.
+    """
+    heard, seen = _where(values)
+    told, precision, log_variance = _known(mean, variance)
+    weighed = told * precision
+    square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (told * weighed).T
+    slope = heard @ precision.T - seen @ weighed.T
+    shared = 1 + offset_db**2 * (seen @ precision.T)
+    squared = (square - offset_db**2 * slope.square() / shared).clamp_min(0)
+    size = seen @ log_variance.T + shared.log()
+    silent = torch.zeros_like(squared)
+    if floor is not None and not torch.isnan(floor).all():
+        spread = (variance + offset_db**2).sqrt()
+        parts = []
+        for some in floor.split(max(MOST // max(mean.numel(), 1), 1)):
+            chance = torch.special.log_ndtr((some[:, None] - mean) / spread)
+            parts.append(chance.nan_to_num(nan=0.0).sum(2))
+        silent = torch.cat(parts)
+    return Misfit(squared, size, seen.sum(1), silent)
+
+
+def _where(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Values with 0 where they are missing, and 1 where they are not."""
+    there = ~torch.isnan(values.real)
+    seen = there.to(values.real.dtype)
+    return torch.where(there, values, torch.zeros_like(values)), seen
+
+
+def _known(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Means, inverse variances and logarithms of variances (G, P), all 0 where nothing is predicted."""
+    known = ~torch.isnan(mean.real)
+    safe = torch.where(known, variance.clamp_min(TINY), torch.ones_like(variance))
+    precision = torch.where(known, 1 / safe, torch.zeros_like(safe))
+    return torch.where(known, mean, torch.zeros_like(mean)), precision, safe.log()

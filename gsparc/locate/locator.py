@@ -1,0 +1,162 @@
+"""Where snapshots were heard, by the likelihood of a trained field."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from gsparc.data.inner_folds import cut_inside
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.locate.calibration import calibrated
+from gsparc.locate.cells import Cells, cover
+from gsparc.locate.likelihood import Trust
+from gsparc.locate.posterior import Posterior
+from gsparc.locate.search import Looked, Unknown, looked, misfit
+from gsparc.locate.site_field import Moments, SiteField
+from gsparc.locate.snapshots import Snapshots, snapshots
+from gsparc.models.method import Method
+from gsparc.models.per_station import for_links
+from gsparc.training.context import FitContext
+
+MOST = 3_000  # cells of the coarse grid
+HELD_OUT = 200  # snapshots that trust is learned from, drawn evenly
+KEY = "locate"  # in a checkpoint's `extra`
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where one snapshot was heard.
+
+    Attributes:
+        place: (3,) [m, local], the likeliest.
+        area: length, area or volume that holds it in the promised share of cases [m, m^2, m^3].
+        modes: parts of that area that are apart, each of some mass.
+        posterior: masses of cells.
+        seconds: that it took.
+    """
+
+    place: np.ndarray
+    area: float
+    modes: int
+    posterior: Posterior
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Locator:
+    """A field with the places where one can stand.
+
+    Attributes:
+        field: what would be heard.
+        cells: of a coarse grid.
+        unknown: what differs by chance between snapshots.
+        trust: see there.
+        share: of places that an area holds.
+    """
+
+    field: SiteField
+    cells: Cells
+    unknown: Unknown
+    trust: Trust
+    share: float = 0.9
+
+    @classmethod
+    def of(
+        cls, method: Method, data: Measurements, rows: np.ndarray, unknown: Unknown, trust: Trust,
+        around: bool = False, most: int = MOST, share: float = 0.9,
+    ) -> Self:  # fmt: skip
+        """Of a method that was trained on rows (n,).
+
+        Args:
+            method: trained.
+            data, rows: what it learned from: where one can stand.
+            unknown, trust, share: see there.
+            around: whether one can stand near trained places alone; else in their whole box.
+            most: cells of the grid.
+
+        Raises:
+            ValueError: both ends move, or the method states no variance.
+        """
+        field = SiteField(method, data.site, tuple(data.target.shape[1:]))
+        return cls(field, cover(data.moving[rows][:, :3], most, around), unknown, trust, share)
+
+    @cached_property
+    def _coarse(self) -> Moments:
+        """Computed once: most of the time of the first snapshot."""
+        return self.field.at(torch.from_numpy(self.cells.centre))
+
+    def look(self, heard: Snapshots) -> Looked:
+        """One snapshot's misfit where it matters."""
+        coarse = misfit(heard, self._coarse, self.unknown)
+        return looked(self.field, heard, self.cells, coarse, self.unknown, self.trust)
+
+    def locate(self, heard: Snapshots) -> list[Located]:
+        """Each of n snapshots on its own."""
+        self._coarse  # noqa: B018 (not on the first snapshot's bill)
+        found = []
+        for number in range(len(heard)):
+            started = time.perf_counter()
+            posterior = self.look(heard.at(np.array([number]))).by(self.trust)
+            inside = posterior.within(self.trust.level)
+            modes = posterior.modes(self.trust.level)
+            best = posterior.cells.centre[posterior.log_density.argmax()]
+            area = float(posterior.cells.size[inside].sum())
+            found.append(Located(best, area, len(modes), posterior, time.perf_counter() - started))
+        return found
+
+
+def trusted(
+    make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext, locator: Locator,
+    folds: int, around: bool,
+) -> tuple[Trust, int]:  # fmt: skip
+    """How far such a method is trusted, from training places that it left out, and their number.
+
+    The method is trained again without each of a few groups of training rows, cut as the test rows were.
+
+    Args:
+        make: an unfitted method of the same settings.
+        data, fold: what the locator's method learned from.
+        context: of each training.
+        locator: of the whole method.
+        folds: groups.
+        around: see `Locator.of`.
+    """
+    held: list[Looked] = []
+    places = []
+    rng = np.random.default_rng(context.seed)
+    for inner in cut_inside(data, fold, context.split, folds, context.seed).folds:
+        method = for_links(make, data)
+        method.fit(data, inner, context)
+        known = np.union1d(inner.train, inner.val)
+        own = Locator.of(method, data, known, locator.unknown, locator.trust, around, MOST, locator.share)
+        heard = snapshots(data, inner.test)
+        chosen = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
+        held += [own.look(heard.at(np.array([number]))) for number in chosen]
+        places.append(heard.place[chosen])
+    every = np.concatenate(places)[:, :3]
+    return calibrated(held, every, locator.share, locator.trust), len(every)
+
+
+def kept(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
+    """For a checkpoint's `extra`."""
+    return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
+
+
+def restored(extra: dict[str, Any]) -> tuple[Trust, Unknown, float] | None:
+    """What `kept` held; None where nothing was."""
+    found = extra.get(KEY)
+    return None if found is None else (Trust(**found["trust"]), Unknown(**found["unknown"]), found["share"])
+
+
+def in_world(located: Located, origin: np.ndarray) -> Located:
+    """The same with places in the world's coordinates."""
+    cells = replace(located.posterior.cells, centre=located.posterior.cells.centre + origin)
+    posterior = replace(located.posterior, cells=cells)
+    return replace(located, place=located.place + origin, posterior=posterior)

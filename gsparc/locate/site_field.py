@@ -1,0 +1,104 @@
+"""A trained method as a field of snapshots: mean and variance of all that would be heard at a place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Site
+from gsparc.locate.snapshots import compared
+from gsparc.models.method import Method, suited_threads
+from gsparc.ops import Pose
+
+CHUNK = 512  # places that are asked about at a time
+DB = 10 / np.log(10)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """What would be heard at G places.
+
+    Attributes:
+        mean: (G, P) as in `Snapshots.values`; NaN where a station has no prediction.
+        variance: (G, P) expected squared error of a measurement, of powers in dB^2; of spectra (G, 1).
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+
+class SiteField:
+    """Answers for all stations of a site together.
+
+    Args:
+        method: trained; its predictions have variances.
+        site: what it was trained on.
+        shape: of one target.
+
+    Raises:
+        ValueError: the method states no variance.
+    """
+
+    def __init__(self, method: Method, site: Site, shape: tuple[int, ...]) -> None:
+        self.method, self.site, self.shape = method, site, shape
+        self.count = 1 if site.stations is None else len(site.stations)
+
+    @torch.no_grad()
+    def at(self, places: Tensor) -> Moments:
+        """Of places (G, 3) float64 [m, local]."""
+        parts = [self._some(some) for some in places.split(CHUNK)]
+        return Moments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
+
+    def _some(self, places: Tensor) -> Moments:
+        site, many = self.site, len(places) * self.count
+        station = torch.arange(self.count).repeat(len(places))
+        moving = places.float().repeat_interleave(self.count, 0)
+        still = self._still()[station]
+        turned = self._rotation()[station]
+        ends = (moving, still) if site.moving_end == "tx" else (still, moving)
+        rx = Pose(ends[1], turned)
+        if self.count == 1 and site.static_end == "rx":
+            rx = Pose(ends[1][0], turned[0])
+        dtype = torch.complex64 if site.kind == "csi" else torch.float32
+        target = torch.zeros(1, dtype=dtype).expand(many, *self.shape)
+        batch = Batch(
+            torch.zeros(many, dtype=torch.int64), ends[0], rx, target,
+            station=None if site.stations is None else station,
+        )  # fmt: skip
+        with suited_threads(self.method, many):
+            found = self.method.answer(batch)
+        if found.variance is None:
+            raise ValueError(
+                f"locate: {self.method.name} states no variance, and has no likelihood of a place"
+            )
+        mean, variance = compared(found.mean), found.variance.double()[:, None]
+        if site.kind == "spectrum":
+            return Moments(mean.double(), variance)
+        if site.kind == "rssi":
+            power = mean.double().clamp_min(1e-30)
+            return self._joined(10 * power.log10(), DB**2 * variance / power.square())
+        mean = mean.to(torch.complex128)
+        return self._joined(mean, variance.expand(mean.shape))
+
+    def _joined(self, mean: Tensor, variance: Tensor) -> Moments:
+        """Of rows by place and station (G T, p): (G, T p)."""
+        return Moments(*(part.reshape(-1, self.count * part.shape[1]) for part in (mean, variance)))
+
+    def _still(self) -> Tensor:
+        """Places (T, 3) float32 of the static ends."""
+        site = self.site
+        if site.stations is not None:
+            return torch.from_numpy(site.stations.position).float()
+        known = np.full(3, np.nan) if site.static_position is None else site.static_position
+        return torch.from_numpy(known).float()[None]
+
+    def _rotation(self) -> Tensor:
+        """(T, 3, 3) float32 of receivers."""
+        site = self.site
+        one = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+        if site.stations is not None and site.stations.rotation is not None and site.static_end == "rx":
+            return torch.from_numpy(site.stations.rotation).float()
+        return torch.from_numpy(one).float().expand(self.count, 3, 3)

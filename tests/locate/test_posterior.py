@@ -1,0 +1,54 @@
+"""Cells, masses, areas and modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsparc.locate.cells import cover
+from gsparc.locate.posterior import Posterior
+
+PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0, 0, 1.5]
+
+
+def gaussians(cells, middles, width=0.2):
+    apart = np.linalg.norm(cells.centre[:, None, :2] - np.asarray(middles, float), axis=2)
+    density = np.log(np.exp(-0.5 * (apart / width) ** 2).sum(1) + 1e-30)
+    return Posterior(cells, density - np.log((np.exp(density) * cells.size).sum()))
+
+
+def test_cells_cover_the_plane_that_was_walked():
+    cells = cover(PLACES, 400, False)
+    assert 300 < len(cells) < 600 and (cells.edge[:, 2] == 0).all() and (cells.centre[:, 2] == 1.5).all()
+    assert cells.size.sum() == pytest.approx(np.ptp(PLACES[:, :2], axis=0).prod())
+
+
+def test_halves_fill_the_whole():
+    cells = cover(PLACES, 50, False)
+    finer = cells.halved()
+    assert len(finer) == 4 * len(cells) and finer.size.sum() == pytest.approx(cells.size.sum())
+    one = cells.at(np.array([3])).halved()
+    assert np.abs(one.centre - cells.centre[3]).max(0) == pytest.approx(cells.edge[3] / 4)
+
+
+def test_one_can_stand_near_trained_places_alone():
+    walked = PLACES[PLACES[:, 0] < 1.0]
+    both = np.concatenate([walked, [[4.0, 2.0, 1.5]]])
+    around = cover(both, 400, True)
+    assert len(around) < 0.5 * len(cover(both, 400, False))
+    with pytest.raises(ValueError, match="single place"):
+        cover(np.ones((5, 3)), 100, False)
+
+
+def test_an_area_of_a_known_density_holds_its_share():
+    found = gaussians(cover(PLACES, 20_000, False), [[2.0, 1.0]])
+    area = found.cells.size[found.within(0.9)].sum()
+    assert area == pytest.approx(-2 * np.pi * 0.2**2 * np.log(0.1), rel=0.02)
+    assert found.level(np.array([2.0, 1.0, 1.5])) < 0.01 and found.level(np.array([3.9, 1.9, 1.5])) > 0.99
+    assert found.estimate(0.9)[:2] == pytest.approx([2.0, 1.0], abs=0.02)
+
+
+def test_two_places_that_look_alike_are_two_modes():
+    cells = cover(PLACES, 5_000, False)
+    assert len(gaussians(cells, [[0.8, 1.0], [3.2, 1.0]], 0.1).modes(0.9)) == 2
+    assert len(gaussians(cells, [[0.8, 1.0]], 0.1).modes(0.9)) == 1
