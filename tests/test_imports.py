@@ -30,11 +30,12 @@ ARROWS = {
     "training": "data field ops processes",
     "models": "data field ops physics processes simulate training",
     "prediction": "data models ops processes training",
-    "evaluation": "conf data models prediction simulate training",
+    "locate": "data models ops processes training",
+    "evaluation": "conf data locate models prediction simulate training",
     "maps": "data evaluation models prediction processes training",
     "view": "data evaluation maps models ops prediction",
     "callbacks": "data evaluation field training",
-    "commands": "conf data evaluation field maps models ops prediction simulate training view",
+    "commands": "conf data evaluation field locate maps models ops prediction simulate training view",
     "conf": "",
 }
 LARGEST = ("models", "data", "commands")

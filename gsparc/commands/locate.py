@@ -100,7 +100,7 @@ def _calibrated(config: DictConfig, run: Opened, found: Locator, around: bool) -
         raise ValueError(f"{config.ckpt} does not name its settings: calibrate=0 goes without")
     split = settings.get("split")
     context = FitContext(
-        seed=int(config.seed), budget_s=float(config.calibrate_s),
+        run_dir=run_directory() / "left_out", seed=int(config.seed), budget_s=float(config.calibrate_s),
         split=None if split is None else split_settings(plain(split)),
     )  # fmt: skip
     make = partial(build, settings.model)
@@ -121,7 +121,8 @@ def _heard(config: DictConfig, run: Opened, data: Measurements, fold: Any) -> tu
         known = place in raw.arrays
         if not known:  # anywhere: nothing is compared with it
             count = max(len(raw.arrays.get(data.site.kind, ())), len(raw.arrays.get("rssi_db", ())))
-            raw.arrays[place] = np.linspace(*(data.site.moving_box + data.site.origin), count)
+            low, high = data.site.moving_box + data.site.origin
+            raw.arrays[place] = np.linspace(low, high, count)
         other = aligned(interpreted(raw, config.data), data.site)
         heard = snapshots(other, np.arange(len(other)))
     if not len(heard):

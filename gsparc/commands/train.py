@@ -220,8 +220,6 @@ def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
         log.log(level, text, method.name, options)
     for note in report.notes:
         log.info("%s", note)
-    if report.cost.stages:
-        log.info("cost: %s", report.cost.described(report.limited_by))
 
 
 def objective_of(config: DictConfig, kind: Kind) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -24,6 +25,8 @@ from gsparc.locate.snapshots import Snapshots, snapshots
 from gsparc.models.method import Method
 from gsparc.models.per_station import for_links
 from gsparc.training.context import FitContext
+
+log = logging.getLogger(__name__)
 
 MOST = 3_000  # cells of the coarse grid
 HELD_OUT = 200  # snapshots that trust is learned from, drawn evenly
@@ -131,14 +134,16 @@ def trusted(
     held: list[Looked] = []
     places = []
     rng = np.random.default_rng(context.seed)
-    for inner in cut_inside(data, fold, context.split, folds, context.seed).folds:
+    cut = cut_inside(data, fold, context.split, folds, context.seed).folds
+    for number, inner in enumerate(cut):
+        log.info("group %d of %d: trained without %d rows", number + 1, len(cut), len(inner.test))
         method = for_links(make, data)
-        method.fit(data, inner, context)
+        method.fit(data, inner, context.within(f"group{number}"))
         known = np.union1d(inner.train, inner.val)
         own = Locator.of(method, data, known, locator.unknown, locator.trust, around, MOST, locator.share)
         heard = snapshots(data, inner.test)
         chosen = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        held += [own.look(heard.at(np.array([number]))) for number in chosen]
+        held += [own.look(heard.at(np.array([row]))) for row in chosen]
         places.append(heard.place[chosen])
     every = np.concatenate(places)[:, :3]
     return calibrated(held, every, locator.share, locator.trust), len(every)

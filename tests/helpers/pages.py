@@ -110,6 +110,7 @@ class Tiny:
 
     def model(self, command: str) -> str:
         """A checkpoint that a command can use."""
+        command = "tradeoff" if command == "locate" else command
         kind = command if command in ("link", "place", "calibrate", "tradeoff") else "map"
         if f"{kind} model" not in self.made:
             folder, more = self.folder / f"{kind} model", ("baselines=[]", "logger=none", "threads=1")
@@ -171,7 +172,8 @@ class Tiny:
         return [*dropped, *(f"{key}={value}" for key, value in words.items())]
 
 
-ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link")  # commands about a model
+# Commands about a model.
+ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link", "locate")
 ALIKE = {"exp005": "techtile", "exp006": "techtile", "plane": "own", "hall_1": "ble", "hall_2": "ble"}
 SHORT = {"threads": "1"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
@@ -182,6 +184,7 @@ TINY = {  # what makes each command short
     },
     "tradeoff": {"threads": "[1]", "rounds": "2", "baselines": "[]"},
     "evaluate": {**SHORT, "baselines": "[mean]"},
+    "locate": {**SHORT, "calibrate": "0", "rows": "3"},
     "link": {"pusch.coarse": "8", "pusch.fine": "16"},
     "map": {**SHORT, "step_m": "4"},
     "plan": {**SHORT, "count": "2"},
