@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from gsparc.ops import built, calls
 from gsparc.ops.operators import contiguous
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import followed
 
 
 def served(*tensors: Tensor) -> bool:
     """Whether the kernels answer: CPU tensors that neither autograd nor `torch.func` follows."""
-    plain = all(part.device.type == "cpu" for part in tensors) and not beyond_kernels(*tensors)
-    follows = torch.is_grad_enabled() and any(part.requires_grad for part in tensors)
-    return plain and not follows and built.kernels() is not None
+    plain = all(part.device.type == "cpu" for part in tensors) and not followed(*tensors)
+    return plain and built.kernels() is not None
 
 
 def array_spectrum(

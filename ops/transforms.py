@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch._C import _functorch
@@ -59,6 +60,18 @@ def transforming() -> bool:
 def beyond_kernels(*values: Any) -> bool:
     """Whether plain PyTorch must compute what a kernel would answer without its derivative, or not at all."""
     return transforming() or carries_tangent(*values)
+
+
+def followed(*values: Tensor) -> bool:
+    """Whether autograd, in either mode, or `torch.func` follows any of these."""
+    recorded = torch.is_grad_enabled() and any(value.requires_grad for value in values)
+    return recorded or beyond_kernels(*values)
+
+
+def numbers(value: Tensor) -> np.ndarray:
+    """The numbers of a tensor without what follows them, for choices that have no derivative."""
+    with torch._C._DisableFuncTorch():  # what it returns would be followed again
+        return unwrapped(value, 0)[0].detach().cpu().numpy()
 
 
 def unwatched(values: Iterable[Any]) -> bool:

@@ -59,7 +59,8 @@ class ErrorModel(nn.Module):
 
         The confidence is the share of the squared error expected far from all data that is not expected here.
         """
-        share = torch.lerp(unknown, ONE, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow_(self.power)
+        one = ONE.to(unknown.dtype)
+        share = torch.lerp(unknown, one, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow(self.power)
         return torch.sub(ONE, share), share * self.far
 
     def get_extra_state(self) -> Tensor:
@@ -111,7 +112,8 @@ class Confidence(nn.Module):
 
     def exponent(self, position: Tensor) -> Tensor:
         """g (B,), clamped: position (B, 3) [m]."""
-        g = self.network(self.encoding(position)).squeeze(-1).float()
+        g = self.network(self.encoding(position)).squeeze(-1)
+        g = g if g.dtype == torch.float64 else g.float()
         return g.clamp(-self.settings.clamp, self.settings.clamp)
 
     def calibrate(self, position: Tensor) -> None:

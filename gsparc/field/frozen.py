@@ -12,7 +12,7 @@ from gsparc import ops
 from gsparc.field import edit
 from gsparc.field.encoding import unknown_share
 from gsparc.field.model import GaussianModel, Rendered
-from gsparc.field.response import ArrayResponse
+from gsparc.field.response import SLOPE_ENDS, ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan, queries
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.processes.features import parts_of
@@ -64,9 +64,8 @@ class FrozenArray:
     offset: Tensor | None
     renderer: SpectrumRenderer
 
-    @torch.no_grad()
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Rendered:
-        """See `FrozenView.render`; spectra of a known share are cut off at 1."""
+        """See `FrozenView.render`; spectra of a known share are cut off at 1. Differentiable in positions."""
         _check_version(self.version, model)
         response = model.response
         assert isinstance(response, ArrayResponse)
@@ -75,7 +74,8 @@ class FrozenArray:
             unknown = model.unknown(tx, rx)
             return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)
         moving, encoding = model.site.moving(tx, rx), model.emission.encoding
-        if model.tells_unknown and queries.served(moving, self.weights):
+        kernels = moving.dtype == torch.float32 and queries.served(moving, self.weights)
+        if model.tells_unknown and kernels:
             mean, unknown = queries.array_spectrum(
                 moving, (encoding.anchors, encoding.whitening), (self.weights, self.offset),
                 self.renderer.tables, self.renderer.square, parts_of(encoding.length, encoding.kernel),
@@ -86,8 +86,9 @@ class FrozenArray:
         if not model.tells_unknown:
             return Rendered(response.spectra(torch.view_as_complex(parts)[:, :-1]), None)
         unknown = unknown_share(encoded)
-        parts[:, -1, 0] = unknown.sqrt()
-        return Rendered(self.renderer(torch.view_as_complex(parts)).clamp(max=1), None, unknown)
+        share = unknown.clamp_min(SLOPE_ENDS).sqrt()[:, None].to(parts.dtype.to_complex())
+        vectors = torch.cat([torch.view_as_complex(parts)[:, :-1], share], 1)
+        return Rendered(self.renderer(vectors).clamp(max=1), None, unknown)
 
 
 @torch.no_grad()

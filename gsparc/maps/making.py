@@ -234,7 +234,7 @@ def levels_at(
 
 
 def levels_of(
-    predictor: Predictor, ends: Callable[[np.ndarray], dict[End, np.ndarray]], places: np.ndarray
+    predictor: Predictor, ends: Callable[[np.ndarray], dict[End, Any]], places: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same with the ends that a predictor is told of each part of the places."""
     parts = [

@@ -27,7 +27,8 @@ class Prediction:
     """What a method says about B positions, in the units of the stored targets.
 
     Attributes:
-        mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32.
+        mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32; all of it
+            in double precision where positions are float64, see `Method.gradient_problem`.
         confidence: (B,) float32 in [0, 1], larger is surer; None when the method has none.
         variance: (B,) float32, expected squared error per entry; None when the method has none.
     """
@@ -83,6 +84,14 @@ class Method(ABC):
     @abstractmethod
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses, all in local coordinates."""
+
+    def gradient_problem(self) -> str | None:
+        """Why predictions have no gradients by position; None where they have.
+
+        Then autograd in either mode and `torch.func` follow `predict` at float64 positions of what moves, for
+        mean, variance and confidence, in double precision. What float32 positions get is not changed by it.
+        """
+        return "the method does not say that its operations are differentiable"
 
     def answer(self, batch: Batch) -> Prediction:
         """Predict a batch; a method that reads the fresh uplink of its snapshots overrides this."""
@@ -219,18 +228,6 @@ class Reducible(Protocol):
 
     def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """A method that answers with these settings; this one is left as it is."""
-
-
-@runtime_checkable
-class Differentiable(Protocol):
-    """Its mean has gradients by position."""
-
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The mean of `predict`, with autograd, at tx (B, 3) [m] and one shared or B receiver poses.
-
-        Raises:
-            ValueError: what was fitted here has no gradients.
-        """
 
 
 @runtime_checkable

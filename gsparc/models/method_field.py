@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, ClassVar, Self
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
@@ -46,7 +45,6 @@ class MethodField(ConditionalField):
         """See `ConditionalField`."""
         self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
 
-    @torch.no_grad()
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
         """See `ConditionalField`."""
         found = self.method.predict(tx, rx)

@@ -240,6 +240,10 @@ class PerStation(Method):
 
         return self._gathered(self._stations(tx, rx)[everyone], ask)
 
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`; that of any copy."""
+        return next(filter(None, (copy.gradient_problem() for copy in self._copies.values())), None)
+
     def of(self, number: int) -> Method:
         """The copy that answers for a station.
 
@@ -321,6 +325,10 @@ class OfStation(View):
     def __init__(self, inner: Method, number: int) -> None:
         super().__init__(inner)
         self.number = number
+
+    def gradient_problem(self) -> str | None:
+        """That of all stations."""
+        return self.inner.gradient_problem()
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""

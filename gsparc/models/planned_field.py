@@ -83,7 +83,7 @@ class PlannedField(LearnedField):
         self.plan: Plan | None = None
         self.explained: float | None = None
         self.started = ""  # initialisers of what was fitted
-        self._average: tuple[Method, float] | None = None  # a process and its weight in the mean
+        self._average: tuple[GaussianProcess, float] | None = None  # a process and its weight in the mean
         self._average_mean: Method | None = None  # that process without its variance, made when first asked
         self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
 
@@ -322,7 +322,6 @@ class PlannedField(LearnedField):
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
         return waves or site.kind == "rssi"
 
-    @torch.no_grad()
     def answer(self, batch: Batch) -> Prediction:
         """See `Method.answer`."""
         if self.field is None or not self.field.reads_rows:
@@ -332,7 +331,6 @@ class PlannedField(LearnedField):
             found = Prediction(of_field.mean, (1 - of_field.unknown).clamp(0, 1), of_field.variance)
         return self.runs.restored(found, batch.run)
 
-    @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
         if self.field is not None:
@@ -351,8 +349,10 @@ class PlannedField(LearnedField):
             return own
         if self._average_mean is None:
             self._average_mean = mean_alone(self._average[0])
-        mean = self._average_mean.predict(tx, rx).mean
-        return replace(own, mean=own.mean.lerp_(mean, self._average[1]))
+        method, weight = self._average
+        if tx.dtype == torch.float64:
+            return replace(own, mean=own.mean.lerp(method.mean_at(tx, rx), weight))
+        return replace(own, mean=own.mean.lerp_(self._average_mean.predict(tx, rx).mean, weight))
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -368,11 +368,10 @@ class PlannedField(LearnedField):
         found.field.condition(data, rows)
         return found
 
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """See `Differentiable`; of rasterized Gaussians, without an averaged process."""
-        if self.field is not None:
-            raise ValueError(f"{self.name}: its mean has no gradients by position")
-        return super().mean_at(tx, rx)
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`; fields in closed form and a process alone have gradients."""
+        alone = self._average is not None and not self.size()
+        return None if self.field is not None or alone else super().gradient_problem()
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
-from gsparc.models.method import Differentiable, Method, Prediction, Reducible
+from gsparc.models.method import Method, Prediction, Reducible
 from gsparc.models.pareto import Settings
 from gsparc.ops import Pose, SphereGrid
 
@@ -87,6 +87,10 @@ class View(Method):
         """See `Method.predict`."""
         return self.inner.predict(tx, rx)
 
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`."""
+        return "what answers faster does so in float32; load the whole model"
+
     def size(self) -> int:
         """As the inner method's."""
         return self.inner.size()
@@ -103,11 +107,16 @@ class View(Method):
 
 
 class MeanOnly(View):
-    """Leaves confidence and variance out of the answer."""
+    """Leaves confidence and variance out of the answer.
 
-    def __init__(self, inner: Method) -> None:
+    Args:
+        inner: fitted.
+        mean_at: answers with its mean alone, at tx (B, 3) [m] and receiver poses; None: it has no such thing.
+    """
+
+    def __init__(self, inner: Method, mean_at: Callable[[Tensor, Pose], Tensor] | None = None) -> None:
         super().__init__(inner)
-        self._mean_at = inner.mean_at if isinstance(inner, Differentiable) else None
+        self._mean_at = mean_at
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:

@@ -25,27 +25,30 @@ def ranges(observers: Tensor, sources: Tensor) -> Tensor:
     return (offset.square().sum(-1) + NEAR_M**2).sqrt()
 
 
-def reduced_phase(distance: Tensor, frequency_hz: Tensor | float) -> Tensor:
+def reduced_phase(
+    distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """`-2 pi f r / c` brought into [-pi, pi] in float64, then cast.
 
     Args:
         distance: (...) [m]; made float64. Its gradient is that of the unreduced phase.
         frequency_hz: broadcasts against `distance` [Hz].
+        dtype: of the result.
 
     Returns:
-        (...) float32 [rad].
+        (...) [rad].
     """
     cycles = distance.double() * (_double(frequency_hz, distance) / LIGHT)
-    return ((cycles.detach().round() - cycles) * (2 * math.pi)).float()
+    return ((cycles.detach().round() - cycles) * (2 * math.pi)).to(dtype)
 
 
-def wave(distance: Tensor, frequency_hz: Tensor | float) -> Tensor:
-    """`exp(-j 2 pi f r / c) / r`, complex64, of distances [m] and frequencies [Hz] that broadcast."""
-    return torch.polar((1 / distance).float(), reduced_phase(distance, frequency_hz))
+def wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32) -> Tensor:
+    """`exp(-j 2 pi f r / c) / r` of parts `dtype`; distances [m] and frequencies [Hz] broadcast."""
+    return torch.polar((1 / distance).to(dtype), reduced_phase(distance, frequency_hz, dtype))
 
 
-def wave_over_band(distance: Tensor, frequency_hz: Tensor) -> Tensor:
-    """The same at every one of F frequencies: (...) [m], (F,) [Hz] -> (..., F) complex64.
+def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """The same at every one of F frequencies: (...) [m], (F,) [Hz] -> (..., F).
 
     Evenly spaced tones are factored into a coarse and a fine comb, `f = f_0 + (q M + p) df`: about
     2 sqrt(F) sines and cosines instead of F, and one product per tone; 1/r enters with the coarse comb.
@@ -53,11 +56,11 @@ def wave_over_band(distance: Tensor, frequency_hz: Tensor) -> Tensor:
     frequency = _double(frequency_hz, distance)
     tones = len(frequency)
     if tones < 6 or not _evenly_spaced(frequency):
-        return wave(distance[..., None], frequency)
+        return wave(distance[..., None], frequency, dtype)
     fine = math.isqrt(tones - 1) + 1
-    coarse = wave(distance[..., None], frequency[::fine])
+    coarse = wave(distance[..., None], frequency[::fine], dtype)
     steps = frequency[:fine] - frequency[0]
-    turn = reduced_phase(distance[..., None], steps)
+    turn = reduced_phase(distance[..., None], steps, dtype)
     comb = torch.polar(torch.ones_like(turn), turn)
     return (coarse[..., :, None] * comb[..., None, :]).flatten(-2)[..., :tones]
 

@@ -16,6 +16,7 @@ from gsparc.data.schema import End, Kind, Site
 from gsparc.models.method import Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
+from gsparc.ops.transforms import carries_tangent, numbers, transforming
 from gsparc.prediction.confidence import Trusted
 from gsparc.prediction.timing import Call
 
@@ -34,6 +35,14 @@ class Predictor:
     Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis. NumPy (or
     lists) in gives NumPy out, torch in gives torch out. The static end may be left out: the model knows
     where it stood.
+
+    With `grad=True` predictions are differentiable by the position of what moves, which is then a tensor:
+    autograd in reverse and forward mode and `torch.func` (`grad`, `jacrev`, `jacfwd`, `jvp`, `vjp`) follow
+    them. All is computed in float64 and answered in the precision of the positions; `ValueError` where the
+    model has no gradients. Which rows are nearest and what a clamp cuts off have none.
+
+    >>> at = torch.tensor([2.0, 1.0, 1.5], dtype=torch.float64, requires_grad=True)
+    >>> predictor.rssi(rx=at, grad=True).log10().sum().backward()
 
     Args:
         method: fitted or restored.
@@ -60,6 +69,7 @@ class Predictor:
         self.method, self.site, self.point = method, site, point
         self._whole = whole or method
         self._still = self._still_pose()
+        self._prepared: list[Method] = []  # whose caches were filled outside of transforms
 
     def __repr__(self) -> str:
         low, high = (self.site.box + self.site.origin).round(2).tolist()
@@ -136,11 +146,17 @@ class Predictor:
             )
         return self.site.georeference
 
-    def predict(self, tx: Any = None, rx: Any = None) -> Prediction:
+    def predict(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Prediction:
         """Mean, variance and confidence (B, ...) at once, as tensors, in the units of the measurements.
 
-        The confidence is None where the method has none; else the one that `confidence` answers.
+        The confidence is None where the method has none; else the one that `confidence` answers. With `grad`
+        it is the method's own, and None where `confidence` answers another.
+
+        Raises:
+            ValueError: `grad` of a model without gradients, or of positions that are no tensors.
         """
+        if grad:
+            return self._followed(self._whole, tx, rx)[0]
         asked, pose, _, _ = self._ends(tx, rx)
         said = _predicted(self._whole, asked, pose)
         sure, scale = None, self.site.target_scale
@@ -164,13 +180,14 @@ class Predictor:
         ask = getattr(asked, self.site.kind)
         return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
 
-    def spectrum(self, tx: Any = None, rx: Any = None) -> Any:
+    def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
         """Power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
 
         Raises:
-            ValueError: the model predicts something else, or a position is missing or not finite.
+            ValueError: the model predicts something else, a position is missing or not finite, or `grad` as
+                in `predict`.
         """
-        return self._ask("spectrum", tx, rx)
+        return self._ask("spectrum", tx, rx, grad)
 
     def csi(
         self,
@@ -180,6 +197,7 @@ class Predictor:
         uplink: Any = None,
         frequency_hz: Any = None,
         symbols: int | None = None,
+        grad: bool = False,
     ) -> Any:
         """Channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
 
@@ -189,9 +207,12 @@ class Predictor:
             frequency_hz: (K,) [Hz] of any OFDM grid within the band; None for the measured tones.
             symbols: OFDM symbols of a slot; then the result is Sionna's
                 [rx, rx_ant, tx, tx_ant, symbols, K].
+            grad: as in `predict`; at the measured tones alone.
         """
         if uplink is None and frequency_hz is None and symbols is None:
-            return self._ask("csi", tx, rx)
+            return self._ask("csi", tx, rx, grad)
+        if grad:
+            raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
         from gsparc.prediction import export
 
         if uplink is not None:
@@ -217,9 +238,9 @@ class Predictor:
         asked, pose, _, _ = self._ends(tx, rx)
         return export.placed_paths(self._whole, self.site, asked, pose)
 
-    def rssi(self, tx: Any = None, rx: Any = None) -> Any:
+    def rssi(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
         """Received power (B, 1) float32, linear, in the physical units of the measurements."""
-        return self._ask("rssi", tx, rx)
+        return self._ask("rssi", tx, rx, grad)
 
     def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """How sure the model is, (B,) float32 in [0, 1], larger is surer.
@@ -269,18 +290,54 @@ class Predictor:
             raise ValueError(f"{self.method.name} has no confidence")
         return torch.from_numpy(self.trusted.confidence(said, places, self.kind)), single, like
 
-    def _ask(self, kind: Kind, tx: Any, rx: Any) -> Any:
+    def _ask(self, kind: Kind, tx: Any, rx: Any, grad: bool = False) -> Any:
         if self.site.kind != kind:
             raise ValueError(
                 f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
                 f"call .{self.site.kind}(...)"
             )
+        if grad:
+            found, single = self._followed(self.method, tx, rx)
+            return found.mean[0] if single else found.mean
         asked, pose, single, like = self._ends(tx, rx)
         mean = _predicted(self.method, asked, pose).mean
         scale = self.site.target_scale
         return _returned(mean if scale == 1 else mean * scale, single, like)
 
-    def _ends(self, tx: Any, rx: Any) -> tuple[Tensor, Pose, bool, bool]:
+    def _followed(self, method: Method, tx: Any, rx: Any) -> tuple[Prediction, bool]:
+        """Moments that autograd follows, and whether one position was asked for; see the class."""
+        problem = method.gradient_problem()
+        if problem is not None:
+            raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
+        ends, fixed = {"tx": tx, "rx": rx}, []
+        if isinstance(rx, Pose):
+            ends["rx"], fixed = rx.position, [rx.rotation]
+        if self.site.static_end is not None:
+            fixed.append(ends.pop(self.site.static_end))
+        for end, value in ends.items():
+            if value is not None and not isinstance(value, Tensor):
+                raise ValueError(f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}")
+        if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
+            raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
+        asked, pose, single, _ = self._ends(tx, rx, torch.float64)
+        origin = torch.from_numpy(np.asarray(self.site.origin, np.float64))
+        local = {end: (value.cpu().double() - origin).expand(len(asked), 3) for end, value in ends.items()}
+        at = Pose(local.get("rx", pose.position), pose.rotation)
+        with suited_threads(method, len(asked)):
+            if transforming() and method not in self._prepared:  # what it keeps must not be a transform's
+                self._prepared.append(method)
+                with torch._C._DisableFuncTorch(), torch.no_grad():
+                    method.predict(asked, pose)
+            found = method.predict(local.get("tx", asked), at)
+        dtype = torch.float32
+        for value in ends.values():
+            dtype = torch.promote_types(dtype, value.dtype)
+        scale, own = self.site.target_scale, (self.kind or self.trusted.kind) in (None, "learned")
+        mean = (found.mean * scale).to(dtype.to_complex() if found.mean.is_complex() else dtype)
+        sure = None if found.confidence is None or not own else found.confidence.to(dtype)
+        return Prediction(mean, sure, None if found.variance is None else found.variance * scale**2), single
+
+    def _ends(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pose, bool, bool]:
         """Both ends in local coordinates, whether one position was asked for, and whether torch was given."""
         given = rx.position if isinstance(rx, Pose) else rx
         places = {
@@ -291,7 +348,8 @@ class Predictor:
             if needed not in places:
                 raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
         single = all(place.ndim == 1 for place in places.values())
-        if self._still is not None and len(places) == 1:  # the common case, with nothing to look up
+        common = self._still is not None and len(places) == 1 and dtype == torch.float32
+        if self._still is not None and common:  # with nothing to look up
             asked = _float(np.atleast_2d(places[moving] - self.site.origin))
             return asked, self._still, single, isinstance(tx, Tensor)
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
@@ -302,11 +360,12 @@ class Predictor:
         ends = {moving: local[moving], static: self._static(local.get(static))}
         rotation = self._rotation(rx, count)
         if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
-            pose = Pose(_float(ends["rx"]), _float(rotation))
+            pose = Pose(_float(ends["rx"], dtype), _float(rotation, dtype))
         else:
             positions = np.broadcast_to(ends["rx"], (count, 3))
-            pose = Pose(_float(positions), _float(np.broadcast_to(rotation, (count, 3, 3))))
-        asked = _float(np.broadcast_to(ends["tx"], (count, 3)))
+            turned = np.broadcast_to(rotation, (count, 3, 3))
+            pose = Pose(_float(positions, dtype), _float(turned, dtype))
+        asked = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
         return asked, pose, single, any(isinstance(v, Tensor) for v in (tx, given))
 
     def _still_pose(self) -> Pose | None:
@@ -334,7 +393,7 @@ class Predictor:
 
     def _rotation(self, rx: Any, count: int) -> np.ndarray:
         if isinstance(rx, Pose):
-            rotation = rx.rotation.detach().cpu().double().numpy()
+            rotation = numbers(rx.rotation).astype(np.float64)
             if rotation.ndim == 3 and len(rotation) not in (1, count):
                 raise ValueError(f"rx= holds {len(rotation)} rotations for {count} positions")
             return rotation
@@ -359,7 +418,7 @@ def usual_heights(site: Site) -> dict[End, float]:
 def _positions(end: str, value: Any) -> np.ndarray:
     """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
     try:
-        array = value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
+        array = numbers(value) if isinstance(value, Tensor) else np.asarray(value)
         array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")
     except (TypeError, ValueError):
         raise ValueError(f"{end}= must be real numbers [m], got {type(value).__name__}") from None
@@ -376,8 +435,8 @@ def _positions(end: str, value: Any) -> np.ndarray:
     return array
 
 
-def _float(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.array(array, dtype=np.float32))
+def _float(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float32 if dtype == torch.float32 else np.float64))
 
 
 def _returned(value: Tensor, single: bool, as_torch: bool) -> Any:

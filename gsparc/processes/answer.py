@@ -38,12 +38,15 @@ class Posterior(ABC):
         """Of the rows (n, D) float64 [m]."""
 
     @abstractmethod
-    def answer(self, queries: Tensor) -> Answer:
-        """Of places (B, D) float64 [m]."""
+    def answer(self, queries: Tensor, exact: bool = False) -> Answer:
+        """Of places (B, D) float64 [m], with autograd; which rows are nearest has no gradient.
+
+        Values of very many rows may be float32, and means with them; `exact`: they are made float64.
+        """
 
     @abstractmethod
-    def mean_at(self, queries: Tensor) -> Tensor:
-        """The mean alone (B, P), with autograd for places (B, D) float64 [m]."""
+    def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
+        """The mean alone (B, P), as `answer` has it."""
 
     @abstractmethod
     def left_out(self) -> tuple[Tensor, Tensor]:

@@ -18,6 +18,7 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+from gsparc.ops.transforms import followed
 from gsparc.processes.worker import raise_if_cancelled
 
 # Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
@@ -151,7 +152,7 @@ def as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
 
 def _alone(*parts: Tensor) -> bool:
     """Whether these are single matrices for one thread of the processor, without gradients."""
-    grows = torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+    grows = followed(*parts)
     fits = all(part.dim() == 2 and part.device.type == "cpu" for part in parts)
     fits = fits and parts[0].dtype not in (torch.float16, torch.bfloat16)
     many = len(parts[0]) > ALONE and torch.get_num_threads() > 1

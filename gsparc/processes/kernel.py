@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.ops.transforms import beyond_kernels
+
 LENGTH_SPAN = (1e-3, 3.0)  # bounds of a length, of the median distance between rows
 NOISE_SPAN = (1e-6, 1e2)  # bounds of the noise's variance, of the amplitude
 SHARES = 6.0  # bound of the logit of a share
@@ -24,7 +26,11 @@ def apart(a: Tensor, b: Tensor) -> Tensor:
 
     Differences are formed before squaring: the expanded form loses millimetres in float32.
     """
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+    if not beyond_kernels(a, b):
+        return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+    squared = (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)  # `cdist` has no forward mode
+    none = squared == 0
+    return torch.where(none, 0.0, torch.where(none, 1.0, squared).sqrt())
 
 
 def matern32(distance: Tensor, length: Tensor | float) -> Tensor:

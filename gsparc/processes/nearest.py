@@ -21,12 +21,13 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from gsparc.ops.queries import nearest_weights, served
+from gsparc.ops.transforms import numbers
 from gsparc.processes.answer import Answer, Posterior
 from gsparc.processes.covering import covering
 from gsparc.processes.density import walked
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, WaveKernel, apart, bounds_of, matern_sum, unpacked
-from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, nearest_distance
 from gsparc.processes.prior import Prior
 
 COVER = 20_000  # rows that weigh the mean law
@@ -121,30 +122,32 @@ class Nearest(Posterior):
         """See `Posterior`."""
         return torch.from_numpy(self.near.places)
 
-    def answer(self, queries: Tensor) -> Answer:
+    def answer(self, queries: Tensor, exact: bool = False) -> Answer:
         """See `Posterior`."""
-        return self._answers(queries, None)
+        return self._answers(queries, None, exact)
 
-    def mean_at(self, queries: Tensor) -> Tensor:
-        """See `Posterior`; which rows are nearest has no gradient."""
-        return torch.cat([self._answer(part, None).mean for part in queries.split(self._block)])
+    def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
+        """See `Posterior`."""
+        return torch.cat([self._answer(part, None, exact).mean for part in queries.split(self._block)])
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """See `Posterior`."""
         found = self._answers(self.places, np.arange(len(self.places)))
         return found.mean, found.left
 
-    @torch.no_grad()
-    def _answers(self, queries: Tensor, without: np.ndarray | None) -> Answer:
+    def _answers(self, queries: Tensor, without: np.ndarray | None, exact: bool = False) -> Answer:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
-        parts = [self._answer(queries[b], None if without is None else without[b]) for b in blocks]
+        parts = [self._answer(queries[b], None if without is None else without[b], exact) for b in blocks]
         return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
 
-    def _answer(self, queries: Tensor, without: np.ndarray | None) -> Answer:
-        index = torch.from_numpy(self.near.nearest(queries.detach().numpy(), without, self.most))
+    def _answer(self, queries: Tensor, without: np.ndarray | None, exact: bool) -> Answer:
+        index = torch.from_numpy(self.near.nearest(numbers(queries), without, self.most))
         weights, known = self._weights(queries, index)
-        mean = torch.bmm(weights[:, None].to(self.rest.dtype), self.rest[index])[:, 0]
+        rest = self.rest[index]
+        if exact:
+            rest = rest.to(torch.complex128 if rest.is_complex() else torch.float64)
+        mean = torch.bmm(weights[:, None].to(rest.dtype), rest)[:, 0]
         left = 1 + self.prior.kernel.noise - known
         if self.prior.trend is not None:
             unsure = self.prior.columns(queries) - torch.bmm(weights[:, None], self._columns[index])[:, 0]
@@ -175,7 +178,7 @@ class Nearest(Posterior):
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
-        return torch.from_numpy(self.near.distance(queries.detach().numpy()))
+        return nearest_distance(self.near.every, queries)
 
     def state(self) -> dict[str, Any]:
         """See `Posterior`."""

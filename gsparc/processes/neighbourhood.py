@@ -6,9 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
+from torch import Tensor
 
+from gsparc.ops.transforms import followed, numbers
 from gsparc.processes.covering import covering
+from gsparc.processes.kernel import apart
 
 NEIGHBOURS = 30  # that tell of a place
 WIDER = 0.5  # share of them that are of sparser sets
@@ -48,12 +52,9 @@ class Neighbourhood:
         return [(own, cKDTree(self.places[own])) for own in sets]
 
     @cached_property
-    def _every(self) -> cKDTree:
+    def every(self) -> cKDTree:
+        """Of all places."""
         return cKDTree(self.places)
-
-    def distance(self, queries: np.ndarray) -> np.ndarray:
-        """From queries (B, D) to the nearest place (B,) [m]."""
-        return self._every.query(queries)[0]
 
     def nearest(
         self, queries: np.ndarray, without: np.ndarray | None = None, most: int = NEIGHBOURS
@@ -78,3 +79,22 @@ class Neighbourhood:
                 row = np.take_along_axis(row, later, 1)
             found.append(row)
         return np.concatenate(found, 1)
+
+
+def nearest_distances(tree: cKDTree, queries: Tensor, which: np.ndarray) -> tuple[Tensor, np.ndarray]:
+    """From queries (B, D) float64 to nearest places of a tree (B, k) [m], with autograd, and their numbers.
+
+    Args:
+        tree: of places.
+        queries: [m].
+        which: (k,) of the nearest ones, counted from 1.
+    """
+    distance, row = tree.query(numbers(queries), k=which)
+    if not followed(queries):
+        return torch.from_numpy(distance), row
+    return apart(queries[:, None], torch.from_numpy(tree.data[row]))[:, 0], row
+
+
+def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
+    """From queries (B, D) float64 to the nearest of a tree's places (B,) [m], with autograd."""
+    return nearest_distances(tree, queries, np.array([1]))[0][:, 0]

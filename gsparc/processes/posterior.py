@@ -81,8 +81,7 @@ class Exact(Posterior):
         """Of the rows' covariance."""
         return _factor(self.prior, self.rows, self.extra)
 
-    @torch.no_grad()
-    def answer(self, queries: Tensor) -> Answer:
+    def answer(self, queries: Tensor, exact: bool = False) -> Answer:
         """See `Posterior`."""
         own = self.prior.columns(queries)
         cross, prior = self._cross(queries, own), self.prior.variance(own)
@@ -102,7 +101,7 @@ class Exact(Posterior):
         near = Neighbourhood.of(self.rows.numpy(), 0)
         return Nearest(self.prior, near, none, noise, none[: len(spread)], spread, NEAR)
 
-    def mean_at(self, queries: Tensor) -> Tensor:
+    def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
         """See `Posterior`."""
         return self._mean(queries, self._cross(queries, self.prior.columns(queries)))
 

@@ -82,7 +82,6 @@ class Shared:
             self._blocks[number] = Block.of(process, self.columns(process.rows))
         return self._blocks[number]
 
-    @torch.no_grad()
     def answer(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, variance of a measurement, and the mean without the process's own part, each (B,).
 

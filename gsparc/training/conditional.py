@@ -26,9 +26,9 @@ class Posterior:
 
     Attributes:
         mean: (B, ...) of all terms.
-        variance: (B,) float32, expected squared error per entry of the mean.
+        variance: (B,) expected squared error per entry of the mean.
         explained: (B, ...) the share of the mean that its Gaussians predict; None where it has none.
-        unknown: (B,) float32 in [0, 1], the posterior's variance relative to the prior's; 1 far away.
+        unknown: (B,) in [0, 1], the posterior's variance relative to the prior's; 1 far away.
     """
 
     mean: Tensor
@@ -100,7 +100,10 @@ class ConditionalField(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
-        """Answer at tx (B, 3) [m] and one shared or B receiver poses, local coordinates."""
+        """Answer at tx (B, 3) [m] and one shared or B receiver poses, local coordinates.
+
+        Followed by autograd, and of double precision, where positions are float64.
+        """
 
     def answer(self, batch: Batch) -> Posterior:
         """Answer rows, whose stations and runs may matter."""

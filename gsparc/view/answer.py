@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -74,7 +75,8 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
     start = time.perf_counter()
     mean = np.asarray(getattr(predictor, kind)(**ends))
     query_ms = (time.perf_counter() - start) * 1e3
-    said = predictor.predict(**{end: np.atleast_2d(place) for end, place in ends.items()})
+    asked: dict[str, Any] = {end: np.atleast_2d(place) for end, place in ends.items()}
+    said = predictor.predict(**asked)
     still: dict[str, np.ndarray] = {}
     if site.static_end is not None and site.static_position is not None:
         still[site.static_end] = site.static_position + site.origin

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -80,7 +81,8 @@ def answers(
             continue
         for start in range(0, len(chosen), CHUNK):
             rows = chosen[start : start + CHUNK]
-            said = asking.predict(**{end: places[row[rows]] for end, places in world.items()})
+            ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
+            said = asking.predict(**ends)
             if not parts:
                 accept(tuple(said.mean.shape[1:]))
             parts.append((rows, said))

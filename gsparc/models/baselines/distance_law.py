@@ -22,10 +22,9 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance, to_real
-from gsparc.ops import Pose
 from gsparc.processes.powers import Rows
 from gsparc.processes.trend import TINY_M, Law, law_of_state
 from gsparc.processes.worker import stop_when_late
@@ -180,7 +179,7 @@ def law_of(rows: Rows, site: Site) -> tuple[Law, tuple[str, ...]]:
     return fit_law(rows, place), (f"the {end}'s place is not given; estimated from powers at ({where}) m",)
 
 
-class DistanceLaw(Interpolator):
+class DistanceLaw(Differentiable):
     """Powers by the distance between the moving and the still end, or between two moving ends."""
 
     name = "distance_law"
@@ -206,18 +205,10 @@ class DistanceLaw(Interpolator):
         )
         return tuple(f"distance_law: {note}" for note in (said, *notes))
 
-    def _look_up(self, queries: np.ndarray) -> Prediction:
-        with torch.no_grad():
-            mean = self._mean(torch.from_numpy(queries))
-        variance = torch.full((len(queries),), law_variance(self.law))
+    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+        mean = self._decode(self.law.mean(queries)[:, None].to(dtype))
+        variance = torch.full((len(queries),), law_variance(self.law), dtype=dtype)
         return Prediction(mean, variance=entry_variance(variance, mean, self.kind))
-
-    def _mean(self, places: Tensor) -> Tensor:
-        return self._decode(self.law.mean(places)[:, None].float())
-
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The mean (B, 1) alone; see `Differentiable`."""
-        return self._mean(self._queries(tx, rx))
 
     def _learned(self) -> dict[str, Any]:
         return self.law.state()

@@ -15,7 +15,7 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements
-from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.haste import CHOSEN_ON
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
@@ -102,7 +102,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     return by_left_out(starts, distance, None, values, bounds, LOOKS, 1e-5, entries, bounded=False)[1]
 
 
-class GaussianProcess(Interpolator):
+class GaussianProcess(Differentiable):
     """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
 
     Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows
@@ -187,27 +187,31 @@ class GaussianProcess(Interpolator):
         found.powers, _ = conditioned(rows_of(data, rows), self.powers.trend, self.powers.kernel, 0)
         return found
 
-    @torch.no_grad()
-    def _look_up(self, queries: np.ndarray) -> Prediction:
-        places = torch.from_numpy(queries)
+    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         if self.powers is not None:
-            decibels, spread, share = self.powers.answer(places)
-            power = self._decode(decibels[:, None].float())
-            return Prediction(power, (1 - share).float(), entry_variance(spread.float(), power, self.kind))
+            decibels, spread, share = self.powers.answer(queries)
+            power = self._decode(decibels[:, None].to(dtype))
+            return Prediction(
+                power, (1 - share).to(dtype), entry_variance(spread.to(dtype), power, self.kind)
+            )
         assert self.scores is not None
-        found, kernel = self.scores.answer(places), self.scores.prior.kernel
-        mean = self._decode(torch.addmm(self.mean, found.mean.float(), self.axes))
-        variance = (kernel.amplitude * found.left + self.lost).float()
-        sure = (1 - found.left / (1 + kernel.noise)).float()
+        found, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
+        mean = self._composed(found.mean, dtype)
+        variance = (kernel.amplitude * found.left + self.lost).to(dtype)
+        sure = (1 - found.left / (1 + kernel.noise)).to(dtype)
         return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The mean (B, ...) alone; see `Differentiable`. The variance is most of a prediction."""
+        """The mean (B, ...) of `predict` alone: the variance is most of a prediction."""
         queries = self._queries(tx, rx)
         if self.powers is not None:
-            return self._decode(self.powers.mean_at(queries)[:, None].float())
+            return self._decode(self.powers.mean_at(queries)[:, None].to(tx.dtype))
         assert self.scores is not None
-        return self._decode(torch.addmm(self.mean, self.scores.mean_at(queries).float(), self.axes))
+        return self._composed(self.scores.mean_at(queries, tx.dtype == torch.float64), tx.dtype)
+
+    def _composed(self, scores: Tensor, dtype: torch.dtype) -> Tensor:
+        """Targets (B, ...) of components (B, P)."""
+        return self._decode(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
@@ -225,7 +229,7 @@ class GaussianProcess(Interpolator):
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
         if not isinstance(self.scores, Exact):
-            return MeanOnly(self)
+            return MeanOnly(self, self.mean_at)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
         kept: Tensor | slice = slice(

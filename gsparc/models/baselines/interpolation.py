@@ -7,6 +7,7 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements, Site
@@ -63,7 +64,11 @@ class Interpolator(Method):
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        return self._look_up(self._queries(tx, rx).detach().numpy())
+        return self._answered(self._queries(tx, rx), tx.dtype)
+
+    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+        """Predict at (B, 3) float64 [m], or (B, 6); see `Differentiable`."""
+        return self._look_up(queries.detach().numpy())
 
     def _queries(self, tx: Tensor, rx: Pose) -> Tensor:
         """Places (B, 3) float64 [m] of the moving end, or (B, 6) of both."""
@@ -113,3 +118,18 @@ class Interpolator(Method):
         """Inverse of what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
             setattr(self, name, state[name])
+
+
+class Differentiable(Interpolator):
+    """One whose `_answered` is followed by autograd, in the precision that it is given."""
+
+    def gradient_problem(self) -> str | None:
+        """None; see `Method.gradient_problem`."""
+        return None
+
+    @abstractmethod
+    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+        """Predict at (B, 3) float64 [m], or (B, 6), as float32 or float64."""
+
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        return self._answered(torch.from_numpy(queries), torch.float32)

@@ -23,5 +23,9 @@ class Mean(Interpolator):
         self.value = torch.from_numpy(total / len(targets)).float()
         return ()
 
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`."""
+        return "predictions are the same everywhere"
+
     def _look_up(self, queries: np.ndarray) -> Prediction:
         return Prediction(self._decode(self.value.expand(len(queries), -1).contiguous()))

@@ -17,6 +17,7 @@ from torch import Tensor
 from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.models.image_sources.run_factors import aligning, run_quadratic
 from gsparc.ops import Pose
+from gsparc.ops.transforms import numbers
 from gsparc.processes.factor import Factor
 
 NOBODY = -1  # in place of a station's number: none of them
@@ -88,7 +89,7 @@ class Group:
     @cached_property
     def displacements(self) -> bytes:
         """Equal for groups whose places differ by one displacement at most, to a micrometre."""
-        return (self.places - self.places[0]).mul(1e6).round().numpy().tobytes()
+        return numbers((self.places - self.places[0]).mul(1e6).round()).tobytes()
 
 
 def refuse(site: Site) -> None:

@@ -160,22 +160,21 @@ class ComplexGP(Method):
         more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
         return f"factors of runs, relative to run {names[np.bincount(run).argmax()]:g}: {listed}{more}"
 
-    @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
-        found, kernel = self._fitted().answer(self._moving(tx, rx)), self.kernel
+        exact, kernel = tx.dtype == torch.float64, self.kernel
+        found = self._fitted().answer(self._moving(tx, rx), exact)
         share = found.left / (1 + kernel.noise)
-        mean = found.mean.to(torch.complex64).reshape(-1, *self.shape)
-        return Prediction(mean, (1 - share).float().clamp(0, 1), (kernel.amplitude * share).float())
+        mean = found.mean.to(tx.dtype.to_complex()).reshape(-1, *self.shape)
+        return Prediction(mean, (1 - share).to(tx.dtype).clamp(0, 1), (kernel.amplitude * share).to(tx.dtype))
+
+    def gradient_problem(self) -> str | None:
+        """None; see `Method.gradient_problem`."""
+        return None
 
     def answer(self, batch: Batch) -> Prediction:
         """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
         return self.runs.restored(self.predict(batch.tx, batch.rx), batch.run)
-
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The mean alone (B, A, K) complex64; see `Differentiable`."""
-        mean = self._fitted().mean_at(self._moving(tx, rx))
-        return mean.to(torch.complex64).reshape(-1, *self.shape)
 
     def leave_one_out(self) -> LeftOut:
         """See `LeaveOneOut`; rows are those of the fit, counted from 0; of visits to a place, the first."""

@@ -28,6 +28,7 @@ from gsparc.models.channels.covariance import (
 )
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.ops import Pose
+from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
@@ -232,16 +233,16 @@ class ChannelField(ConditionalField):
         station = self._numbers(station, nearest)
         count, longest = len(moving), max(len(each.group) for each in self._conditioned())
         parts = [
-            self._answer(moving[part], static[part], turned[part], station[part])
+            self._answer(moving[part], static[part], turned[part], station[part], tx.dtype)
             for part in torch.arange(count).split(max(CHUNK // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
         device = tx.device
         return Posterior(
             mean.to(device),
-            after.float().to(device),
+            after.to(tx.dtype).to(device),
             share.to(device) if self.count else None,
-            (after / before.clamp_min(1e-300)).clamp(0, 1).float().to(device),
+            (after / before.clamp_min(1e-300)).clamp(0, 1).to(tx.dtype).to(device),
         )
 
     def _numbers(self, station: Tensor | None, nearest: Tensor) -> Tensor:
@@ -260,13 +261,14 @@ class ChannelField(ConditionalField):
         return replace(found, mean=found.mean * turned, variance=variance, explained=explained)
 
     def _answer(
-        self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor
+        self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Mean and images' share of it (B, A, K), variance after and before learning (B,)."""
+        """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
         shape, values, size = self.shape, self._held, math.prod(self.channel)
-        mean = torch.zeros(len(moving), *self.channel, dtype=torch.complex64)
+        mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
         share = torch.zeros_like(mean) if self.count else mean
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
+        exact = dtype == torch.float64
         disturbed = sum(shape.of(name, values.power).sum() for name in ("noise", "fast", "drift"))
         for alike in self._by_places(moving, turned, station):
             slots, places, learned = (
@@ -282,12 +284,13 @@ class ChannelField(ConditionalField):
                 slot.put(mean, here, known.given.mean(cross))
                 if self.count:
                     slot.put(share, here, known.given.mean(explained(shape, values, slot, places, learned)))
+                learned = known.given.known(cross) if exact else known.learned(cross)
                 weight = known.scale * known.group.target.shape[1] / size
                 whole = prior(shape, values, slot, places) + disturbed
-                after.index_add_(0, here, weight * (whole - known.learned(cross)).clamp_min(0))
+                after.index_add_(0, here, weight * (whole - learned).clamp_min(0))
                 before.index_add_(0, here, weight * whole)
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
-        for place in static[unheard].unique(dim=0):
+        for place in static[unheard].detach().unique(dim=0):
             here = torch.nonzero(unheard & (static == place).all(1)).flatten()
             self._of_unheard(place, here, moving, turned, mean, after, before)
         return mean, share, after, before
@@ -302,8 +305,8 @@ class ChannelField(ConditionalField):
             for known in self.stations.get(number, ()):
                 slot, learned = known.group.slot, known.group
                 places = slot.places(moving[here], turned[here])
-                first = learned.places[0].numpy().tobytes()
-                asked_at = places.detach().numpy().tobytes()
+                first = numbers(learned.places)[0].tobytes()
+                asked_at = numbers(places).tobytes()
                 key = (slot.wavenumber, learned.displacements, first, asked_at)
                 found.setdefault(key, []).append((known, here, places))
         return list(found.values())

@@ -29,10 +29,11 @@ from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse
 from gsparc.models.image_sources.gp_likelihood import steering, with_noise
 from gsparc.models.image_sources.rows import Rows, gather
 from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityGP, flips
+from gsparc.models.in_double import in_double
 from gsparc.models.method import LeftOut, Prediction
 from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
-from gsparc.processes.kernel import matern32_of_squares
+from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out_group
 from gsparc.training.context import FitContext, FitReport
 
@@ -62,11 +63,10 @@ class GainKernel:
     length: float
     noise: float
 
-    def correlation(self, first: Tensor, second: Tensor) -> Tensor:
-        """(n, m) float32 of places (n, 3) and (m, 3) float64 [m]."""
-        apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
-        squared = (apart / self.length).square()
-        return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).float()
+    def correlation(self, first: Tensor, second: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(n, m) of places (n, 3) and (m, 3) float64 [m]."""
+        squared = (apart(first, second) / self.length).square()
+        return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).to(dtype)
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ class DirectionalGP(FramedMethod):
     """
 
     name = "directional_gp"
+    _doubled: DirectionalGP | None = None  # made when first asked in float64
 
     def __init__(self, rows: int = 3000, seed: int = 0) -> None:
         if rows < 8:
@@ -192,7 +193,7 @@ class DirectionalGP(FramedMethod):
 
     def _prepare(self) -> None:
         """Quantities derived from the state that queries need."""
-        rows = self.rows
+        rows, self._doubled = self.rows, None
         self.waves, self.uncertain, self.phase_vectors, retained = self._prior(rows, self.observer)
         correlation = self.kernel.correlation(rows.position, rows.position)
         covariance = _covariance(self.waves, self.waves, self.power, self.uncertain, retained)
@@ -252,18 +253,21 @@ class DirectionalGP(FramedMethod):
     # ---- predicting ----
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the variance includes gains, noise and visibility."""
-        query = self._query(tx, rx)
-        return self._prediction(self._sum(query), *self._variance(query))
+        answering = self._exact() if tx.dtype == torch.float64 else self
+        query = answering._query(tx, rx)
+        return self._prediction(answering._sum(query), *answering._variance(query))
 
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The mean alone (B, A, K) complex64."""
-        return self._sum(self._query(tx, rx))
+    def _exact(self) -> DirectionalGP:
+        """The same in float64."""
+        if self._doubled is None:
+            self._doubled = in_double(self)
+        return self._doubled
 
     def _sum(self, query: QueryGeometry) -> Tensor:
         """Predicted mean channels (B, A, K) of a query's receivers."""
         tones = torch.from_numpy(self._fitted().tones())
         gains = query.probability[:, :, None] * self._gains(query)
-        return self._stored(gains.mT @ wave_over_band(query.away, tones), tones)
+        return self._stored(gains.mT @ wave_over_band(query.away, tones, self.power.dtype), tones)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""
@@ -276,16 +280,17 @@ class DirectionalGP(FramedMethod):
     def _query(self, tx: Tensor, rx: Pose) -> QueryGeometry:
         """Query geometry of receivers, their antennas in the regression's frame."""
         flat, count = self._places(tx, rx)
-        retained = torch.zeros(0, len(flat), len(self.rows))
+        dtype = self.power.dtype
+        retained = torch.zeros(0, len(flat), len(self.rows), dtype=dtype)
         if len(self.uncertain):
             unsure, carrier = self.positions.only(self.uncertain), torch.tensor(self.frame.carrier_hz)
-            retained = coherence(unsure.phase_vectors(flat, carrier), self.phase_vectors)
+            retained = coherence(unsure.phase_vectors(flat, carrier, dtype), self.phase_vectors)
         return QueryGeometry(
             flat,
             count,
             ranges(flat, self.sources),
-            self.visibility.probability(flat).float(),
-            self.kernel.correlation(flat, self.rows.position),
+            self.visibility.probability(flat).to(dtype),
+            self.kernel.correlation(flat, self.rows.position, dtype),
             retained,
         )
 
@@ -300,7 +305,8 @@ class DirectionalGP(FramedMethod):
 
     def _variance(self, query: QueryGeometry) -> tuple[Tensor, Tensor]:
         """Expected squared error and expected power (m,) at a query's places."""
-        probability, arriving = query.probability, wave(query.away, self.frame.carrier_hz)
+        probability = query.probability
+        arriving = wave(query.away, self.frame.carrier_hz, self.power.dtype)
         powers = arriving.abs().square() * self.power
         cross = _covariance(arriving * probability, self.waves, self.power, self.uncertain, query.retained)
         cross = cross * query.correlation

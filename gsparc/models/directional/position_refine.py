@@ -26,6 +26,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import apart
 
 SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
 DRAWS_PER_CELL, MIN_DRAWS, MAX_DRAWS = 6, 32, 768  # positions per (quarter wavelength)^3 of the prior
@@ -56,10 +57,10 @@ class UncertainPositions:
         """(K, 3, 3), Cholesky factors of the covariances."""
         return Factor.of(self.covariance + 1e-14 * torch.eye(3, dtype=torch.float64), "raise").lower
 
-    def phase_vectors(self, places: Tensor, frequency: Tensor) -> Tensor:
-        """(K, n, 3) float32 [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
+    def phase_vectors(self, places: Tensor, frequency: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(K, n, 3) [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
         slope = wave_vectors(self.points, places, frequency)
-        return (slope @ self.lower).float()
+        return (slope @ self.lower).to(dtype)
 
     def only(self, kept: Tensor) -> UncertainPositions:
         """A subset of the sources."""
@@ -81,10 +82,8 @@ def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
 
 
 def coherence(first: Tensor, second: Tensor) -> Tensor:
-    """(K, m, n) float32, of `phase_vectors` (K, m, 3) and (K, n, 3)."""
-    # rounding of expanded squares would make covariances indefinite
-    apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
-    return apart.square_().mul_(-0.5).exp_()
+    """(K, m, n), of `phase_vectors` (K, m, 3) and (K, n, 3)."""
+    return apart(first, second).square().mul_(-0.5).exp_()
 
 
 @dataclass

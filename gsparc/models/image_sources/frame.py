@@ -52,6 +52,10 @@ class FramedMethod(Method):
     antennas: int
     frame: Frame
 
+    def gradient_problem(self) -> str | None:
+        """None; see `Method.gradient_problem`."""
+        return None
+
     def _fitted(self) -> Site:
         if self.site is None or not self.size():
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")

@@ -310,7 +310,8 @@ class ImageSourceGP(FramedMethod):
         """
         flat, _ = self._places(tx, rx)
         tones = torch.from_numpy(self._fitted().tones())
-        stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
+        query = self.query.exact if tx.dtype == torch.float64 else self.query
+        stack, variance, prior = query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)

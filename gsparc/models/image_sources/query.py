@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -14,8 +15,10 @@ from gsparc.models.image_sources.gp_likelihood import Scene
 from gsparc.models.image_sources.phased_gp import PhasedPosterior, shares
 from gsparc.models.image_sources.rows import ranges_at
 from gsparc.models.image_sources.visibility_kernel import directions
+from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band
+from gsparc.processes.kernel import apart
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 VARIANCE_ROWS = 350  # that a variance is computed from: fewer overestimate it
@@ -80,9 +83,10 @@ class PackedSources:
 
         With what does not vary, a visibility's correlation is `constant + (1 - constant) varying`.
         """
-        apart = torch.cdist(queries, self.places, compute_mode="donot_use_mm_for_euclid_dist")
-        scaled = torch.addcmul(self.by_angle, apart.square().float(), self.by_length)
-        scaled = torch.baddbmm(scaled, directions(queries[:, :3], self.sources), self.towards)
+        dtype = self.towards.dtype
+        squared = apart(queries, self.places).square().to(dtype)
+        scaled = torch.addcmul(self.by_angle, squared, self.by_length)
+        scaled = torch.baddbmm(scaled, directions(queries[:, :3], self.sources, dtype), self.towards)
         root = scaled.clamp_min(1e-9).sqrt()  # Matern-3/2 of 3 times the squared distances
         decay = torch.exp(-root)
         return torch.addcmul(decay, root, decay)
@@ -110,6 +114,11 @@ class Query:
         self.level = real.sum(1, keepdim=True) * self.pack.constant
         self.variance = RowVariance(members[0], place_of, variance_rows) if variance_rows else None
 
+    @cached_property
+    def exact(self) -> Query:
+        """The same in float64."""
+        return in_double(self)
+
     def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance (m,), prior (m,).
 
@@ -124,7 +133,7 @@ class Query:
 
     def _part(self, part: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         gains, varying, seen = self._gains(part)
-        waves = wave_over_band(self.pack.ranges(part), tones)  # (m, K, F)
+        waves = wave_over_band(self.pack.ranges(part), tones, varying.dtype)  # (m, K, F)
         split = zip(gains.permute(1, 2, 0).split(self.counts, 2), waves.split(self.counts, 1), strict=True)
         means = torch.stack([gain @ each for gain, each in split])
         if self.variance is None:

@@ -15,7 +15,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.processes.kernel import matern32_of_squares
+from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out as residuals
 
 LENGTHS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # candidates for every source
@@ -71,9 +71,8 @@ class VisibilityGP:
 
     def probability(self, places: Tensor) -> Tensor:
         """Probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
-        apart = torch.cdist(places, self.places, compute_mode="donot_use_mm_for_euclid_dist")
         lengths, weights = self._by_length
-        correlation = matern32_of_squares((apart[:, None] / lengths).square()).flatten(1)
+        correlation = matern32_of_squares((apart(places, self.places)[:, None] / lengths).square()).flatten(1)
         return torch.addmm(self._mean, correlation, weights).clamp(0, 1)
 
     @cached_property

@@ -57,10 +57,10 @@ class KernelVisibility:
         return KernelVisibility(float(self.constant), float(self.angle), float(self.length))
 
 
-def directions(places: Tensor, sources: Tensor) -> Tensor:
-    """Unit vectors (..., n, 3) float32 from sources (..., 3) to places (n, 3) float64 [m]."""
+def directions(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
     offset = places - sources[..., None, :]
-    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).float()
+    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).to(dtype)
 
 
 def _is_wide(places: Tensor, length: float) -> bool:

@@ -98,7 +98,7 @@ class Mixture(ConditionalField):
         unknown = torch.stack([weight * one.unknown for weight, one in pairs]).sum(0)
         if self.residual is not None:
             mean = mean + self.share * self.residual(tx, rx).mean
-        return Posterior(mean, variance.float(), explained, unknown.float())
+        return Posterior(mean, variance.to(mean.real.dtype), explained, unknown.to(mean.real.dtype))
 
     def left_out(self) -> LeftOutRows:
         """The mean of all."""

@@ -143,7 +143,7 @@ def neighbourhoods(kernel: Kernel, places: np.ndarray) -> tuple[Tensor, Tensor]:
 
 def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor) -> Tensor:
     """Columns (m, 5) of the regression from k neighbours: (m, k) distances [m], (m, k, k), (m, k) errors."""
-    variance = _variance(kernel, distance, precision).log().float()
+    variance = _variance(kernel, distance, precision).log().to(distance.dtype)
     return torch.cat([torch.stack([_average(distance, errors), variance], 1), features], 1)
 
 

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.baselines.interpolation import Interpolator
+from gsparc.models.baselines.interpolation import Differentiable
+from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
 from gsparc.models.moving_array.error_model import ErrorModel, fit_error_model, image_features
 from gsparc.models.moving_array.power_gp import Trend, TrendSettings, fit_trend
@@ -74,7 +75,7 @@ class Spectra:
         return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
 
-class MovingArrayField(Interpolator):
+class MovingArrayField(Differentiable):
     """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
 
     With `trainer.budget_s` it searches until the budget is spent or the leave-one-out error stops falling.
@@ -307,26 +308,28 @@ class MovingArrayField(Interpolator):
 
     def posterior(self, tx: Tensor, rx: Pose) -> Posterior:
         """What is known at queries; `explained` are the sources' images alone."""
-        return self._answer(self.where(tx, rx))
+        return self._posterior(self.where(tx, rx), tx.dtype)
 
-    def _look_up(self, queries: np.ndarray) -> Prediction:
-        found = self._answer(torch.from_numpy(queries))
+    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+        found = self._posterior(queries, dtype)
         return Prediction(found.mean, 1 - found.unknown, found.variance)
 
-    @torch.no_grad()
-    def _answer(self, where: Tensor) -> Posterior:
-        found = self.query()(where)
+    def _posterior(self, where: Tensor, dtype: torch.dtype) -> Posterior:
+        query, errors = self.query(), self.error_model
+        if dtype == torch.float64:
+            query, errors = query.exact, in_double(errors)
+        found = query(where)
         mean = found.image.clamp_(0, 1)
         features = image_features(mean, found.added / mean[0].numel())
         power = mean.flatten(1).square().mean(1)
-        unknown, variance = self.error_model.expected(found.far, features, power)
-        return Posterior(mean, variance, found.explained.clamp_(0, 1), unknown)
+        unknown, variance = errors.expected(found.far, features, power)
+        return Posterior(mean, variance, found.explained.clamp(0, 1), unknown)
 
     def where(self, tx: Tensor, rx: Pose) -> Tensor:
         """Receivers' places (B, 3) float64 [m]; `ValueError` before `fit` or `restore`."""
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        return self._queries(tx, rx).detach()
+        return self._queries(tx, rx)
 
     def query(self) -> Query:
         """Answers with all that was found, made once."""

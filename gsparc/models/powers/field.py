@@ -29,6 +29,7 @@ from gsparc.models.target_rows import (
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
+from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.trend import Trend, trend_of
@@ -107,7 +108,6 @@ class PowerField(ConditionalField):
             heard = np.flatnonzero(nearest.noise.numpy() <= self.process.kernel.noise)
             self.at = heard[cKDTree(self.process.places[heard]).query(loud.places)[1]]
 
-    @torch.no_grad()
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
         """See `ConditionalField`; (B, 1) linear powers.
 
@@ -117,17 +117,10 @@ class PowerField(ConditionalField):
         process, places = self._conditioned(), self._places(tx, rx)
         parts = [self._answer(process, part) for part in places.split(QUERIES)]
         mean, spread, share, explained = (torch.cat(part) for part in zip(*parts, strict=True))
+        mean, spread, share, explained = (part.to(tx.dtype) for part in (mean, spread, share, explained))
         power = self._power(mean)
         said = self._power(explained) if self.count else None
-        return Posterior(power, entry_variance(spread.float(), power, "rssi"), said, share.float())
-
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The mean (B, 1) alone, with autograd for places."""
-        process, places = self._conditioned(), self._places(tx, rx)
-        decibels = process.mean_at(places)
-        if self.fringes is not None:
-            decibels, _ = self.fringes.blended(decibels, places, self._distance(places.detach()))
-        return self._power(decibels)
+        return Posterior(power, entry_variance(spread, power, "rssi"), said, share)
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
@@ -145,10 +138,10 @@ class PowerField(ConditionalField):
         places = process.places[loud]
         if self.fringes is not None:
             decibels, factor = self.fringes.blended_unseen(
-                decibels, torch.from_numpy(places), nearest(places), self.known
+                decibels, torch.from_numpy(places), torch.from_numpy(nearest(places)), self.known
             )
             spread = spread * factor
-        mean = self._power(decibels)
+        mean = self._power(decibels.float())
         return LeftOutRows(self.known, mean, entry_variance(spread.float(), mean, "rssi"))
 
     def state(self) -> dict[str, Any]:
@@ -177,11 +170,11 @@ class PowerField(ConditionalField):
         mean, factor = self.fringes.blended(mean, places, self._distance(places))
         return mean, spread * factor, share, self.fringes.solutions(places).mean(1)
 
-    def _distance(self, places: Tensor) -> np.ndarray:
+    def _distance(self, places: Tensor) -> Tensor:
         """From the nearest known row (B,) [m]."""
         if self._tree is None:
             self._tree = cKDTree(self._conditioned().places)
-        return self._tree.query(places.numpy())[0]
+        return nearest_distance(self._tree, places)
 
     def _conditioned(self) -> PowerProcess:
         if self.process is None:
@@ -193,7 +186,7 @@ class PowerField(ConditionalField):
         return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
     def _power(self, decibels: Tensor) -> Tensor:
-        return from_real(decibels[:, None].float(), "rssi", (1,))
+        return from_real(decibels[:, None], "rssi", (1,))
 
 
 def initialise(

@@ -52,11 +52,11 @@ class Blend:
     share: tuple[float, float]
     left: tuple[float, float]
 
-    def at(self, distance: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, distance: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
         """Shares (n,) of the solutions, and factors (n,) of the process's variance."""
         near, far = self.distance
-        there = np.clip((distance - near) / max(far - near, 1e-12), 0.0, 1.0)
-        inside = np.clip((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0]), 0.0, 1.0)
+        there = ((distance - near) / max(far - near, 1e-12)).clamp(0.0, 1.0)
+        inside = ((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0])).clamp(0.0, 1.0)
         share = (self.share[0] + (self.share[1] - self.share[0]) * there) * inside
         left = self.left[0] + (self.left[1] - self.left[0]) * there
         return share, 1 + (left - 1) * inside
@@ -96,7 +96,7 @@ class Fringes:
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
         return self.level + 10 * (field.real.square() + field.imag.square() + FLOOR).log10()
 
-    def blended(self, decibels: Tensor, places: Tensor, distance: np.ndarray) -> tuple[Tensor, Tensor]:
+    def blended(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """A process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
 
         Args:
@@ -107,7 +107,7 @@ class Fringes:
         return self._shared(decibels, self.solutions(places).mean(1), distance)
 
     def blended_unseen(
-        self, decibels: Tensor, places: Tensor, distance: np.ndarray, rows: np.ndarray
+        self, decibels: Tensor, places: Tensor, distance: Tensor, rows: np.ndarray
     ) -> tuple[Tensor, Tensor]:
         """The same at rows (n,) by those solutions that never saw them or their surroundings."""
         at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
@@ -115,8 +115,8 @@ class Fringes:
         mean = _held_out_mean(self.solutions(places).numpy(), fold, self.blind)
         return self._shared(decibels, torch.from_numpy(mean), distance)
 
-    def _shared(self, decibels: Tensor, mean: Tensor, distance: np.ndarray) -> tuple[Tensor, Tensor]:
-        share, factor = (torch.from_numpy(v) for v in self.blend.at(distance, self.wavelength))
+    def _shared(self, decibels: Tensor, mean: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+        share, factor = self.blend.at(distance, self.wavelength)
         return decibels + share * (mean - decibels), factor
 
     def state(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
+from gsparc.models.in_double import in_double
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.weights import LEAST_HELD
@@ -73,6 +74,8 @@ class LearnedField(Method):
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = True
     _limited_by: Clock | None = None
+    # Of a version, with what an array sees or without, in float64.
+    _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
 
     def __init__(
         self,
@@ -152,7 +155,7 @@ class LearnedField(Method):
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             self._stage("train", origin, data, fold, context, budget, seconds)
             self._weigh_process(data, fold)
-            self.frozen = None
+            self.frozen = self._doubled = None
             return FitReport(budget.counted.wall, limited_by=self._limited_by)
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
@@ -166,7 +169,7 @@ class LearnedField(Method):
             again = context.within("refit", resume=resume)
             confidence = self.fitted().confidence
             self._stage("refit", origin, data, every, again, budget, seconds, confidence)
-        self.frozen = None
+        self.frozen = self._doubled = None
         return FitReport(budget.counted.wall, limited_by=self._limited_by)
 
     def _pays(self) -> bool:
@@ -317,17 +320,40 @@ class LearnedField(Method):
         """See `Method`; through an array all pixels follow from a few numbers."""
         return not self.settings.response.array
 
-    @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
-        model = self.fitted()
         if len(tx) > QUERY_CHUNK:
             chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
             parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
             return Prediction.joined(parts)
-        frozen = self.frozen_at(rx)
+        if tx.dtype == torch.float64:
+            return self._answered(*self._exact(rx.to(torch.float32)), tx, rx)
+        with torch.no_grad():
+            return self._answered(self.fitted(), self.frozen_at(rx), tx, rx)
+
+    def gradient_problem(self) -> str | None:
+        """Where the receiver moves: its footprints have none."""
+        if self.site is not None and self.site.moving_end == "rx":
+            return "footprints of Gaussians have none by the receiver's position"
+        return None
+
+    @torch.no_grad()
+    def _exact(self, rx: Pose) -> tuple[GaussianModel, FrozenArray | None]:
+        """The model and what an array sees of it, in float64; images are rendered: these have gradients."""
+        model, seen = self.fitted(), self.frozen_at(rx) if self.settings.response.array else None
+        frozen = seen if isinstance(seen, FrozenArray) else None
+        of = int(model.gaussians.version), frozen is None
+        if self._doubled is None or self._doubled[0] != of:
+            self._doubled = of, in_double((model, frozen))
+        return self._doubled[1]
+
+    def _answered(
+        self, model: GaussianModel, frozen: FrozenView | FrozenArray | None, tx: Tensor, rx: Pose
+    ) -> Prediction:
         found = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
-        mean = found.mean.clamp_(0, 1) if model.site.kind == "spectrum" else found.mean
+        mean = found.mean
+        if model.site.kind == "spectrum":
+            mean = mean.clamp(0, 1) if mean.dtype == torch.float64 else mean.clamp_(0, 1)
         if model.error is not None and found.unknown is not None:
             return Prediction(mean, *model.error(found.unknown))
         if model.confidence is None:
@@ -354,16 +380,6 @@ class LearnedField(Method):
         for i in range(len(tx)):  # one at a time: features of all would be gigabytes
             square += model.features(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx)[0].square().sum(1)
         return model.gaussians.cloud((square / max(len(tx), 1)).sqrt(), "emission of a Gaussian")
-
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The model's own mean, not clamped; see `Differentiable`.
-
-        Raises:
-            ValueError: gradients by the receiver's position are asked for, and images depend on it.
-        """
-        if rx.position.requires_grad:
-            raise ValueError(f"{self.name}: footprints have no gradients by the receiver's position")
-        return self.fitted()(tx, rx).mean
 
     # -- what it can do besides ----------------------------------------------------------------------
 
@@ -399,7 +415,7 @@ class LearnedField(Method):
         self.model = self._new_model(site)
         edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
-        self.frozen = None
+        self.frozen = self._doubled = None
 
     def size(self) -> int:
         """Number of Gaussians."""

@@ -51,6 +51,10 @@ class UplinkMethod(Method):
         """Always refused: `ValueError`."""
         raise ValueError(f"{self.name}: answers snapshots with their uplink, not positions")
 
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`."""
+        return "predictions follow from an uplink, not from a position"
+
     @abstractmethod
     def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
         """Channels of the downlink (B, A, K) from uplinks (B, U, L), with noise powers (B,) where known."""

@@ -123,7 +123,7 @@ class Unfolding:
     def paths(self, places: Tensor) -> Paths:
         """From places (n, 3) [m]."""
         shape = (*self.given.shape[:2], len(places))
-        here, valid = places.float().expand(*shape, 3), self.given.expand(shape)
+        here, valid = places.to(self.chain.dtype).expand(*shape, 3), self.given.expand(shape)
         points = [here]
         steps = list(zip(self.normal, self.offset, self.height, self.chain[1:], strict=True))
         for normal, offset, height, image in reversed(steps):

@@ -25,6 +25,7 @@ from gsparc.models.powers.together.terms import LAW_DB, TALL, Terms
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
+from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import REACH
 from gsparc.processes.prior import Prior
@@ -114,7 +115,6 @@ class JointPowerField(ConditionalField):
         self.whole = max(float(loud.decibels.var()), self.own.variance)
         self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
 
-    @torch.no_grad()
     def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
         """See `ConditionalField`; (B, 1) linear powers.
 
@@ -128,16 +128,17 @@ class JointPowerField(ConditionalField):
         """
         posterior, elsewhere = self._conditioned()
         places, number = self._asked(tx, rx, station)
-        mean, spread, share, explained = torch.zeros(4, len(places), dtype=torch.float64)
+        mean, spread, share, explained = (torch.zeros(len(places), dtype=torch.float64) for _ in range(4))
         for one in number.unique().tolist():
             of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
             for chosen in torch.nonzero(number == one)[:, 0].split(QUERIES):
                 mean[chosen], left, explained[chosen] = of.answer(places[chosen], one)
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
+        mean, spread, share, explained = (part.to(tx.dtype) for part in (mean, spread, share, explained))
         power = self._power(mean)
-        variance = entry_variance(spread.float(), power, "rssi")
-        return Posterior(power, variance, self._power(explained) if self.count else None, share.float())
+        variance = entry_variance(spread, power, "rssi")
+        return Posterior(power, variance, self._power(explained) if self.count else None, share)
 
     def answer(self, batch: Batch) -> Posterior:
         """See `ConditionalField`; two stations may stand at one place."""
@@ -156,7 +157,7 @@ class JointPowerField(ConditionalField):
             loud = process.extra == 0
             means.append((process.values()[:, 0] - error)[loud])
             spreads.append(variance[loud])
-        mean = self._power(torch.cat(means))
+        mean = self._power(torch.cat(means).float())
         variance = entry_variance(torch.cat(spreads).float(), mean, "rssi")
         return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), mean, variance)
 
@@ -206,17 +207,19 @@ class JointPowerField(ConditionalField):
             known = torch.cat([one.rows[:, :3] for one in posterior.processes.values()]).numpy()
             self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), 1e-9)
         tree, reach = self._reach
-        far = torch.from_numpy(tree.query(moving.numpy())[0])
+        far = nearest_distance(tree, moving)
         law = max(1 - self.own.variance / self.whole, 0.0)
         return law * (1 - (-(far / reach).square()).exp())
 
     def _standing(self, places: Tensor) -> Tensor:
         """Numbers (B,) of the stations at places (B, 3), negative where none stands."""
-        apart, number = torch.cdist(places, torch.from_numpy(self.places).nan_to_num(math.inf)).min(1)
+        apart, number = torch.cdist(places.detach(), torch.from_numpy(self.places).nan_to_num(math.inf)).min(
+            1
+        )
         return torch.where(apart <= SAME_PLACE_M, number, NEVER)
 
     def _power(self, decibels: Tensor) -> Tensor:
-        return from_real(decibels[:, None].float(), "rssi", (1,))
+        return from_real(decibels[:, None], "rssi", (1,))
 
 
 def most_each(stations: int) -> int:
