@@ -24,7 +24,7 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.models import method as protocols
 from gsparc.models.channels import complex_gp
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Differentiable, Method, Reducible
+from gsparc.models.method import Method, Reducible
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.registry import METHODS, build, method_class
@@ -36,15 +36,17 @@ DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink"), ""),
     **dict.fromkeys(("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf"), ""),
     "calibrated_raytracer": "",
-    "distance_law": "Differentiable",
-    "gp": "Differentiable Reducible",
-    "complex_gp": "Differentiable LeaveOneOut",
-    "directional_gp": "Differentiable LeaveOneOut HasPaths",
+    "distance_law": "",
+    "gp": "Reducible",
+    "complex_gp": "LeaveOneOut",
+    "directional_gp": "LeaveOneOut HasPaths",
     "image_source_gp": "LeaveOneOut HasPaths Reducible",
-    "array": "Differentiable Reducible",
+    "array": "Reducible",
     "moving_array": "Reducible",
-    "gsparc": "Differentiable HasPaths Reducible",
+    "gsparc": "HasPaths Reducible",
 }
+GRADIENTS = ("idw", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
+GRADIENTS += ("moving_array", "gsparc")  # see tests/prediction/test_gradients.py
 VARIANCE = (
     "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
     "moving_array",
@@ -56,10 +58,6 @@ FILES = {  # of rendered Gaussians, by what they render
     "gsparc of channels": lambda path: channels(path, shape="S"),
     "gsparc of powers": powers,
 }
-
-
-def having(protocol: str) -> list[str]:
-    return [name for name, words in DECLARED.items() if protocol in words.split()]
 
 
 def data_of(name: str, folder: Path) -> Measurements:
@@ -127,6 +125,7 @@ def test_a_method_is_what_the_table_says(name):
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
     assert method.resumable == (name in ("image_source_gp", "gsparc"))
+    assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 
 @pytest.mark.parametrize("name", VARIANCE)
@@ -135,46 +134,6 @@ def test_predictions_have_a_variance(name):
     variance = method.predict(*ends(method, places(method).float())).variance
     assert variance is not None and variance.shape == (5,)
     assert variance.dtype == torch.float32 and (variance > 0).all()
-
-
-@pytest.mark.parametrize("name", [*having("Differentiable"), "gp of powers"])
-def test_gradients_are_those_of_the_predicted_mean(name):
-    method = fitted(name)[0]
-    assert isinstance(method, Differentiable)
-    # What is computed in float32 is asked in float32, with steps that rounding does not hide.
-    exact = name not in ("gsparc", "array")
-    where = places(method).to(torch.float64 if exact else torch.float32)
-    with torch.no_grad():
-        said, mean = method.predict(*ends(method, where)).mean, method.mean_at(*ends(method, where))
-    assert method.site is not None
-    shown = mean.clamp(0, 1) if method.site.kind == "spectrum" else mean  # spectra are shown clamped
-    torch.testing.assert_close(shown, said, rtol=1e-4, atol=1e-5 * float(said.abs().max()))
-    draw = torch.Generator().manual_seed(1)
-    weights = torch.randn(mean.shape, generator=draw, dtype=mean.dtype)
-
-    def summed(moving: torch.Tensor) -> torch.Tensor:
-        """A sum (B,) of the mean's entries, in float64."""
-        product = method.mean_at(*ends(method, moving)) * weights
-        return torch.real(product).double().flatten(1).sum(1)
-
-    asked = where.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(summed(asked).sum(), asked)
-    step = 3e-4 if exact else 3e-3
-    with torch.no_grad():
-        for axis in torch.eye(3, dtype=where.dtype):
-            found = (summed(where + step * axis) - summed(where - step * axis)) / (2 * step)
-            wanted = (slope * axis).sum(1).double()
-            torch.testing.assert_close(found, wanted, rtol=0.02, atol=0.02 * float(slope.abs().max()))
-    assert slope.abs().max() > 0
-
-
-@pytest.mark.parametrize("name", [*list(FILES)[1:], "gsparc of sources"])
-def test_what_has_no_gradients_says_so(name):
-    """Footprints are projected without any: a moving receiver's would lack most of what changes."""
-    method = fitted(name)[0]
-    assert isinstance(method, Differentiable)
-    with pytest.raises(ValueError, match="no gradients"):
-        method.mean_at(*ends(method, places(method).float().requires_grad_()))
 
 
 def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):

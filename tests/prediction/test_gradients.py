@@ -139,9 +139,7 @@ CASES = {
     "image_source_gp": Case(
         lambda: ImageSourceGP(searches=1, search_rows=60), lambda _: shoebox(60, pillar=True)[1]
     ),
-    "gsparc, a mixture": Case(
-        lambda: Assembled(ImageSourceGP(searches=1, search_rows=60)), lambda _: shoebox(60)[1]
-    ),
+    "gsparc, a mixture": Case(lambda: Assembled(ImageSourceGP(searches=1, search_rows=60)), kinds.bands),
     "gsparc, channels of an array": Case(planned(*SOURCES), kinds.bands),
     "gsparc, channels from nowhere known": Case(planned(), kinds.unplaced),
     "gsparc, channels of stations": Case(planned(), lambda _: antennas(), "0"),

@@ -284,10 +284,10 @@ class ChannelField(ConditionalField):
                 slot.put(mean, here, known.given.mean(cross))
                 if self.count:
                     slot.put(share, here, known.given.mean(explained(shape, values, slot, places, learned)))
-                learned = known.given.known(cross) if exact else known.learned(cross)
+                told = known.given.known(cross) if exact else known.learned(cross)
                 weight = known.scale * known.group.target.shape[1] / size
                 whole = prior(shape, values, slot, places) + disturbed
-                after.index_add_(0, here, weight * (whole - learned).clamp_min(0))
+                after.index_add_(0, here, weight * (whole - told).clamp_min(0))
                 before.index_add_(0, here, weight * whole)
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
         for place in static[unheard].detach().unique(dim=0):
