@@ -16,7 +16,7 @@ from gsparc.data.schema import End, Kind, Site
 from gsparc.models.method import Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
-from gsparc.ops.transforms import carries_tangent, numbers, transforming
+from gsparc.ops.transforms import carries_tangent, mapped, numbers, transforming
 from gsparc.prediction.confidence import Trusted
 from gsparc.prediction.timing import Call
 
@@ -317,6 +317,8 @@ class Predictor:
         for end, value in ends.items():
             if value is not None and not isinstance(value, Tensor):
                 raise ValueError(f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}")
+        if mapped(*ends.values()):
+            raise ValueError("grad=True: torch.vmap is not followed; give all positions at once, (B, 3)")
         if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
             raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
         asked, pose, single, _ = self._ends(tx, rx, torch.float64)

@@ -81,20 +81,9 @@ class Neighbourhood:
         return np.concatenate(found, 1)
 
 
-def nearest_distances(tree: cKDTree, queries: Tensor, which: np.ndarray) -> tuple[Tensor, np.ndarray]:
-    """From queries (B, D) float64 to nearest places of a tree (B, k) [m], with autograd, and their numbers.
-
-    Args:
-        tree: of places.
-        queries: [m].
-        which: (k,) of the nearest ones, counted from 1.
-    """
-    distance, row = tree.query(numbers(queries), k=which)
-    if not followed(queries):
-        return torch.from_numpy(distance), row
-    return apart(queries[:, None], torch.from_numpy(tree.data[row]))[:, 0], row
-
-
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
     """From queries (B, D) float64 to the nearest of a tree's places (B,) [m], with autograd."""
-    return nearest_distances(tree, queries, np.array([1]))[0][:, 0]
+    distance, row = tree.query(numbers(queries))
+    if not followed(queries):
+        return torch.from_numpy(distance)
+    return apart(queries[:, None], torch.from_numpy(tree.data[row])[:, None])[:, 0, 0]

@@ -45,7 +45,7 @@ DECLARED = {
     "moving_array": "Reducible",
     "gsparc": "HasPaths Reducible",
 }
-GRADIENTS = ("idw", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
+GRADIENTS = ("distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
 GRADIENTS += ("moving_array", "gsparc")  # see tests/prediction/test_gradients.py
 VARIANCE = (
     "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",

@@ -123,7 +123,6 @@ CASES = {
     "gp, spectra": Case(method_class("gp"), kinds.images),
     "gp, spectra, nearest rows": Case(method_class("gp"), lambda folder: images(folder, 200), thin=True),
     "gp, spectra of a moving receiver": Case(method_class("gp"), lambda folder: images(folder, 40, "rx")),
-    "idw, spectra": Case(method_class("idw"), kinds.images),
     "array": Case(lambda: method_class("array")(), kinds.static_array),
     "gsparc, rendered": Case(planned(*RENDERED, "model.field.count=40"), kinds.images),
     "gsparc, array": Case(planned("model.field.count=64"), kinds.static_array),
@@ -145,7 +144,6 @@ CASES = {
     "gsparc, channels of stations": Case(planned(), lambda _: antennas(), "0"),
     "gsparc, channels of both ends": Case(planned(), lambda _: both_ends("csi")),
     "distance_law": Case(method_class("distance_law"), kinds.received),
-    "idw, powers": Case(method_class("idw"), kinds.received),
     "gp, powers": Case(method_class("gp"), kinds.received),
     "gp, powers, nearest rows": Case(method_class("gp"), kinds.received, thin=True),
     "gp, powers of both ends": Case(method_class("gp"), lambda _: both_ends("rssi")),
@@ -154,10 +152,11 @@ CASES = {
     "gsparc, powers of stations": Case(planned(), kinds.several, "0"),
 }
 REFUSED = {
-    "nearest": "constant about each sample",
+    "nearest": "change in jumps",
+    "idw": "change in jumps",
     "mean": "same everywhere",
     "zero": "same everywhere",
-    "kriging": "does not say",
+    "kriging": "outside of autograd",
 }
 QUICK = ("gp, spectra", "complex_gp, both ends", "gp, powers, nearest rows", "gsparc, powers of stations")
 
@@ -354,6 +353,8 @@ def test_wrong_questions_get_clear_answers(name):
         still = torch.from_numpy(predictor.site.static_position + predictor.site.origin).requires_grad_()
         with pytest.raises(ValueError, match=f"gradients are by the position of {end} alone"):
             predictor.predict(**{end: at, predictor.site.static_end: still}, grad=True)
+    with pytest.raises(ValueError, match="vmap is not followed"):
+        torch.func.vmap(lambda one: asked(predictor, one, grad=True))(at)
     if predictor.site.kind == "csi":
         with pytest.raises(ValueError, match="measured tones alone"):
             predictor.csi(tx=at[:, :3], rx=at[:, 3:], symbols=14, grad=True)

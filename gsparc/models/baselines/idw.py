@@ -7,17 +7,15 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
-from gsparc.models.baselines.interpolation import Differentiable
+from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import to_real
-from gsparc.processes.neighbourhood import nearest_distances
 
 SPACING_ON = 10_000  # rows whose spacing is looked at
 
 
-class InverseDistance(Differentiable):
+class InverseDistance(Interpolator):
     """Averages the `neighbours` nearest samples with weights 1 / distance^power.
 
     Its confidence is exp(-distance to the nearest / typical spacing of the training set).
@@ -44,14 +42,18 @@ class InverseDistance(Differentiable):
         self.spacing = float(np.median(apart)) if len(apart) else 1.0  # [m], of neighbouring places
         return ()
 
-    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`."""
+        return "its nearest samples change in jumps"
+
+    def _look_up(self, queries: np.ndarray) -> Prediction:
         count = min(self.neighbours, len(self.positions))
-        distance, row = nearest_distances(self.tree, queries, np.arange(1, count + 1))  # nearest first
-        weight = 1 / distance.clamp_min(self.NEAR) ** self.power
-        weight = (weight / weight.sum(1, keepdim=True)).to(dtype)
-        found = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind)).to(dtype)
+        distance, row = self.tree.query(queries, k=np.arange(1, count + 1))  # nearest first
+        weight = 1 / np.maximum(distance, self.NEAR) ** self.power
+        weight = torch.from_numpy(weight / weight.sum(1, keepdims=True)).float()
+        found = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind))
         blend = torch.bmm(weight[:, None], found.view(*row.shape, -1))[:, 0]
-        sure = (-distance[:, 0] / self.spacing).exp().to(dtype)
+        sure = torch.from_numpy(np.exp(-distance[:, 0] / self.spacing)).float()
         return Prediction(self._decode(blend), confidence=sure)
 
     def _learned(self) -> dict[str, Any]:

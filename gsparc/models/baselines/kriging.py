@@ -169,6 +169,10 @@ class Kriging(Interpolator):
         """Queries answered at a time, of more."""
         return max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))
 
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`."""
+        return "its systems are solved outside of autograd"
+
     def _look_up(self, queries: np.ndarray) -> Prediction:
         if self.tree is not None and len(queries) > (block := self._block()):
             parts = [self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)]

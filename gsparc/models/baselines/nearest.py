@@ -12,7 +12,3 @@ class Nearest(InverseDistance):
 
     def __init__(self) -> None:
         super().__init__(neighbours=1)
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "predictions are constant about each sample"

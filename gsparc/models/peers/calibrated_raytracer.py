@@ -137,6 +137,10 @@ class CalibratedRayTracer(Method):
         energy = np.vdot(traced, traced).real
         return complex(np.vdot(traced, data.target[rows].ravel()) / energy) if energy > 0 else 0j
 
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`."""
+        return "rays are traced to a place anew"
+
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
         if self.site is None or self.learned is None:

@@ -207,6 +207,10 @@ class TrainedPeer(Method):
         """Number of Gaussians or virtual transmitters; 0 for a network without, and before `fit`."""
         return 0 if self.network is None else self.network.count
 
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`."""
+        return "its network answers in float32 and keeps no graph"
+
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; these peers give no confidence."""
