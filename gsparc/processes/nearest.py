@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -138,8 +139,15 @@ class Nearest(Posterior):
     def _answers(self, queries: Tensor, without: np.ndarray | None, exact: bool = False) -> Answer:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
-        parts = [self._answer(queries[b], None if without is None else without[b], exact) for b in blocks]
-        return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
+        parts = (self._answer(queries[b], None if without is None else without[b], exact) for b in blocks)
+        if len(blocks) < 2 or not served(queries):
+            return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
+        first = next(parts)
+        found = Answer(first.mean.new_empty(len(queries), first.mean.shape[1]), queries.new_empty(len(queries)))
+        # Parts kept in a list would lie between freed systems in memory, which then is not used again.
+        for block, part in zip(blocks, chain([first], parts), strict=True):
+            found.mean[block], found.left[block] = part.mean, part.left
+        return found
 
     def _answer(self, queries: Tensor, without: np.ndarray | None, exact: bool) -> Answer:
         index = torch.from_numpy(self.near.nearest(numbers(queries), without, self.most))
