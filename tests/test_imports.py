@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "processes", "physics", "data", "simulate", "field", "training", "models", "prediction"]
-ROOMS += ["evaluation", "maps", "view", "commands", "callbacks", "conf"]
+ROOMS += ["locate", "evaluation", "maps", "view", "commands", "callbacks", "conf"]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -29,6 +29,7 @@ ARROWS = {
     "field": "data ops physics processes",
     "training": "data field ops processes",
     "models": "data field ops physics processes simulate training",
+    "locate": "data processes",
     "prediction": "data models ops processes training",
     "locate": "data models ops processes training",
     "evaluation": "conf data locate models prediction simulate training",

@@ -1,1 +1,1 @@
-"""Where something was heard: positions from spectra, channels, powers and fingerprints."""
+"""Where something was heard: places by the likelihood of a learned field."""

@@ -1,0 +1,1 @@
+"""Levels of access points of unknown place: rows, their field, and its likelihood."""

@@ -1,0 +1,154 @@
+"""The field of fingerprints: how probably each access point is heard at a place, and at what level.
+
+One process with one kernel for all: its outputs are, of each access point, whether it was heard (0 or 1) and
+its level above a base where it was heard, 0 where not. The ratio of the two is the mean of a heard level: a
+floor in place of silent rows would bias it. What the process says of rows at places left out calibrates the
+variance of each access point and the log odds of hearing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from sklearn.linear_model import LogisticRegression
+from torch import Tensor
+
+from gsparc.locate.fingerprints.likelihood import Levels, log_likelihood, shifted
+from gsparc.locate.shared_kernel import settings, stretched
+from gsparc.processes.nearest import Nearest, Values, given
+
+BELOW_DB = 1.0  # of the faintest level, that the base lies
+RARE = 0.05  # probability below which a ratio of two small numbers is no level
+SURE = 0.002  # no place makes silence, or hearing, less probable
+LEAST_DB2 = 1.0  # common variance of a level: receivers round
+PRIOR_ROWS = 10.0  # that the common variance counts as beside an access point's own
+ROWS = 500  # that calibrate the odds of hearing
+SENSITIVITIES = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0)
+PLACES = 2_048  # whose moments are in memory at a time
+
+
+@dataclass(frozen=True)
+class FingerprintField:
+    """Learned from rows of P access points.
+
+    Attributes:
+        process: of 2 P outputs, heard and level above the base, less their means.
+        mean: (2, P) of these.
+        base: (P,) [dBm].
+        variance: (P,) of a heard level [dB^2] in units of the process's variance.
+        odds: slope and intercept of the log odds of hearing by those of the process.
+        sensitivity: deviation of what a row adds to all log odds.
+        vertical: what a metre of height counts as along the floor.
+    """
+
+    process: Nearest
+    mean: Tensor
+    base: Tensor
+    variance: Tensor
+    odds: tuple[float, float]
+    sensitivity: float
+    vertical: float
+
+    @torch.no_grad()
+    def moments(self, places: Tensor) -> Levels:
+        """Of places (B, 3) float64 [m]."""
+        at = torch.from_numpy(stretched(places.detach().double().numpy(), self.vertical))
+        found = self.process.answer(at)
+        heard, level = (found.mean.unflatten(1, (2, -1)) + self.mean).unbind(1)
+        variance = found.left.float()[:, None] * self.variance
+        return Levels(self.base + above(heard, level), variance, calibrated(heard, self.odds).sigmoid())
+
+    @torch.no_grad()
+    def log_likelihood(self, levels: Tensor, places: Tensor, offset: float | None = None) -> Tensor:
+        """Log density (B,) [nats] of levels (P,) at places (B, 3) [m]; (m, B) of levels (m, P).
+
+        Args:
+            levels: [dBm], NaN where silent.
+            places: float64 [m].
+            offset: deviation of a device's unknown offset [dB]; None: it has none.
+        """
+        rows, parts = levels.reshape(-1, len(self.base)), places.split(PLACES)
+        found = [log_likelihood(rows, self.moments(part), offset, self.sensitivity) for part in parts]
+        return torch.cat(found, 1).reshape(*levels.shape[:-1], len(places))
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and numbers that `read` needs."""
+        numbers = [*self.odds, self.sensitivity, self.vertical]
+        own = {name: getattr(self, name) for name in ("mean", "base", "variance")}
+        return {**own, "numbers": numbers, "process": self.process.state()}
+
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> FingerprintField:
+        """The field whose `state()` this was."""
+        slope, intercept, sensitivity, vertical = (float(v) for v in state["numbers"])
+        mean, base, variance = (state[name] for name in ("mean", "base", "variance"))
+        process, odds = Nearest.read(state["process"]), (slope, intercept)
+        return cls(process, mean, base, variance, odds, sensitivity, vertical)
+
+
+def above(heard: Tensor, level: Tensor) -> Tensor:
+    """Mean of heard levels above the base (..., P) [dB]: that of all rows over how often one is heard."""
+    return level.clamp_min(0.0) / heard.clamp_min(RARE)
+
+
+def calibrated(heard: Tensor, odds: tuple[float, float]) -> Tensor:
+    """Log odds of hearing (..., P) by what the process says of 0 and 1, which may lie beyond these."""
+    bound = math.log(1 / SURE - 1)
+    return (odds[0] * torch.logit(heard.clamp(SURE, 1 - SURE)) + odds[1]).clamp(-bound, bound)
+
+
+def learn(levels: np.ndarray, places: np.ndarray, seed: int = 0) -> FingerprintField:
+    """The field of rows.
+
+    Example:
+        field = learn(rows.level[train], rows.position[train])
+        field.log_likelihood(torch.from_numpy(rows.level[7]), candidates, offset=6.0)
+
+    Levels are (n, P) [dBm], NaN where silent, places (n, 3) float64 [m]; `ValueError` where all are silent.
+    """
+    level = torch.from_numpy(levels).float()
+    heard = torch.isfinite(level)
+    if not heard.any():
+        raise ValueError(f"fingerprints: {len(levels)} rows heard no access point; give rows with levels")
+    faintest = torch.where(heard, level, math.inf).amin(0)
+    base = torch.where(heard.any(0), faintest, faintest.amin()) - BELOW_DB
+    outputs = torch.cat([heard.float(), torch.where(heard, level - base, 0.0)], 1)
+    mean = outputs.mean(0)
+    outputs -= mean
+    prior, vertical = settings(outputs[:, len(base) :], places, seed)
+    at = stretched(places, vertical)
+    process = given(prior, Values.of(at, outputs), seed)
+    del outputs
+    mean, (found, left) = mean.unflatten(0, (2, -1)), process.left_out()
+    place = torch.from_numpy(np.unique(at, axis=0, return_inverse=True)[1].reshape(-1))
+    own, times = torch.zeros(len(base)), heard.sum(0)
+    for rows in torch.arange(len(level)).split(PLACES):
+        said = found[place[rows]].unflatten(1, (2, -1)) + mean
+        error = torch.nan_to_num(level[rows] - base - above(*said.unbind(1)))
+        own += (error.square() / left[place[rows], None].float()).sum(0)
+    common = (own.sum() / times.sum()).clamp_min(LEAST_DB2)
+    variance = (own + PRIOR_ROWS * common) / (times + PRIOR_ROWS)
+    some = torch.from_numpy(np.sort(np.random.default_rng(seed).permutation(len(level))[:ROWS]))
+    odds, sensitivity = hearing(found[place[some], : len(base)] + mean[0], heard[some])
+    return FingerprintField(process, mean, base, variance, odds, sensitivity, vertical)
+
+
+def hearing(said: Tensor, heard: Tensor) -> tuple[tuple[float, float], float]:
+    """Slope and intercept of log odds, and the deviation of a row's shift, most likely by rows (n, P).
+
+    Args:
+        said: what the process says of 0 and 1 at places left out.
+        heard: bool.
+    """
+    odds = (1.0, 0.0)
+    if 0 < heard.sum() < heard.numel():
+        entries = calibrated(said, odds).reshape(-1, 1), heard.reshape(-1)
+        fitted = LogisticRegression(C=1e3).fit(*entries)
+        odds = float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
+    rows = [(one[None], here[None].float()) for one, here in zip(calibrated(said, odds), heard, strict=True)]
+    return odds, max(SENSITIVITIES, key=lambda one: sum(float(shifted(*row, one)) for row in rows))

@@ -1,0 +1,144 @@
+"""The field of fingerprints: its moments, its likelihood, what it is stored as."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from releases import real
+from scipy.stats import multivariate_normal
+
+from gsparc.locate.fingerprints.field import FingerprintField, learn
+from gsparc.locate.fingerprints.likelihood import HEARING, Levels, log_likelihood
+from gsparc.locate.fingerprints.rows import parted, read_fingerprints
+
+NAN = float("nan")
+
+
+def invented(count: int, floors: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Levels of 12 access points in a hall of 30 x 20 m, silent below -80 dBm, and their places."""
+    rng = np.random.default_rng(seed)
+    size = np.array([30, 20, 1.0])
+    places = rng.uniform(0, 1, (count, 3)) * size
+    places[:, 2] = 4.0 * rng.integers(0, floors, count)
+    where = np.random.default_rng(9).uniform(0, 1, (12, 3)) * size
+    apart = np.linalg.norm(places[:, None] - where, axis=2)
+    level = -35 - 32 * np.log10(np.maximum(apart, 1)) + rng.normal(0, 2, apart.shape)
+    level -= 3.0 * np.abs(places[:, None, 2] - where[:, 2])
+    return np.where(level > -80, level, np.nan).astype(np.float32), places
+
+
+@pytest.fixture(scope="module")
+def field() -> FingerprintField:
+    return learn(*invented(400))
+
+
+def test_levels_and_silence_are_predicted_where_nobody_measured(field):
+    level, places = invented(200, seed=1)
+    found, heard = field.moments(torch.from_numpy(places)), np.isfinite(level)
+    error = (level - found.mean.numpy())[heard]
+    assert error.std() < 3.5 and abs(error.mean()) < 0.5  # two of them are noise
+    squares = error**2 / found.variance.numpy()[heard]
+    assert 0.6 < squares.mean() < 1.6
+    probability = found.heard.numpy()
+    assert probability[heard].mean() > 0.85 and probability[~heard].mean() < 0.4
+    assert probability.min() > 0 and probability.max() < 1
+
+
+def test_a_row_is_most_likely_near_its_place(field):
+    level, places = invented(60, seed=1)
+    grid = np.stack(np.meshgrid(np.arange(0, 30, 1.0), np.arange(0, 20, 1.0), [0.0]), -1).reshape(-1, 3)
+    found = field.log_likelihood(torch.from_numpy(level), torch.from_numpy(grid))
+    apart = np.linalg.norm(grid[found.argmax(1).numpy()] - places, axis=1)
+    assert np.median(apart) < 1.5
+    one = field.log_likelihood(torch.from_numpy(level[3]), torch.from_numpy(grid))
+    torch.testing.assert_close(one, found[3], rtol=1e-4, atol=1e-3)
+
+
+def test_a_device_that_adds_to_all_levels_is_found_with_an_offset(field):
+    level, places = invented(60, seed=1)
+    grid, other = torch.from_numpy(invented(300, seed=2)[1]), torch.from_numpy(level - 12)
+    plain, shifted = (field.log_likelihood(other, grid, offset).argmax(1) for offset in (None, 12.0))
+    apart = [np.linalg.norm(grid[best].numpy() - places, axis=1).mean() for best in (plain, shifted)]
+    assert apart[1] < 0.8 * apart[0]
+
+
+def test_the_likelihood_is_the_density_of_a_normal_vector_with_a_common_part():
+    rng = np.random.default_rng(0)
+    mean, variance = rng.uniform(-80, -50, (2, 4)), rng.uniform(4, 25, (2, 4))
+    heard = rng.uniform(0.2, 0.9, (2, 4))
+    levels = Levels(*(torch.from_numpy(part) for part in (mean, variance, heard)))
+    row = np.array([-61.0, NAN, -70.0, -55.0])
+    here = np.isfinite(row)
+    for offset in (None, 5.0):
+        found = log_likelihood(torch.from_numpy(row)[None], levels, offset)[0]
+        for place in range(2):
+            covariance = np.diag(variance[place][here]) + (offset or 0.0) ** 2
+            known = multivariate_normal(mean[place][here], covariance).logpdf(row[here])
+            known += HEARING * np.where(here, np.log(heard[place]), np.log1p(-heard[place])).sum()
+            assert float(found[place]) == pytest.approx(known, abs=1e-3)
+    # Sensitivity: the mean over a common normal shift of all log odds.
+    odds, draws = np.log(heard / (1 - heard)), rng.normal(0, 1, 200_000)
+    sums = [np.prod(1 / (1 + np.exp(-np.where(here, 1, -1) * (o + draws[:, None]))), 1) for o in odds]
+    with_, without = (log_likelihood(torch.from_numpy(row)[None], levels, None, s)[0] for s in (1.0, 0.0))
+    plain = np.where(here, np.log(heard), np.log1p(-heard)).sum(1)
+    wanted = HEARING * (np.log([one.mean() for one in sums]) - plain)
+    np.testing.assert_allclose((with_ - without).numpy(), wanted, atol=5e-3)
+
+
+def test_floors_are_told_apart():
+    field = learn(*invented(500, floors=2))
+    level, places = invented(100, floors=2, seed=1)
+    other = places * [1, 1, 0] + [0, 0, 4.0] - places * [0, 0, 1]
+    right, wrong = (
+        field.log_likelihood(torch.from_numpy(level), torch.from_numpy(at)).diagonal()
+        for at in (places, other)
+    )
+    assert (right > wrong).float().mean() > 0.9 and field.vertical > 1
+
+
+def test_what_is_stored_is_read(field):
+    grid = torch.from_numpy(invented(50, seed=2)[1])
+    again = FingerprintField.read(field.state()).moments(grid)
+    for one, other in zip(vars(field.moments(grid)).values(), vars(again).values(), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_few_rows_and_access_points_never_heard():
+    level, places = invented(400)
+    level[:, 3] = np.nan
+    for count in (1, 2, 5, 40):
+        found = learn(level[:count], places[:count]).moments(torch.from_numpy(places[:7]))
+        assert all(torch.isfinite(part).all() for part in vars(found).values())
+        assert (found.variance > 0).all() and (found.heard[:, 3] < 0.1).all()
+    with pytest.raises(ValueError, match="5 rows heard no access point"):
+        learn(np.full((5, 3), np.nan, np.float32), places[:5])
+
+
+def test_a_place_takes_less_than_a_millisecond(field):
+    """200 access points, as a batch; measured 0.1 to 0.3 ms."""
+    rng = np.random.default_rng(0)
+    level = np.where(rng.random((400, 200)) < 0.3, rng.uniform(-90, -40, (400, 200)), np.nan)
+    wide, places = (
+        learn(level.astype(np.float32), invented(400)[1]),
+        torch.from_numpy(invented(500, seed=3)[1]),
+    )
+    wide.moments(places[:10])
+    start = time.perf_counter()
+    wide.moments(places)
+    assert (time.perf_counter() - start) / len(places) < 3e-3  # beside other work
+
+
+def test_real_walks_are_placed_better_than_by_the_nearest_row():
+    rows = read_fingerprints(real("locate/wifine-floor4.npz"))
+    train, test = parted(rows, "walks", share=0.25)
+    train, test = train[::3], test[::6]
+    field = learn(rows.level[train], rows.position[train])
+    grid = torch.from_numpy(rows.position[train])
+    found = (
+        field.log_likelihood(torch.from_numpy(rows.level[test]), grid, offset=6.0).softmax(1).double() @ grid
+    )
+    apart = np.linalg.norm(found.numpy() - rows.position[test], axis=1)
+    assert np.median(apart) < 1.9
