@@ -29,7 +29,6 @@ ARROWS = {
     "field": "data ops physics processes",
     "training": "data field ops processes",
     "models": "data field ops physics processes simulate training",
-    "locate": "data processes",
     "prediction": "data models ops processes training",
     "locate": "data models ops processes training",
     "evaluation": "conf data locate models prediction simulate training",

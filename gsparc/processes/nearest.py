@@ -143,7 +143,9 @@ class Nearest(Posterior):
         if len(blocks) < 2 or not served(queries):
             return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
         first = next(parts)
-        found = Answer(first.mean.new_empty(len(queries), first.mean.shape[1]), queries.new_empty(len(queries)))
+        found = Answer(
+            first.mean.new_empty(len(queries), first.mean.shape[1]), queries.new_empty(len(queries))
+        )
         # Parts kept in a list would lie between freed systems in memory, which then is not used again.
         for block, part in zip(blocks, chain([first], parts), strict=True):
             found.mean[block], found.left[block] = part.mean, part.left
