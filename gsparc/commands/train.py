@@ -141,7 +141,7 @@ def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         )  # fmt: skip
         run: dict[str, Any] = {"seed": int(config.seed), "model/limited_by_clock": fitted.limited_by}
         if fitted.cost.stages:
-            run["model/cost"] = fitted.cost.described(fitted.limited_by)
+            run["time/cost"] = fitted.cost.described(fitted.limited_by)
             run["time/unused_s"] = fitted.cost.unused_s
         facts = {**found.facts, **provenance(), **run}
         # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.

@@ -114,7 +114,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         ],
     }
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
-    cost = [f"cost: {facts['model/cost']}"] if facts.get("model/cost") else []
+    cost = [f"cost: {facts['time/cost']}"] if facts.get("time/cost") else []
     return [*seen.get(prefix, []), *run_conditions(facts), *rest, *cost]
 
 
