@@ -48,8 +48,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown = Unknown(bool(config.phase_known), float(config.offset_db))
-    stored = locating.restored(run.stored[0].extra)
-    start = Trust() if stored is None else stored[0]
+    start = Trust() if config.calibrate else _stored(config, run, unknown)
     around = config.prior == "trained"
     found = Locator.of(method, data, learned, unknown, start, around, share=float(config.share))
     count = 0
@@ -57,8 +56,6 @@ def task(config: DictConfig) -> dict[str, Any]:
         found, count = _calibrated(config, run, found, around)
         if config.store:
             checkpoint.amend(config.ckpt, locating.kept(found.trust, unknown, found.share))
-    elif stored is None:
-        log.warning("calibrate=0, and nothing is stored: areas are as wide as the model's own variances say")
     heard, known = _heard(config, run, data, fold)
     located = found.locate(heard)
     inside = [
@@ -69,7 +66,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts = {**run.facts(), "locate/calibrated_on": count, "locate/snapshots": len(heard)}
     facts |= {"locate/area_m2": float(np.median([one.area for one in located]))}
     facts |= {"time/locate_ms_p50": float(np.median([one.seconds for one in located]) * 1e3)}
-    draw_posteriors(located, heard.place if known else None, data.moving[learned], run_dir / "posteriors.png")
+    origin = data.site.origin
+    shown_at = [locating.in_world(one, origin) for one in located]
+    true = heard.place + origin if known else None
+    draw_posteriors(shown_at, true, data.moving[learned] + origin, run_dir / "posteriors.png")
     if not known:
         return finish(run_dir, facts)
     errors = {method.name: error}
@@ -94,6 +94,21 @@ def task(config: DictConfig) -> dict[str, Any]:
     return finish(run_dir, facts, shown, lines=[said])
 
 
+def _stored(config: DictConfig, run: Opened, unknown: Unknown) -> Trust:
+    """The trust that an earlier call kept with the model."""
+    found = locating.restored(run.stored[0].extra)
+    if found is None:
+        log.warning("calibrate=0, and nothing is stored: areas are as wide as the model's own variances say")
+        return Trust()
+    trust, before, share = found
+    if (before, share) != (unknown, float(config.share)):
+        said = f"share={share}, phase_known={before.phase_known}, offset_db={before.offset_db}"
+        raise ValueError(
+            f"calibrate=0: {config.ckpt} was calibrated with {said}; calibrate it for other settings"
+        )
+    return trust
+
+
 def _calibrated(config: DictConfig, run: Opened, found: Locator, around: bool) -> tuple[Locator, int]:
     settings = OmegaConf.create(run.stored[0].configuration)
     if "model" not in settings:
@@ -102,6 +117,7 @@ def _calibrated(config: DictConfig, run: Opened, found: Locator, around: bool) -
     context = FitContext(
         run_dir=run_directory() / "left_out", seed=int(config.seed), budget_s=float(config.calibrate_s),
         split=None if split is None else split_settings(plain(split)),
+        stations=settings.get("stations", "auto"),
     )  # fmt: skip
     make = partial(build, settings.model)
     trust, count = locating.trusted(

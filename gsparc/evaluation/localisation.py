@@ -22,7 +22,7 @@ def draw_posteriors(
 
     Args:
         located: of all snapshots.
-        true: (n, 3) [m, local]; None where nobody knows.
+        true: (n, 3) [m], in the coordinates of `located`; None where nobody knows.
         trained: (m, 3) places that the model learned from.
         path: file.
     """

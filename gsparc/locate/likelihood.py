@@ -128,7 +128,8 @@ def of_levels(
         parts = []
         for some in floor.split(max(MOST // max(mean.numel(), 1), 1)):
             chance = torch.special.log_ndtr((some[:, None] - mean) / spread)
-            parts.append(chance.nan_to_num(nan=0.0).sum(2))
+            counted = ~torch.isnan(some)[:, None] & ~torch.isnan(mean)  # silent, and with a prediction
+            parts.append(torch.where(counted, chance, torch.zeros_like(chance)).sum(2))
         silent = torch.cat(parts)
     return Misfit(squared, size, seen.sum(1), silent)
 

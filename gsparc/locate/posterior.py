@@ -55,9 +55,3 @@ class Posterior:
         mass = np.bincount(part, self.mass[some])
         order = [one for one in np.argsort(-mass) if one == mass.argmax() or mass[one] >= MODE]
         return [some[part == one] for one in order]
-
-    def estimate(self, share: float) -> np.ndarray:
-        """Mean place (3,) of the heaviest mode."""
-        cells = self.modes(share)[0]
-        mass = self.mass[cells]
-        return np.asarray((mass[:, None] * self.cells.centre[cells]).sum(0) / mass.sum())

@@ -37,9 +37,6 @@ class SiteField:
         method: trained; its predictions have variances.
         site: what it was trained on.
         shape: of one target.
-
-    Raises:
-        ValueError: the method states no variance.
     """
 
     def __init__(self, method: Method, site: Site, shape: tuple[int, ...]) -> None:
@@ -48,7 +45,11 @@ class SiteField:
 
     @torch.no_grad()
     def at(self, places: Tensor) -> Moments:
-        """Of places (G, 3) float64 [m, local]."""
+        """Of places (G, 3) float64 [m, local].
+
+        Raises:
+            ValueError: the method states no variance.
+        """
         parts = [self._some(some) for some in places.split(CHUNK)]
         return Moments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
 

@@ -11,6 +11,9 @@ from campaigns import compose, powers, spectra
 
 from gsparc.commands import locate
 from gsparc.commands.train import train
+from gsparc.locate.likelihood import Trust
+from gsparc.locate.locator import kept
+from gsparc.locate.search import Unknown
 from gsparc.models import checkpoint
 
 
@@ -57,6 +60,13 @@ def test_a_file_without_places_is_located_too(trained, tmp_path, monkeypatch):
     assert len(rows) == 6 and set(rows[0]) == {"x", "y", "z", "area_m2", "modes"}
     found = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
     assert np.median(np.linalg.norm(found - true, axis=1)) < 0.3
+
+
+def test_trust_of_other_settings_is_not_taken_in_silence(trained, tmp_path, monkeypatch):
+    """`calibrate=0 share=0.5` used the level that was learned for 90 % of places."""
+    checkpoint.amend(trained, kept(Trust(level=0.95), Unknown(), 0.9))
+    with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
+        located(trained, tmp_path, monkeypatch, "calibrate=0", "share=0.5")
 
 
 @pytest.mark.parametrize(
