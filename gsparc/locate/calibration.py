@@ -45,7 +45,11 @@ def calibrated(held: Sequence[Looked], places: np.ndarray, share: float, start: 
     found = minimize(
         surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
     )
-    trust = of(found.x)
+    return levelled(of(found.x), held, places, share)
+
+
+def levelled(trust: Trust, held: Sequence[Looked], places: np.ndarray, share: float) -> Trust:
+    """The trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
     levels = np.sort([one.by(trust).level(place) for one, place in zip(held, places, strict=True)])
     rank = int(np.ceil((len(levels) + 1) * share))
     return replace(trust, level=float(levels[rank - 1]) if rank <= len(levels) else 1.0)

@@ -15,7 +15,7 @@ import torch
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.locate.calibration import calibrated
+from gsparc.locate.calibration import calibrated, levelled
 from gsparc.locate.cells import Cells, cover
 from gsparc.locate.likelihood import Trust
 from gsparc.locate.posterior import Posterior
@@ -95,10 +95,10 @@ class Locator:
         """Computed once: most of the time of the first snapshot."""
         return self.field.at(torch.from_numpy(self.cells.centre))
 
-    def look(self, heard: Snapshots) -> Looked:
-        """One snapshot's misfit where it matters."""
+    def look(self, heard: Snapshots, trust: Trust | None = None) -> Looked:
+        """One snapshot's misfit where it matters under a trust, the locator's own unless it is given."""
         coarse = misfit(heard, self._coarse, self.unknown)
-        return looked(self.field, heard, self.cells, coarse, self.unknown, self.trust)
+        return looked(self.field, heard, self.cells, coarse, self.unknown, trust or self.trust)
 
     def locate(self, heard: Snapshots) -> list[Located]:
         """Each of n snapshots on its own."""
@@ -131,8 +131,7 @@ def trusted(
         folds: groups.
         around: see `Locator.of`.
     """
-    held: list[Looked] = []
-    places = []
+    groups: list[tuple[Locator, Snapshots]] = []
     rng = np.random.default_rng(context.seed)
     cut = cut_inside(data, fold, context.split, folds, context.seed).folds
     for number, inner in enumerate(cut):
@@ -143,10 +142,17 @@ def trusted(
         own = Locator.of(method, data, known, locator.unknown, locator.trust, around, MOST, locator.share)
         heard = snapshots(data, inner.test)
         chosen = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        held += [own.look(heard.at(np.array([row]))) for row in chosen]
-        places.append(heard.place[chosen])
-    every = np.concatenate(places)[:, :3]
-    return calibrated(held, every, locator.share, locator.trust), len(every)
+        groups.append((own, heard.at(chosen)))
+    places = np.concatenate([heard.place for _, heard in groups])
+
+    def looks(trust: Trust) -> list[Looked]:
+        return [
+            own.look(heard.at(np.array([row])), trust) for own, heard in groups for row in range(len(heard))
+        ]
+
+    trust = calibrated(looks(locator.trust), places, locator.share, locator.trust)
+    # Which cells are halved depends on the trust: the level is one of cells as they will be.
+    return levelled(trust, looks(trust), places, locator.share), len(places)
 
 
 def kept(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
