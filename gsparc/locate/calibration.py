@@ -12,13 +12,14 @@ from gsparc.locate.likelihood import Trust
 from gsparc.locate.search import Looked
 
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
-LOOKS = 120
+SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
+LOOKS = 160
 
 
 def calibrated(held: Sequence[Looked], places: np.ndarray, share: float, start: Trust) -> Trust:
     """The trust under which places that were held out are most likely, with an area that holds a share.
 
-    The first three numbers maximise the mean log density at the true places, a proper score; the level is
+    All numbers but the level maximise the mean log density at the true places, a proper score; the level is
     then the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
     "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
     the share of places that are exchangeable with these.
@@ -29,19 +30,19 @@ def calibrated(held: Sequence[Looked], places: np.ndarray, share: float, start: 
         share: of places, to be held.
         start: of the search.
     """
-    cells = [one.cells.holding(place) for one, place in zip(held, places, strict=True)]
-    spans = np.log([INFLATIONS, TEMPERATURES, TAILS]).T
+    edge = float(np.max([one.cells.edge.max() for one in held]))
+    spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
 
     def of(point: np.ndarray) -> Trust:
-        inflation, temperature, tail = np.exp(np.clip(point, *spans))
-        return Trust(float(inflation), float(temperature), float(tail))
+        inflation, temperature, tail, spread = np.exp(np.clip(point, *spans)).tolist()
+        return Trust(inflation, temperature, tail, spread * edge)
 
     def surprise(point: np.ndarray) -> float:
         trust = of(point)
-        return -float(np.mean([one.by(trust).log_density[i] for one, i in zip(held, cells, strict=True)]))
+        return -float(np.mean([one.by(trust).at(place) for one, place in zip(held, places, strict=True)]))
 
-    first = np.log([start.inflation, start.temperature, start.tail])
-    simplex = first + np.vstack([np.zeros(3), np.diag([1.0, -1.5, 1.0])])
+    first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
+    simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
     found = minimize(
         surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
     )

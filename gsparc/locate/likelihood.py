@@ -63,12 +63,14 @@ class Trust:
         inflation: of variances.
         temperature: share of the values in (0, 1] that count as independent.
         tail: degrees of freedom.
+        spread: standard deviation of recorded places about the likelihood's along each axis [m].
         level: mass of the area that holds the promised share of places.
     """
 
     inflation: float = 1.0
     temperature: float = 0.1
     tail: float = 4.0
+    spread: float = 0.0
     level: float = 0.9
 
     def log_likelihood(self, misfit: Misfit) -> Tensor:

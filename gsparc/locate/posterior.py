@@ -3,44 +3,88 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.special import logsumexp
 
 from gsparc.locate.cells import Cells
 
 MODE = 0.05  # of the mass, that a further mode has at least
+BLURRED = 0.999  # of the mass: cells beyond it stay as they are
+LEAST = 1e-300
+
+
+def likeliest(log_density: np.ndarray, size: np.ndarray, share: float) -> np.ndarray:
+    """The densest cells (c,) of G that hold a share of the mass, densest first."""
+    order = np.argsort(-log_density, kind="stable")
+    return order[: int(np.searchsorted(np.cumsum((np.exp(log_density) * size)[order]), share)) + 1]
 
 
 @dataclass(frozen=True)
 class Posterior:
     """Masses of the cells in which something was heard.
 
+    Places are recorded with errors, so that the density is that of the likelihood after a convolution with a
+    Gaussian: a kernel density of the cells, each as wide as it is itself and as the errors are.
+
     Attributes:
         cells: G of them.
-        log_density: (G,) log mass by size of a cell, of total mass 1.
+        sharp: (G,) log mass by size of a cell by the likelihood alone, of total mass 1.
+        spread: standard deviation of recorded places along each axis [m].
     """
 
     cells: Cells
-    log_density: np.ndarray
+    sharp: np.ndarray
+    spread: float = 0.0
+
+    @cached_property
+    def log_density(self) -> np.ndarray:
+        """(G,) log mass by size of a cell, of total mass 1."""
+        found = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
+        found = np.log(found + LEAST)
+        return np.asarray(found - logsumexp(found, b=self.cells.size))
 
     @property
     def mass(self) -> np.ndarray:
         """Of each cell (G,)."""
         return np.exp(self.log_density) * self.cells.size
 
+    def at(self, place: np.ndarray) -> float:
+        """Log density at a place (3,) itself, not of its cell."""
+        here = self.cells.holding(place)
+        rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
+        return float(np.log(self._density(place[None])[0] + rest + LEAST))
+
     def level(self, place: np.ndarray) -> float:
-        """Mass of all cells more likely than the one that a place (3,) is in, and half of that cell's own."""
-        here, mass = self.cells.holding(place), self.mass
-        above = self.log_density > self.log_density[here]
-        return float(mass[above].sum() + 0.5 * mass[here])
+        """Mass of all cells more likely than a place (3,)."""
+        return float(self.mass[self.log_density > self.at(place)].sum())
+
+    @cached_property
+    def _blurred(self) -> np.ndarray:
+        """Whether a cell is one of those that hold nearly all of the mass (G,)."""
+        some = np.zeros(len(self.cells), bool)
+        some[likeliest(self.sharp, self.cells.size, BLURRED)] = True
+        return some
+
+    def _density(self, places: np.ndarray) -> np.ndarray:
+        """Of the cells that are blurred, at places (m, 3)."""
+        some, live = self._blurred, self.cells.edge.max(0) > 0
+        middle = self.cells.centre.mean(0)[live]
+        centre, edge = self.cells.centre[some][:, live] - middle, self.cells.edge[some][:, live]
+        apart = places[:, live] - middle
+        precision = 1 / (self.spread**2 + edge**2 / 12)
+        squared = apart**2 @ precision.T + (centre**2 * precision).sum(1) - 2 * apart @ (centre * precision).T
+        mass = np.exp(self.sharp[some]) * self.cells.size[some]
+        weight = mass * np.sqrt(precision / (2 * np.pi)).prod(1)
+        return np.asarray(np.exp(-0.5 * squared.clip(0)) @ weight)
 
     def within(self, share: float) -> np.ndarray:
         """The most likely cells (c,) that hold a share of the mass, most likely first."""
-        order = np.argsort(-self.log_density, kind="stable")
-        return order[: int(np.searchsorted(np.cumsum(self.mass[order]), share)) + 1]
+        return likeliest(self.log_density, self.cells.size, share)
 
     def modes(self, share: float) -> list[np.ndarray]:
         """Cells of each connected part of the area that holds a share of the mass, heaviest first."""

@@ -10,12 +10,12 @@ import torch
 from gsparc.locate import likelihood
 from gsparc.locate.cells import Cells
 from gsparc.locate.likelihood import Misfit, Trust
-from gsparc.locate.posterior import Posterior
+from gsparc.locate.posterior import Posterior, likeliest
 from gsparc.locate.site_field import Moments, SiteField
 from gsparc.locate.snapshots import Snapshots
 
 HALVED = 16  # cells that are halved at a time
-KEPT = 0.5  # of the mass: cells beyond it stay as they are
+KEPT = 0.9  # of the mass: cells beyond it stay as they are
 LEVELS = 8  # halvings of a cell
 ENOUGH = 32  # cells of one size that hold this mass need not be halved
 
@@ -42,7 +42,7 @@ class Looked:
 
     def by(self, trust: Trust) -> Posterior:
         """What is known of the place."""
-        return Posterior(self.cells, _log_density(self.misfit, self.cells, trust))
+        return Posterior(self.cells, _log_density(self.misfit, self.cells, trust), trust.spread)
 
 
 def misfit(heard: Snapshots, there: Moments, unknown: Unknown) -> Misfit:
@@ -68,10 +68,10 @@ def looked(
     """
     cells, found = coarse, of_coarse
     for _ in range(LEVELS):
-        here = Posterior(cells, _log_density(found, cells, trust))
-        some = here.within(KEPT)
+        some = likeliest(_log_density(found, cells, trust), cells.size, KEPT)
         wide = cells.edge[some].max(1)
-        if len(some) >= ENOUGH and wide.max() < 1.01 * wide.min():
+        some, wide = some[wide > trust.spread], wide[wide > trust.spread]
+        if not len(some) or (len(some) >= ENOUGH and wide.max() < 1.01 * wide.min()):
             break
         chosen = some[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
         finer = cells.at(chosen).halved()
