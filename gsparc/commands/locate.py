@@ -48,9 +48,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown = Unknown(bool(config.phase_known), float(config.offset_db))
-    start = Trust() if config.calibrate else _stored(config, run, unknown)
+    share = float(config.share)
+    start = Trust() if config.calibrate else locating.restored(run.stored[0].extra, unknown, share)
     around = config.prior == "trained"
-    found = Locator.of(method, data, learned, unknown, start, around, share=float(config.share))
+    found = Locator.of(method, data, learned, unknown, start, around, share=share)
     count = 0
     if config.calibrate:
         found, count = _calibrated(config, run, found, around)
@@ -92,21 +93,6 @@ def task(config: DictConfig) -> dict[str, Any]:
         f"{found.share:.0%} are promised; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
     )
     return finish(run_dir, facts, shown, lines=[said])
-
-
-def _stored(config: DictConfig, run: Opened, unknown: Unknown) -> Trust:
-    """The trust that an earlier call kept with the model."""
-    found = locating.restored(run.stored[0].extra)
-    if found is None:
-        log.warning("calibrate=0, and nothing is stored: areas are as wide as the model's own variances say")
-        return Trust()
-    trust, before, share = found
-    if (before, share) != (unknown, float(config.share)):
-        said = f"share={share}, phase_known={before.phase_known}, offset_db={before.offset_db}"
-        raise ValueError(
-            f"calibrate=0: {config.ckpt} was calibrated with {said}; calibrate it for other settings"
-        )
-    return trust
 
 
 def _calibrated(config: DictConfig, run: Opened, found: Locator, around: bool) -> tuple[Locator, int]:

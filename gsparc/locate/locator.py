@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -87,7 +87,7 @@ class Locator:
         Raises:
             ValueError: both ends move, or the method states no variance.
         """
-        field = SiteField(method, data.site, tuple(data.target.shape[1:]))
+        field = SiteField(method, data.site)
         return cls(field, cover(data.moving[rows][:, :3], most, around), unknown, trust, share)
 
     @cached_property
@@ -160,10 +160,25 @@ def kept(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
     return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
 
 
-def restored(extra: dict[str, Any]) -> tuple[Trust, Unknown, float] | None:
-    """What `kept` held; None where nothing was."""
+def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
+    """The trust that `kept` held.
+
+    Where nothing was, areas are as wide as the model's own variances say, which is logged.
+
+    Raises:
+        ValueError: it was learned for other settings.
+    """
     found = extra.get(KEY)
-    return None if found is None else (Trust(**found["trust"]), Unknown(**found["unknown"]), found["share"])
+    if found is None:
+        log.warning("locate: never calibrated, areas are as wide as the model's own variances say")
+        return Trust(level=share)
+    before, promised = Unknown(**found["unknown"]), found["share"]
+    if (before, promised) != (unknown, share):
+        said = f"share={promised}, phase_known={before.phase_known}, offset_db={before.offset_db}"
+        raise ValueError(
+            f"the model was calibrated with {said}: `gsparc locate` calibrates it for other settings"
+        )
+    return Trust(**found["trust"])
 
 
 def in_world(located: Located, origin: np.ndarray) -> Located:

@@ -36,11 +36,15 @@ class SiteField:
     Args:
         method: trained; its predictions have variances.
         site: what it was trained on.
-        shape: of one target.
+
+    Raises:
+        ValueError: both ends move.
     """
 
-    def __init__(self, method: Method, site: Site, shape: tuple[int, ...]) -> None:
-        self.method, self.site, self.shape = method, site, shape
+    def __init__(self, method: Method, site: Site) -> None:
+        if site.static_end is None:
+            raise ValueError("locate: both ends move; one that stands still is needed")
+        self.method, self.site = method, site
         self.count = 1 if site.stations is None else len(site.stations)
 
     @torch.no_grad()
@@ -64,7 +68,7 @@ class SiteField:
         if self.count == 1 and site.static_end == "rx":
             rx = Pose(ends[1][0], turned[0])
         dtype = torch.complex64 if site.kind == "csi" else torch.float32
-        target = torch.zeros(1, dtype=dtype).expand(many, *self.shape)
+        target = torch.zeros(1, dtype=dtype).expand(many, 1)
         batch = Batch(
             torch.zeros(many, dtype=torch.int64), ends[0], rx, target,
             station=None if site.stations is None else station,

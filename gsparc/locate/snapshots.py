@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Kind, Measurements, Site
 
 PIXELS = 1_000  # about as many of a spectrum are compared: an array's have far fewer degrees of freedom
 
@@ -45,13 +45,8 @@ def snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     """Rows (m,) of measurements as snapshots: rows of one place at different stations are one.
 
     Of several visits of a station to a place the first is of the first snapshot there, and so on.
-
-    Raises:
-        ValueError: both ends move.
     """
     site = data.site
-    if site.static_end is None:
-        raise ValueError("locate: both ends move; one that stands still is needed")
     rows = np.sort(np.asarray(rows))
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
     count = 1 if site.stations is None else len(site.stations)
@@ -78,6 +73,49 @@ def snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
         values[which[silent], station[silent]] = np.nan
         floor = floor.flatten(1)
     return Snapshots(site.kind, values.flatten(1), floor, data.moving[rows][first], rows[first])
+
+
+def of_values(
+    site: Site, values: np.ndarray | Tensor, silent: np.ndarray | Tensor | None = None
+) -> Snapshots:
+    """Snapshots at unknown places from what predictions of the site look like.
+
+    Args:
+        site: with T stations, or one static end.
+        values: (n, ...), where there are stations (n, T, ...): spectra, channels or linear powers in physical
+            units; NaN where a station is missing.
+        silent: bool like powers (n, T) or (n, 1): True where nothing was heard, and the value is the level
+            below which it was.
+
+    Raises:
+        ValueError: of another kind or shape than what the site was measured with, or nothing in it.
+    """
+    heard = torch.as_tensor(values)
+    count, each = site.stations and len(site.stations), {"spectrum": 3, "csi": 3, "rssi": 2}[site.kind]
+    ndim = each if count is None or site.kind == "rssi" else each + 1
+    if (
+        heard.is_complex() != (site.kind == "csi")
+        or heard.ndim != ndim
+        or (count and heard.shape[1] != count)
+    ):
+        stations = "" if count is None else f" of {count} stations"
+        raise ValueError(f"locate: values {tuple(heard.shape)} {heard.dtype} are no {site.kind}{stations}")
+    if silent is not None and (site.kind != "rssi" or np.shape(silent) != tuple(heard.shape)):
+        raise ValueError(f"locate: silent {np.shape(silent)} is not like powers {tuple(heard.shape)}")
+    if torch.isnan(heard.real).flatten(1).all(1).any():
+        raise ValueError("locate: there is a snapshot in which nothing was heard")
+    scaled = heard.to(torch.complex128 if heard.is_complex() else torch.float64) / site.target_scale
+    flat = (scaled if count is None or site.kind == "rssi" else scaled.flatten(0, 1)).contiguous()
+    own = (
+        10 * flat.clamp_min(1e-30).log10() if site.kind == "rssi" else compared(flat).reshape(len(heard), -1)
+    )
+    floor = None
+    if silent is not None:
+        quiet = torch.as_tensor(silent)
+        floor = torch.where(quiet, own, torch.full_like(own, np.nan))
+        own = torch.where(quiet, torch.full_like(own, np.nan), own)
+    nowhere = np.full((len(heard), 3), np.nan)
+    return Snapshots(site.kind, own, floor, nowhere, np.arange(len(heard)))
 
 
 def compared(targets: Tensor) -> Tensor:

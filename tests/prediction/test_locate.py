@@ -1,0 +1,76 @@
+"""`Predictor.locate`: places from values in the units and shapes of predictions."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+from campaigns import compose, powers, spectra
+
+import gsparc
+from gsparc.commands.train import train
+from gsparc.locate.likelihood import Trust
+from gsparc.locate.locator import kept
+from gsparc.locate.search import Unknown
+from gsparc.models import checkpoint
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("located")
+    file = spectra(folder / "own.npz", rows=80)
+    train(compose("dataset=own", f"dataset.file='{file}'", "model=gp", "baselines=[]", "logger=none"), folder)
+    return folder / "model.ckpt"
+
+
+def test_a_predicted_spectrum_is_located_where_it_was_predicted(trained):
+    predictor = gsparc.load(trained)
+    low, high = predictor.site.moving_box + predictor.site.origin
+    places = low + (high - low) * np.array([[0.3, 0.4, 0.5], [0.7, 0.5, 0.4]])
+    found = predictor.locate(predictor.spectrum(tx=places))
+    assert np.linalg.norm([one.place for one in found] - places, axis=1).max() < 0.1
+    corner = predictor.locate(
+        predictor.spectrum(tx=places[:1]), where=low[None] + [[0, 0, 0], [0.3, 0.3, 0.1]]
+    )
+    assert (corner[0].place <= low + 0.61).all(), "nowhere else can one stand"
+
+
+def test_areas_are_those_that_were_calibrated(trained, caplog):
+    predictor = gsparc.load(trained)
+    spectrum = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
+    with caplog.at_level(logging.WARNING):
+        before = predictor.locate(spectrum)[0]
+    assert "never calibrated" in caplog.text
+    checkpoint.amend(trained, kept(Trust(spread=0.2), Unknown(), 0.9))
+    after = gsparc.load(trained).locate(spectrum)[0]
+    assert after.area > 2 * before.area
+    with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
+        gsparc.load(trained).locate(spectrum, share=0.5)
+
+
+def test_missing_and_silent_stations_are_no_values(tmp_path):
+    file = powers(tmp_path / "own.npz")
+    train(
+        compose("dataset=own", f"dataset.file='{file}'", "model=gp", "baselines=[]", "logger=none"), tmp_path
+    )
+    predictor = gsparc.load(tmp_path / "model.ckpt")
+    place = (predictor.site.moving_box + predictor.site.origin).mean(0)
+    power = predictor.rssi(**{predictor.site.moving_end: place[None]})
+    loud, quiet = (predictor.locate(power, silent=silent)[0] for silent in (None, [[True]]))
+    assert quiet.area > loud.area, "below a level is less than at a level"
+
+
+@pytest.mark.parametrize(
+    ("values", "more", "said"),
+    [
+        (np.zeros((2, 3)), {}, r"values \(2, 3\) torch.float64 are no spectrum"),
+        (np.zeros((1, 9, 36), complex), {}, "are no spectrum"),
+        (np.full((1, 9, 36), np.nan), {}, "in which nothing was heard"),
+        (np.zeros((1, 9, 36)), {"silent": [[True]]}, "silent"),
+    ],
+)
+def test_values_of_another_kind_are_refused_in_one_line(trained, values, more, said):
+    with pytest.raises(ValueError, match=said) as raised:
+        gsparc.load(trained).locate(values, **more)
+    assert "\n" not in str(raised.value)
