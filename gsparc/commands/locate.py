@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.commands.map import plan_of
 from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.load import split_settings
@@ -21,6 +23,7 @@ from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
 from gsparc.locate import locator as locating
 from gsparc.locate.baselines.table import located_by
+from gsparc.locate.cells import Cells, cover
 from gsparc.locate.likelihood import Trust
 from gsparc.locate.locator import Located, Locator
 from gsparc.locate.search import Unknown
@@ -50,11 +53,15 @@ def task(config: DictConfig) -> dict[str, Any]:
     unknown = Unknown(bool(config.phase_known), float(config.offset_db))
     share = float(config.share)
     start = Trust() if config.calibrate else locating.restored(run.stored[0].extra, unknown, share)
-    around = config.prior == "trained"
-    found = Locator.of(method, data, learned, unknown, start, around, share=share)
+    plan = plan_of(config)
+    cells = partial(
+        cover, most=locating.MOST, around=config.prior == "trained",
+        open_at=None if plan is None else lambda places: plan.light(places[:, :2] + data.site.origin[:2]),
+    )  # fmt: skip
+    found = Locator.of(method, data, learned, unknown, start, cells, share)
     count = 0
     if config.calibrate:
-        found, count = _calibrated(config, run, found, around)
+        found, count = _calibrated(config, run, found, cells)
         if config.store:
             checkpoint.amend(config.ckpt, locating.kept(found.trust, unknown, found.share))
     heard, known = _heard(config, run, data, fold)
@@ -95,7 +102,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     return finish(run_dir, facts, shown, lines=[said])
 
 
-def _calibrated(config: DictConfig, run: Opened, found: Locator, around: bool) -> tuple[Locator, int]:
+def _calibrated(
+    config: DictConfig, run: Opened, found: Locator, cells: Callable[[np.ndarray], Cells]
+) -> tuple[Locator, int]:
     settings = OmegaConf.create(run.stored[0].configuration)
     if "model" not in settings:
         raise ValueError(f"{config.ckpt} does not name its settings: calibrate=0 goes without")
@@ -107,7 +116,7 @@ def _calibrated(config: DictConfig, run: Opened, found: Locator, around: bool) -
     )  # fmt: skip
     make = partial(build, settings.model)
     trust, count = locating.trusted(
-        make, run.data, run.split.folds[0], context, found, int(config.calibrate), around
+        make, run.data, run.split.folds[0], context, found, int(config.calibrate), cells
     )
     log.info("trust learned from %d snapshots that were left out: %s", count, trust)
     return Locator(found.field, found.cells, found.unknown, trust, found.share), count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,16 +55,19 @@ class Cells:
         return int((outside.sum(1) + 1e-6 * np.linalg.norm(self.centre - place, axis=1)).argmin())
 
 
-def cover(trained: np.ndarray, most: int, around: bool) -> Cells:
+def cover(
+    trained: np.ndarray, most: int, around: bool, open_at: Callable[[np.ndarray], np.ndarray] | None = None
+) -> Cells:
     """About `most` equal cells of the box of trained places (n, 3) [m].
 
     Args:
         trained: local.
         most: cells of the whole box.
         around: whether only cells near trained places are kept, as in a building one walked through.
+        open_at: whether one can stand at places (m, 3) [m, local], by a floor plan.
 
     Raises:
-        ValueError: all places are one.
+        ValueError: all places are one, or one can stand nowhere.
     """
     low, extent = trained.min(0), np.ptp(trained, axis=0)
     live = extent > THIN * extent.max()
@@ -82,4 +86,8 @@ def cover(trained: np.ndarray, most: int, around: bool) -> Cells:
         apart = np.median(tree.query(tree.data, k=min(2, tree.n))[0][:, -1])
         near = tree.query(centre)[0] <= max(REACH * apart, np.linalg.norm(edge))
         centre = centre[near]
+    if open_at is not None:
+        centre = centre[open_at(centre)]
+        if not len(centre):
+            raise ValueError("locate: by the plan one can stand nowhere in the box of trained places")
     return Cells(centre, np.broadcast_to(edge, centre.shape).copy())

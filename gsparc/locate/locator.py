@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numpy as np
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 MOST = 3_000  # cells of the coarse grid
 HELD_OUT = 200  # snapshots that trust is learned from, drawn evenly
+BOX = partial(cover, most=MOST, around=False)  # one can stand anywhere in the box of trained places
 KEY = "locate"  # in a checkpoint's `extra`
 
 
@@ -73,7 +74,7 @@ class Locator:
     @classmethod
     def of(
         cls, method: Method, data: Measurements, rows: np.ndarray, unknown: Unknown, trust: Trust,
-        around: bool = False, most: int = MOST, share: float = 0.9,
+        cells: Callable[[np.ndarray], Cells] = BOX, share: float = 0.9,
     ) -> Self:  # fmt: skip
         """Of a method that was trained on rows (n,).
 
@@ -81,14 +82,13 @@ class Locator:
             method: trained.
             data, rows: what it learned from: where one can stand.
             unknown, trust, share: see there.
-            around: whether one can stand near trained places alone; else in their whole box.
-            most: cells of the grid.
+            cells: of a coarse grid where one can stand, from trained places (n, 3) [m, local].
 
         Raises:
             ValueError: both ends move, or the method states no variance.
         """
         field = SiteField(method, data.site)
-        return cls(field, cover(data.moving[rows][:, :3], most, around), unknown, trust, share)
+        return cls(field, cells(data.moving[rows][:, :3]), unknown, trust, share)
 
     @cached_property
     def _coarse(self) -> Moments:
@@ -117,7 +117,7 @@ class Locator:
 
 def trusted(
     make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext, locator: Locator,
-    folds: int, around: bool,
+    folds: int, cells: Callable[[np.ndarray], Cells],
 ) -> tuple[Trust, int]:  # fmt: skip
     """How far such a method is trusted, from training places that it left out, and their number.
 
@@ -129,7 +129,7 @@ def trusted(
         context: of each training.
         locator: of the whole method.
         folds: groups.
-        around: see `Locator.of`.
+        cells: see `Locator.of`.
     """
     groups: list[tuple[Locator, Snapshots]] = []
     rng = np.random.default_rng(context.seed)
@@ -139,7 +139,7 @@ def trusted(
         method = for_links(make, data)
         method.fit(data, inner, context.within(f"group{number}"))
         known = np.union1d(inner.train, inner.val)
-        own = Locator.of(method, data, known, locator.unknown, locator.trust, around, MOST, locator.share)
+        own = Locator.of(method, data, known, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)
         chosen = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
         groups.append((own, heard.at(chosen)))

@@ -15,6 +15,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.limits import finite
 
 LEAST_PIXELS = 2.0  # between the reference points: nearer ones tell no scale
+DARK = 128  # of 255: walls are darker
 LARGEST = 4000  # pixels of the longer side that are kept
 SHOW = "say plan_points=[[column,row,x,y],[column,row,x,y]], pixels from the upper left corner, metres"
 
@@ -44,6 +45,15 @@ class FloorPlan:
         """(a, b, c, d, e, f): x = a column + c row + e and y = b column + d row + f [m]."""
         one, two = self.scale, -1j * self.scale
         return one.real, one.imag, two.real, two.imag, self.shift.real, self.shift.imag
+
+    def light(self, places: np.ndarray) -> np.ndarray:
+        """Whether there is open floor (m,), a light pixel, at world places (m, 2) [m]."""
+        pixel = (places[:, 0] + 1j * places[:, 1] - self.shift) / self.scale
+        column, row = np.floor(pixel.real).astype(int), np.floor(-pixel.imag).astype(int)
+        height, width = self.image.shape[:2]
+        within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        shade = self.image[row.clip(0, height - 1), column.clip(0, width - 1)].mean(1)
+        return np.asarray(within & (shade > DARK))
 
 
 def read_plan(path: str | Path, points: Sequence[Sequence[float]] | None) -> FloorPlan:

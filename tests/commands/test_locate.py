@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from campaigns import compose, powers, spectra
+from PIL import Image
 
 from gsparc.commands import locate
 from gsparc.commands.train import train
@@ -67,6 +68,18 @@ def test_trust_of_other_settings_is_not_taken_in_silence(trained, tmp_path, monk
     checkpoint.amend(trained, kept(Trust(level=0.95), Unknown(), 0.9))
     with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
         located(trained, tmp_path, monkeypatch, "calibrate=0", "share=0.5")
+
+
+def test_nobody_is_located_in_a_wall(trained, tmp_path, monkeypatch):
+    plan = np.full((40, 100, 3), 255, np.uint8)
+    plan[:, 50:] = 0  # the right half of the room
+    Image.fromarray(plan).save(tmp_path / "plan.png")
+    low, high = (site := checkpoint.read(trained).site).moving_box[:, :2] + site.origin[:2]
+    points = f"plan_points=[[0,40,{low[0]},{low[1]}],[100,40,{high[0]},{low[1]}]]"
+    more = ("calibrate=0", f"plan='{tmp_path}/plan.png'", points)
+    _, rows = located(trained, tmp_path / "run", monkeypatch, *more)
+    assert all(float(row["x"]) <= 0.5 * (low + high)[0] + 0.3 for row in rows)
+    assert any(float(row["x_true"]) > 0.5 * (low + high)[0] + 0.3 for row in rows)
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,23 @@ def test_one_can_stand_near_trained_places_alone():
         cover(np.ones((5, 3)), 100, False)
 
 
+def test_one_can_stand_where_a_plan_is_open():
+    left = cover(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
+    assert (left.centre[:, 0] < 2.0).all() and 150 < len(left) < 300
+    with pytest.raises(ValueError, match="stand nowhere"):
+        cover(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
+
+
+def test_errors_of_recorded_places_widen_an_area():
+    cells = cover(PLACES, 20_000, False)
+    sharp = gaussians(cells, [[2.0, 1.0]])
+    wide = Posterior(cells, sharp.sharp, 0.3)
+    area = cells.size[wide.within(0.9)].sum()
+    assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
+    place = np.array([2.3, 1.1, 1.5])
+    assert wide.at(place) == pytest.approx(wide.log_density[cells.holding(place)], abs=0.05)
+
+
 def test_an_area_of_a_known_density_holds_its_share():
     found = gaussians(cover(PLACES, 20_000, False), [[2.0, 1.0]])
     area = found.cells.size[found.within(0.9)].sum()
