@@ -109,9 +109,10 @@ class Locator:
             posterior = self.look(heard.at(np.array([number]))).by(self.trust)
             inside = posterior.within(self.trust.level)
             modes = posterior.modes(self.trust.level)
-            best = posterior.cells.centre[posterior.log_density.argmax()]
             area = float(posterior.cells.size[inside].sum())
-            found.append(Located(best, area, len(modes), posterior, time.perf_counter() - started))
+            found.append(
+                Located(posterior.peak(), area, len(modes), posterior, time.perf_counter() - started)
+            )
         return found
 
 

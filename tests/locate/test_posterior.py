@@ -47,6 +47,15 @@ def test_one_can_stand_where_a_plan_is_open():
         cover(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
 
 
+def test_the_likeliest_place_is_between_middles_of_cells():
+    cells = cover(PLACES, 400, False)
+    truth = np.array([2.037, 1.021])
+    found = Posterior(cells, gaussians(cells, [truth], 0.3).sharp, 0.15)
+    cell = cells.centre[found.log_density.argmax()]
+    assert np.linalg.norm(found.peak()[:2] - truth) < 0.3 * np.linalg.norm(cell[:2] - truth)
+    assert found.peak()[2] == 1.5
+
+
 def test_errors_of_recorded_places_widen_an_area():
     cells = cover(PLACES, 20_000, False)
     sharp = gaussians(cells, [[2.0, 1.0]])
