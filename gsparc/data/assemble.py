@@ -110,6 +110,7 @@ def assemble(
     carrier_hz: float | None = None,
     subcarriers_hz: np.ndarray | None = None,
     links: Links | None = None,
+    position_std: np.ndarray | None = None,
     **facts: Any,
 ) -> Measurements:
     """Measurements centred on the scene box, from validated world coordinates.
@@ -122,7 +123,7 @@ def assemble(
         target_scale: stored target = physical target / target_scale.
         noise_variance: (S,) in units of the stored target.
         release_split: (train, test) rows that the data themselves name.
-        mask, directions, row_names, provenance: see `Measurements`.
+        mask, directions, row_names, provenance, position_std: see `Measurements`.
         links: of several stations, censored or unknown ends; None where there is nothing to say.
     """
     links = links or Links(static_end)
@@ -140,7 +141,7 @@ def assemble(
         "target_scale": np.array(target_scale), "subcarriers_hz": subcarriers_hz,
         "carrier_hz": None if carrier_hz is None else np.array(carrier_hz), "noise_variance": noise_variance,
         "station": links.station, "place": links.place, "censored": links.censored, "run": links.run,
-        "carriers_hz": None if stations is None else stations.carrier_hz,
+        "carriers_hz": None if stations is None else stations.carrier_hz, "position_std": position_std,
     }  # fmt: skip
     still = None
     if static_end is not None and (stations is None or len(stations) == 1):
@@ -159,5 +160,5 @@ def assemble(
     return Measurements(
         site, tx - origin, rx - origin, rx_rotation, target, mask, noise_variance, directions, names,
         release_split, dict(provenance or {}), station=links.station, place=links.place,
-        censored=links.censored, run=links.run,
+        censored=links.censored, run=links.run, position_std=position_std,
     )  # fmt: skip

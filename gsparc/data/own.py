@@ -135,7 +135,10 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
     grid = check.grid(*values.shape[1:]) if kind == "spectrum" else None
     array = _array(check, values.shape[1] if kind == "csi" else None)
-    noise = _noise(check, measured, rows)
+    noise = _not_negative(check, "noise_variance", rows)
+    if noise is not None and measured == "rssi_db":
+        check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
+    position_std = _not_negative(check, "position_std", rows)
     offsets = check.ragged(rows)
     release_split = check.release_split(rows)
     _in_range(check, measured, values, mask)
@@ -165,7 +168,8 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         kind=kind, static_end=static_end, tx=tx, rx=rx, rx_rotation=rotation, target=target, mask=mask,
         target_scale=scale, noise_variance=noise, directions=directions, grid=grid, array=array,
         carrier_hz=carrier, subcarriers_hz=frequency if kind == "csi" else None,
-        row_names=row_names, release_split=release_split, links=links, **about,
+        row_names=row_names, release_split=release_split, links=links,
+        position_std=position_std, **about,
     )  # fmt: skip
     return Reading(data, tuple(check.notes))
 
@@ -227,16 +231,15 @@ def _array(check: Checker, antennas: int | None) -> np.ndarray | None:
     return array
 
 
-def _noise(check: Checker, measured: str, rows: int) -> np.ndarray | None:
-    noise = check.real("noise_variance", (), (rows,))
-    if noise is None:
+def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
+    """An array () or (S,) as (S,) float64."""
+    given = check.real(name, (), (rows,))
+    if given is None:
         return None
-    if measured == "rssi_db":
-        return check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
-    noise = np.broadcast_to(noise, (rows,))
-    bad = ~(np.isfinite(noise) & (noise >= 0))
-    check.refuse_rows("noise_variance", bad, "expected a finite number, at least 0")
-    return noise
+    values = np.broadcast_to(given, (rows,)).copy()
+    bad = ~(np.isfinite(values) & (values >= 0))
+    check.refuse_rows(name, bad, "expected a finite number, at least 0")
+    return values
 
 
 def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:

@@ -244,6 +244,8 @@ class Measurements:
         censored: (S,) bool, True where a power was below what can be heard: the target is that level, and its
             mask is False. None where nothing is.
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
+        position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
+            where positions count as exact.
     """
 
     site: Site
@@ -262,6 +264,7 @@ class Measurements:
     place: np.ndarray | None = None
     censored: np.ndarray | None = None
     run: np.ndarray | None = None
+    position_std: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.target)
@@ -363,6 +366,7 @@ FIELDS: dict[str, Field] = {
         Field("grid_deg", "(4,)", "deg", "no", "first elevation, first azimuth, their steps"),
         Field("mask", "as the measurement", "1", "no", "True where measured; the rest may hold anything"),
         Field("noise_variance", "() or (S,)", "unit of the measurement squared", "no", "noise power"),
+        Field("position_std", "() or (S,)", "m", "no", "error of each coordinate of the end that moves"),
         Field("path_offsets", "(S + 1,)", "1", "no", "paths of sample i are path_offsets[i]:[i + 1]"),
         Field("path_direction", "(P, 3)", "1", "no", "direction of arrival, receiver's frame"),
         Field("path_last_point", "(P, 3)", "m", "no", "last interaction point; instead of path_direction"),

@@ -11,6 +11,7 @@ import copy
 import logging
 from abc import abstractmethod
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.inner_folds import cut_inside
+from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
@@ -34,6 +36,7 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.weights import comparable
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Blended, averaged, contributions, knobs, mean_alone, reduced
+from gsparc.models.refined_places import displaced, refined
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
@@ -56,6 +59,7 @@ log = logging.getLogger(__name__)
 DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 BEFORE, AFTER = 3.0, 3.0  # validations that steps take at least, and that may follow when seconds end them
+MEASURED_SHARE = 0.4  # of the seconds, for the fit that positions with errors are refined by
 LEAST_STEPS_S = 0.5  # less is not worth to set up
 RAYS_FACTORS = 1_500.0  # the same of measured rays, fitted and given all rows
 LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fit makes, and rows of one
@@ -67,6 +71,7 @@ class PlannedField(LearnedField):
 
     Args:
         effects: switches of terms.
+        position_std: of each coordinate of training positions [m]; None: as the data say.
         **field: see `LearnedField`.
     """
 
@@ -76,8 +81,12 @@ class PlannedField(LearnedField):
     def planned(self, data: Measurements) -> Plan:
         """What is trained for these measurements."""
 
-    def __init__(self, effects: EffectSettings | None = None, **field: Any) -> None:
+    def __init__(
+        self, effects: EffectSettings | None = None, position_std: float | None = None, **field: Any
+    ) -> None:
+        check_arguments(locals(), position_std=or_null(number(0)))
         super().__init__(**field)
+        self.position_std = position_std
         self.switches = effects or EffectSettings()
         self.field: ConditionalField | None = None
         self.plan: Plan | None = None
@@ -124,9 +133,40 @@ class PlannedField(LearnedField):
             log.info("%s", reason)
         if self.init.name == "scene":
             read_walls(self.init.file)  # its errors come before anything is computed
+        std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
+        known = np.concatenate([fold.train, fold.val])
+        wrong = std is not None and bool(std[known].any())
+        if wrong and not self.plan.rasterized and data.site.static_end is not None:
+            return self._fit_refined(self.plan, data, fold, context, std)
+        if wrong:
+            log.warning("position_std is not used: it is of closed forms where one end moves")
         if self.plan.rasterized:
             return self._fit_rasterized(data, fold, context)
         return self._fit_conditional(self.plan, data, fold, context)
+
+    def _fit_refined(
+        self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext, std: np.ndarray
+    ) -> FitReport:
+        """First where rows were measured, then, in the rest of the seconds, where they rather were."""
+        seconds = DEFAULT_BUDGET_S if context.budget_s is None else context.budget_s
+        budget = context.time_budget(seconds)
+        first = replace(context, run_dir=Path(), resume=None, budget_s=MEASURED_SHARE * seconds)
+        report = self._fit_conditional(chosen, data, fold, first)
+        assert self.field is not None
+        try:
+            rows, by, said = refined(self.field, self.runs.aligned(data), std)
+        except ValueError as error:
+            rows, by, said = fold.train, np.zeros((1, 3)), f"position_std is not used: {error}"
+        log.info("%s", said)
+        spent = budget.counted.wall
+        rest = max(seconds - budget.spent, (1 - MEASURED_SHARE) * seconds / 2)
+        there = displaced(data, rows, by)
+        found = self._fit_conditional(chosen, there, fold, replace(context, budget_s=rest))
+        stages = {"measured places": spent, **found.cost.stages}
+        limited = less_repeatable(report.limited_by, found.limited_by)
+        notes = (said, *found.notes)
+        cost = replace(found.cost, stages=stages)
+        return replace(found, seconds=spent + found.seconds, notes=notes, limited_by=limited, cost=cost)
 
     def _fit_rasterized(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         assert self.plan is not None

@@ -16,7 +16,7 @@ from gsparc.models.terms import EffectSettings
 PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
 LINES = {
     "effects": (["base=plain"], ["none"], "study/plain/psnr_db"),
-    "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train"], "study/mean/query/0.1/psnr_db"),
+    "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train", "train_known"], "study/mean/query/0.1/psnr_db"),
     "measurements": (["kind.keep=[1,0.5]", "rounds=1"], ["keep", "keep"], "study/mean/keep/0.5/train_s"),
 }
 
@@ -48,7 +48,7 @@ def test_each_kind_has_its_variants_and_baselines():
     names = [*effects.variants]
     assert names[0] == effects.base == "plain" and {"array", "phase", "power", "gp"} <= set(names)
     assert [*positions.variants] == [*measured.variants]
-    assert len(positions.conditions) == 13 and len(measured.conditions) == 4 and measured.rounds == 3
+    assert len(positions.conditions) == 19 and len(measured.conditions) == 4 and measured.rounds == 3
 
 
 def test_variants_join_the_models_settings_where_they_are_interpolations():

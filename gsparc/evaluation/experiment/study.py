@@ -15,6 +15,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.fit import Outcome, fit_and_score, in_folders
 from gsparc.evaluation.figures import DECIDING
 from gsparc.models.method import Method
+from gsparc.models.refined_places import displaced as elsewhere
 from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
 from gsparc.training.context import FitContext
 
@@ -226,21 +227,28 @@ class Positions:
         errors_m: standard deviations of each coordinate [m].
         errors_deg: of directions of arrival about each of two axes, where receivers measured them [degrees].
         train_errors: whether training positions are disturbed, too; else those of queries alone.
+        known: whether, then, also with models told how large these errors are (`position_std`).
     """
 
     title: ClassVar[str] = "accuracy against errors of positions and directions"
     errors_m: Sequence[float] = ()
     errors_deg: Sequence[float] = ()
     train_errors: bool = True
+    known: bool = True
 
     def conditions(self) -> list[Condition]:
-        """No error, then errors of positions in a `query`, in training (`train`), and of `directions`."""
+        """No error, then errors of positions in a `query`, in training (`train`), and of `directions`.
+
+        Training errors whose size the data say (`Measurements.position_std`) are `train_known`.
+        """
+        told = {"train": False} | ({"train_known": True} if self.known else {})
         errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
         return [
             Condition(),
             *(Condition("query", error, tested=partial(_asked_elsewhere, error)) for error in errors),
             *(
-                Condition("train", error, learned=partial(_learned_elsewhere, error))
+                Condition(name, error, learned=partial(_learned_elsewhere, error, known))
+                for name, known in told.items()
                 for error in errors
                 if self.train_errors
             ),
@@ -274,9 +282,10 @@ def _asked_elsewhere(error_m: float, data: Measurements, split: Split, seed: int
 
 
 def _learned_elsewhere(
-    error_m: float, data: Measurements, fold: Fold, seed: int
+    error_m: float, known: bool, data: Measurements, fold: Fold, seed: int
 ) -> tuple[Measurements, Fold]:
-    return displaced(data, np.concatenate([fold.train, fold.val]), error_m, seed), fold
+    moved = displaced(data, np.concatenate([fold.train, fold.val]), error_m, seed)
+    return (replace(moved, position_std=np.full(len(data), error_m)) if known else moved), fold
 
 
 def _turned(error_deg: float, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
@@ -288,12 +297,13 @@ def _thinned(keep: float, data: Measurements, fold: Fold, seed: int) -> tuple[Me
 
 
 def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
-    """The moving end of `rows` believed elsewhere by N(0, error_m^2) per coordinate; all else the same."""
+    """The moving end of `rows` believed elsewhere by N(0, error_m^2) per coordinate; all else the same.
+
+    Rows of one place, heard by several stations, are believed to be at one place.
+    """
+    _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     offset = np.random.default_rng(seed).normal(scale=error_m, size=(len(rows), 3))
-    name = "tx" if data.site.moving_end == "tx" else "rx_position"
-    moved = getattr(data, name).copy()
-    moved[rows] += offset
-    return replace(data, **{name: moved})
+    return elsewhere(data, rows, offset[first][place.reshape(-1)])
 
 
 def turned(

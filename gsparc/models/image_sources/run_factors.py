@@ -62,7 +62,8 @@ class RunFactors:
 
     def aligned(self, data: Measurements) -> Measurements:
         """The channels in the phase and level of the largest run, as of one run."""
-        assert data.run is not None
+        if data.run is None or len(self) == 1:
+            return data
         factor = self.of(torch.from_numpy(data.run)).numpy()
         target = (data.target / factor[:, None, None]).astype(data.target.dtype)
         noise = None if data.noise_variance is None else data.noise_variance / np.abs(factor) ** 2

@@ -97,7 +97,7 @@ def test_errors_cost_an_interpolator_and_not_the_mean():
     conditions = Positions([0.001, 0.3]).conditions()
     rows = Study(dict(gp=GaussianProcess, mean=Mean), conditions, clock=CLOCK).run(data, split, CONTEXT)
     value = {(r.variant, r.what, r.amount): r.value for r in rows}
-    assert len(value) == 10
+    assert len(value) == 14
     for what in ("query", "train"):
         assert value["gp", what, 0.3] < value["gp", "none", 0.0] - 1
         assert abs(value["mean", what, 0.3] - value["mean", "none", 0.0]) < 1e-6

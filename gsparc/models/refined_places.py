@@ -1,0 +1,135 @@
+"""Positions of known errors, refined by what a field says of each row from all others.
+
+A row measured at an error d ~ N(0, s^2) has y = m + J d + e: m is predicted from all other rows, J its slope
+by the place, e ~ N(0, c v) with v the prediction's variance. The posterior of d is a Gauss-Newton step
+towards the marginal likelihood's maximum over places; McHutchon and Rasmussen ("Gaussian process training
+with input noise", NeurIPS 2011) leave J d as noise instead. Rows measured at one place share d.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.models.mixture.weights import comparable
+from gsparc.ops import Pose
+from gsparc.training.conditional import ConditionalField
+
+SHARES = np.logspace(-3, 1.5, 46)  # c, candidates
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Rows about their places, as real numbers in the unit that errors are counted in.
+
+    Attributes:
+        residual: (n, D) float64, measured less predicted from all other rows.
+        slope: (n, D, 3) float64 of the prediction [1/m].
+        variance: (n, D) float64 of the prediction; infinite where nothing was measured.
+    """
+
+    residual: Tensor
+    slope: Tensor
+    variance: Tensor
+
+
+def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor, float]:
+    """Posterior means of errors (P, 3) [m], and what errors of this size gain in log density [nats].
+
+    Args:
+        seen: n rows.
+        place: (n,) int64, which of P places each was measured at.
+        std: (P,) [m]; of a place without error, the displacement is 0.
+    """
+    sure, count = 1 / seen.variance, len(std)
+    slope = seen.slope * std[place][:, None, None]
+    own = torch.einsum("ndk,ndl,nd->nkl", slope, slope, sure)
+    size = torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, place, own)
+    towards = torch.einsum("ndk,nd,nd->nk", slope, seen.residual, sure)
+    pull = torch.zeros(count, 3, dtype=torch.float64).index_add(0, place, towards)
+    whole, entries = float((seen.residual.square() * sure).sum()), int((sure > 0).sum())
+    tried = []
+    for share in SHARES:
+        precision = torch.eye(3, dtype=torch.float64) + size / share
+        unit = torch.linalg.solve(precision, pull[..., None])[..., 0] / share
+        exact = (whole / share + entries * math.log(share)) / 2
+        told = float((pull * unit).sum()) / share - float(precision.logdet().sum())
+        tried.append((exact - told / 2, exact, unit))
+    least, _, unit = min(tried, key=lambda each: each[0])
+    return unit * std[:, None], min(exact for _, exact, _ in tried) - least
+
+
+def refined(
+    field: ConditionalField, data: Measurements, std: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
+
+    Args:
+        field: conditioned on these rows at the places of `data`.
+        data: of one moving end.
+        std: (S,) [m] standard deviations of each coordinate.
+
+    Raises:
+        ValueError: the field does not predict its rows from all others.
+    """
+    rows, seen = _linearised(field, data)
+    _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    moved, gain = displacements(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
+    said = f"errors of places explain the rows left out {gain:+.0f} nats better"
+    if gain <= 0:
+        return rows, np.zeros((len(rows), 3)), f"{said}: positions stay as measured"
+    size = float(moved.square().mean().sqrt())
+    return rows, moved.numpy()[place], f"{said}: positions refined by {size:.2g} m (rms)"
+
+
+def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray, Linearised]:
+    """Rows (n,) that the field was conditioned on, about their places."""
+    left, site = field.left_out(), data.site
+    batch, moving = data.batch(left.rows), torch.from_numpy(data.moving[left.rows])
+    ends = batch.rx.position.double(), batch.rx.rotation.double()
+
+    def at(places: Tensor) -> Batch:
+        if site.moving_end == "tx":
+            return replace(batch, tx=places, rx=Pose(*ends))
+        return replace(batch, tx=batch.tx.double(), rx=Pose(places, ends[1]))
+
+    with torch.no_grad():
+        found = field.answer(at(moving))  # what is computed once and kept must not be so inside `jvp`
+    if left.mean.numel() != batch.target.numel():
+        raise ValueError(f"{field.kind}: of several tones or antennas one is kept of rows left out")
+    mean, whole = left.mean.reshape(batch.target.shape), batch.target[0].numel()
+    variance = torch.where(left.variance.isnan(), found.variance, left.variance).double()
+    if site.kind == "rssi":
+        variance = variance * (10 / math.log(10) / mean.flatten().double().clamp_min(1e-30)).square()
+    entries = (torch.view_as_real(mean).flatten(1) if mean.is_complex() else mean).shape[1]
+    spread = (variance * whole / entries)[:, None].expand(-1, entries)
+    if batch.mask is not None:
+        measured = batch.mask.flatten(1).repeat_interleave(entries // whole, 1)
+        spread = torch.where(measured, spread, math.inf)
+    residual = _real(batch.target, site) - _real(mean, site)
+    slope = [
+        torch.func.jvp(lambda p: _real(field.answer(at(p)).mean, site), (moving,), (axis,))[1].detach()
+        for axis in torch.eye(3, dtype=torch.float64)[:, None].expand(3, len(moving), 3).contiguous()
+    ]
+    return left.rows, Linearised(residual, torch.stack(slope, -1), spread)
+
+
+def _real(values: Tensor, site: Site) -> Tensor:
+    """(n, D) float64."""
+    values = comparable(values, site)
+    values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
+    return values.double().flatten(1)
+
+
+def displaced(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
+    """The moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
+    name = "tx" if data.site.moving_end == "tx" else "rx_position"
+    moved = getattr(data, name).copy()
+    moved[rows] += by
+    return replace(data, **{name: moved})
