@@ -134,12 +134,10 @@ class PlannedField(LearnedField):
         if self.init.name == "scene":
             read_walls(self.init.file)  # its errors come before anything is computed
         std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
-        known = np.concatenate([fold.train, fold.val])
-        wrong = std is not None and bool(std[known].any())
-        if wrong and not self.plan.rasterized and data.site.static_end is not None:
-            return self._fit_refined(self.plan, data, fold, context, std)
-        if wrong:
-            log.warning("position_std is not used: it is of closed forms where one end moves")
+        if std is not None and std[np.concatenate([fold.train, fold.val])].any():
+            if not self.plan.rasterized and data.site.kind != "spectrum" and data.site.static_end is not None:
+                return self._fit_refined(self.plan, data, fold, context, std)
+            log.warning("position_std is not used: it is for channels and powers of one end that moves")
         if self.plan.rasterized:
             return self._fit_rasterized(data, fold, context)
         return self._fit_conditional(self.plan, data, fold, context)
@@ -151,21 +149,16 @@ class PlannedField(LearnedField):
         seconds = DEFAULT_BUDGET_S if context.budget_s is None else context.budget_s
         budget = context.time_budget(seconds)
         first = replace(context, run_dir=Path(), resume=None, budget_s=MEASURED_SHARE * seconds)
-        report = self._fit_conditional(chosen, data, fold, first)
+        limited = self._fit_conditional(chosen, data, fold, first).limited_by
         assert self.field is not None
-        try:
-            rows, by, said = refined(self.field, self.runs.aligned(data), std)
-        except ValueError as error:
-            rows, by, said = fold.train, np.zeros((1, 3)), f"position_std is not used: {error}"
+        rows, by, said = refined(self.field, self.runs.aligned(data), std)
         log.info("%s", said)
         spent = budget.counted.wall
-        rest = max(seconds - budget.spent, (1 - MEASURED_SHARE) * seconds / 2)
-        there = displaced(data, rows, by)
-        found = self._fit_conditional(chosen, there, fold, replace(context, budget_s=rest))
-        stages = {"measured places": spent, **found.cost.stages}
-        limited = less_repeatable(report.limited_by, found.limited_by)
+        rest = replace(context, budget_s=max(seconds - budget.spent, (1 - MEASURED_SHARE) * seconds / 2))
+        found = self._fit_conditional(chosen, displaced(data, rows, by), fold, rest)
+        limited = less_repeatable(limited, found.limited_by)
+        cost = replace(found.cost, stages={"measured places": spent, **found.cost.stages})
         notes = (said, *found.notes)
-        cost = replace(found.cost, stages=stages)
         return replace(found, seconds=spent + found.seconds, notes=notes, limited_by=limited, cost=cost)
 
     def _fit_rasterized(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.models.mixture.weights import comparable
+from gsparc.data.schema import Batch, Measurements
+from gsparc.models.mixture.weights import comparable, real
 from gsparc.ops import Pose
 from gsparc.training.conditional import ConditionalField
 
@@ -70,61 +70,55 @@ def refined(
     """Rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
 
     Args:
-        field: conditioned on these rows at the places of `data`.
-        data: of one moving end.
+        field: conditioned on these rows at the places of `data`, channels or powers of one moving end.
         std: (S,) [m] standard deviations of each coordinate.
+    """
+    try:
+        rows, seen = _linearised(field, data)
+    except ValueError as error:
+        return np.zeros(0, np.int64), np.zeros((0, 3)), f"position_std is not used: {error}"
+    _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    moved, gain = displacements(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
+    said = f"errors of places explain the rows left out {gain:+.0f} nats better: positions "
+    if gain <= 0:
+        return rows, np.zeros((len(rows), 3)), f"{said}stay as measured"
+    return rows, moved.numpy()[place], f"{said}refined by {float(moved.square().mean().sqrt()):.2g} m (rms)"
+
+
+def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray, Linearised]:
+    """Rows (n,) that the field was conditioned on, about their places.
 
     Raises:
         ValueError: the field does not predict its rows from all others.
     """
-    rows, seen = _linearised(field, data)
-    _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
-    place = place.reshape(-1)
-    moved, gain = displacements(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
-    said = f"errors of places explain the rows left out {gain:+.0f} nats better"
-    if gain <= 0:
-        return rows, np.zeros((len(rows), 3)), f"{said}: positions stay as measured"
-    size = float(moved.square().mean().sqrt())
-    return rows, moved.numpy()[place], f"{said}: positions refined by {size:.2g} m (rms)"
-
-
-def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray, Linearised]:
-    """Rows (n,) that the field was conditioned on, about their places."""
     left, site = field.left_out(), data.site
     batch, moving = data.batch(left.rows), torch.from_numpy(data.moving[left.rows])
-    ends = batch.rx.position.double(), batch.rx.rotation.double()
+    if left.mean.numel() != batch.target.numel():
+        raise ValueError(f"{field.kind}: of several tones or antennas one is kept of rows left out")
+    turned = batch.rx.rotation.double()
 
     def at(places: Tensor) -> Batch:
         if site.moving_end == "tx":
-            return replace(batch, tx=places, rx=Pose(*ends))
-        return replace(batch, tx=batch.tx.double(), rx=Pose(places, ends[1]))
+            return replace(batch, tx=places, rx=Pose(batch.rx.position.double(), turned))
+        return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
+
+    def mean(places: Tensor) -> Tensor:
+        return real(comparable(field.answer(at(places)).mean, site))
 
     with torch.no_grad():
         found = field.answer(at(moving))  # what is computed once and kept must not be so inside `jvp`
-    if left.mean.numel() != batch.target.numel():
-        raise ValueError(f"{field.kind}: of several tones or antennas one is kept of rows left out")
-    mean, whole = left.mean.reshape(batch.target.shape), batch.target[0].numel()
     variance = torch.where(left.variance.isnan(), found.variance, left.variance).double()
     if site.kind == "rssi":
-        variance = variance * (10 / math.log(10) / mean.flatten().double().clamp_min(1e-30)).square()
-    entries = (torch.view_as_real(mean).flatten(1) if mean.is_complex() else mean).shape[1]
-    spread = (variance * whole / entries)[:, None].expand(-1, entries)
+        variance = variance * (10 / math.log(10) / left.mean.flatten().double().clamp_min(1e-30)).square()
+    residual = real(comparable(batch.target, site)) - real(comparable(left.mean, site))
+    parts = 2 if batch.target.is_complex() else 1
+    spread = (variance / parts)[:, None].expand_as(residual)
     if batch.mask is not None:
-        measured = batch.mask.flatten(1).repeat_interleave(entries // whole, 1)
-        spread = torch.where(measured, spread, math.inf)
-    residual = _real(batch.target, site) - _real(mean, site)
-    slope = [
-        torch.func.jvp(lambda p: _real(field.answer(at(p)).mean, site), (moving,), (axis,))[1].detach()
-        for axis in torch.eye(3, dtype=torch.float64)[:, None].expand(3, len(moving), 3).contiguous()
-    ]
+        spread = torch.where(batch.mask.flatten(1).repeat_interleave(parts, 1), spread, math.inf)
+    axes = torch.eye(3, dtype=torch.float64)[:, None].expand(3, len(moving), 3).contiguous()
+    slope = [torch.func.jvp(mean, (moving,), (axis,))[1].detach() for axis in axes]
     return left.rows, Linearised(residual, torch.stack(slope, -1), spread)
-
-
-def _real(values: Tensor, site: Site) -> Tensor:
-    """(n, D) float64."""
-    values = comparable(values, site)
-    values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
-    return values.double().flatten(1)
 
 
 def displaced(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:

@@ -17,6 +17,7 @@ def test_round_trip(tmp_path, csi_arrays, suffix):
         **csi_arrays,
         "mask": mask,
         "noise_variance": np.float64(0.02),
+        "position_std": np.linspace(0, 0.1, 12),
         "row_name": np.array(["ä"] * 12),
     }
     written = write_own(path, arrays, {"name": "garage", "operator": "me", "convergence_error": 0.01})
@@ -31,6 +32,8 @@ def test_round_trip(tmp_path, csi_arrays, suffix):
     np.testing.assert_allclose(physical[mask], csi_arrays["csi"][mask], rtol=1e-6)
     assert 0.85 < np.mean(np.abs(read.target[mask]) ** 2) < 1.2
     np.testing.assert_allclose(read.noise_variance * read.site.target_scale**2, 0.02, rtol=1e-6)
+    assert np.array_equal(read.position_std, arrays["position_std"])
+    assert np.array_equal(read.subset(np.arange(3)).position_std, arrays["position_std"][:3])
 
 
 def test_the_same_content_has_the_same_hash_in_both_formats(tmp_path, spectrum_arrays):

@@ -120,6 +120,7 @@ ACCURACY = "value"
 PANELS: tuple[tuple[str, str, Callable[[StudyRow], float], str], ...] = (
     ("query", "position error in queries [cm]", lambda row: 100 * row.amount, ACCURACY),
     ("train", "position error in training [cm]", lambda row: 100 * row.amount, ACCURACY),
+    ("train_known", "the same, its size known [cm]", lambda row: 100 * row.amount, ACCURACY),
     ("directions", "error of directions of arrival [degrees]", lambda row: row.amount, ACCURACY),
     ("keep", "measurements learned from", lambda row: row.rows, ACCURACY),
     ("keep", "measurements learned from", lambda row: row.rows, "train_s"),

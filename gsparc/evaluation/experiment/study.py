@@ -227,28 +227,22 @@ class Positions:
         errors_m: standard deviations of each coordinate [m].
         errors_deg: of directions of arrival about each of two axes, where receivers measured them [degrees].
         train_errors: whether training positions are disturbed, too; else those of queries alone.
-        known: whether, then, also with models told how large these errors are (`position_std`).
     """
 
     title: ClassVar[str] = "accuracy against errors of positions and directions"
     errors_m: Sequence[float] = ()
     errors_deg: Sequence[float] = ()
     train_errors: bool = True
-    known: bool = True
 
     def conditions(self) -> list[Condition]:
-        """No error, then errors of positions in a `query`, in training (`train`), and of `directions`.
-
-        Training errors whose size the data say (`Measurements.position_std`) are `train_known`.
-        """
-        told = {"train": False} | ({"train_known": True} if self.known else {})
+        """No error, then of a `query`, in training (`train`, or `train_known` in size), of `directions`."""
         errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
         return [
             Condition(),
             *(Condition("query", error, tested=partial(_asked_elsewhere, error)) for error in errors),
             *(
                 Condition(name, error, learned=partial(_learned_elsewhere, error, known))
-                for name, known in told.items()
+                for name, known in (("train", False), ("train_known", True))
                 for error in errors
                 if self.train_errors
             ),

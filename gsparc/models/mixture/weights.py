@@ -35,7 +35,7 @@ def weights(predicted: list[Tensor], target: Tensor, unit: np.ndarray) -> tuple[
         target: (n, ...).
         unit: (n,), rows of one unit are not independent.
     """
-    missed = torch.stack([_real(one - target) for one in predicted], 1)  # (n, M, P)
+    missed = torch.stack([real((one - target).detach()) for one in predicted], 1)  # (n, M, P)
     chosen = choose((missed @ missed.mT).numpy(), unit)
     return tuple(float(weight) for weight in chosen)
 
@@ -90,9 +90,10 @@ def comparable(values: Tensor, site: Site) -> Tensor:
     return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
 
 
-def _real(values: Tensor) -> Tensor:
+def real(values: Tensor) -> Tensor:
+    """Entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
     values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
-    return values.detach().double().flatten(1)
+    return values.double().flatten(1)
 
 
 def best_weights(gram: np.ndarray) -> np.ndarray:
