@@ -50,7 +50,8 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
         raise DataError(f"dataset.name={name}: this is dataset={own[0]}; say dataset={name}")
     kind = find(str(target))
     if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
-        raise DataError(f"dataset._target_={target} is no gsparc.data.datamodule.DataModule")
+        only = "; only gsparc locate takes it" if name == "fingerprints" else ""
+        raise DataError(f"dataset._target_={target} is no gsparc.data.datamodule.DataModule{only}")
     settings = _checked(settings, kind)
     try:  # under its key, which errors then name
         found = instantiate({"dataset": settings}, _convert_="all")["dataset"]

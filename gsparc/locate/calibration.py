@@ -16,7 +16,9 @@ SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
 LOOKS = 160
 
 
-def calibrated(held: Sequence[Looked], places: np.ndarray, share: float, start: Trust) -> Trust:
+def calibrated(
+    held: Sequence[Looked], places: np.ndarray, share: float, start: Trust, blurred: bool = True
+) -> Trust:
     """The trust under which places that were held out are most likely, with an area that holds a share.
 
     All numbers but the level maximise the mean log density at the true places, a proper score; the level is
@@ -29,20 +31,22 @@ def calibrated(held: Sequence[Looked], places: np.ndarray, share: float, start: 
         places: (n, 3), where they were heard [m, local].
         share: of places, to be held.
         start: of the search.
+        blurred: whether errors of recorded places are learned too; without, cells stay as they are.
     """
     edge = float(np.max([one.cells.edge.max() for one in held]))
-    spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
+    count = 4 if blurred else 3
+    spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS][:count]).T
 
     def of(point: np.ndarray) -> Trust:
-        inflation, temperature, tail, spread = np.exp(np.clip(point, *spans)).tolist()
-        return Trust(inflation, temperature, tail, spread * edge)
+        inflation, temperature, tail, *spread = np.exp(np.clip(point, *spans)).tolist()
+        return Trust(inflation, temperature, tail, *(edge * one for one in spread))
 
     def surprise(point: np.ndarray) -> float:
         trust = of(point)
         return -float(np.mean([one.by(trust).at(place) for one, place in zip(held, places, strict=True)]))
 
-    first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
-    simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
+    first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD][:count])
+    simplex = first + np.vstack([np.zeros(count), np.diag([1.0, -1.5, 1.0, 1.0][:count])])
     found = minimize(
         surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
     )

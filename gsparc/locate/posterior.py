@@ -45,6 +45,8 @@ class Posterior:
     @cached_property
     def log_density(self) -> np.ndarray:
         """(G,) log mass by size of a cell, of total mass 1."""
+        if not self.spread:
+            return self.sharp
         found = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
         found = np.log(found + LEAST)
         return np.asarray(found - logsumexp(found, b=self.cells.size))
@@ -57,12 +59,15 @@ class Posterior:
     def at(self, place: np.ndarray) -> float:
         """Log density at a place (3,) itself, not of its cell."""
         here = self.cells.holding(place)
+        if not self.spread:
+            return float(self.sharp[here])
         rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
         return float(np.log(self._density(place[None])[0] + rest + LEAST))
 
     def level(self, place: np.ndarray) -> float:
-        """Mass of all cells more likely than a place (3,)."""
-        return float(self.mass[self.log_density > self.at(place)].sum())
+        """Mass of all cells more likely than a place (3,), and half of that of those as likely."""
+        here, mass = self.at(place), self.mass
+        return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())
 
     @cached_property
     def _blurred(self) -> np.ndarray:

@@ -114,6 +114,7 @@ def test_typos_of_dataset_kinds_get_the_nearest_name():
 
 
 CONFIGS = {path.stem: path for path in Path(gsparc.conf.__path__[0]).joinpath("dataset").glob("*.yaml")}
+del CONFIGS["fingerprints"]  # of `gsparc locate` alone
 
 
 @pytest.mark.parametrize("name", sorted(CONFIGS))
@@ -158,6 +159,7 @@ def test_data_modules_are_of_different_classes():
             {"name": "own", "_target_": "gsparc.data.datasets.rfid.RFID"},
             "this is dataset=rfid; say dataset=own",
         ),
+        ({"name": "fingerprints", "file": "x.npz"}, "DataModule; only gsparc locate takes it"),
         (
             {"name": "rfid", "gatway": "x"},
             r"dataset\.gatway: no such setting of dataset=rfid; did you mean 'gateway'",

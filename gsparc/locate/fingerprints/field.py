@@ -9,16 +9,14 @@ variance of each access point and the log odds of hearing.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
-from gsparc.locate.fingerprints.likelihood import Levels, log_likelihood, shifted
+from gsparc.locate.fingerprints.likelihood import Levels, shifted
 from gsparc.locate.shared_kernel import settings, stretched
 from gsparc.processes.nearest import Nearest, Values, given
 
@@ -63,33 +61,6 @@ class FingerprintField:
         variance = found.left.float()[:, None] * self.variance
         return Levels(self.base + above(heard, level), variance, calibrated(heard, self.odds).sigmoid())
 
-    @torch.no_grad()
-    def log_likelihood(self, levels: Tensor, places: Tensor, offset: float | None = None) -> Tensor:
-        """Log density (B,) [nats] of levels (P,) at places (B, 3) [m]; (m, B) of levels (m, P).
-
-        Args:
-            levels: [dBm], NaN where silent.
-            places: float64 [m].
-            offset: deviation of a device's unknown offset [dB]; None: it has none.
-        """
-        rows, parts = levels.reshape(-1, len(self.base)), places.split(PLACES)
-        found = [log_likelihood(rows, self.moments(part), offset, self.sensitivity) for part in parts]
-        return torch.cat(found, 1).reshape(*levels.shape[:-1], len(places))
-
-    def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `read` needs."""
-        numbers = [*self.odds, self.sensitivity, self.vertical]
-        own = {name: getattr(self, name) for name in ("mean", "base", "variance")}
-        return {**own, "numbers": numbers, "process": self.process.state()}
-
-    @classmethod
-    def read(cls, state: Mapping[str, Any]) -> FingerprintField:
-        """The field whose `state()` this was."""
-        slope, intercept, sensitivity, vertical = (float(v) for v in state["numbers"])
-        mean, base, variance = (state[name] for name in ("mean", "base", "variance"))
-        process, odds = Nearest.read(state["process"]), (slope, intercept)
-        return cls(process, mean, base, variance, odds, sensitivity, vertical)
-
 
 def above(heard: Tensor, level: Tensor) -> Tensor:
     """Mean of heard levels above the base (..., P) [dB]: that of all rows over how often one is heard."""
@@ -102,12 +73,14 @@ def calibrated(heard: Tensor, odds: tuple[float, float]) -> Tensor:
     return (odds[0] * torch.logit(heard.clamp(SURE, 1 - SURE)) + odds[1]).clamp(-bound, bound)
 
 
-def learn(levels: np.ndarray, places: np.ndarray, seed: int = 0) -> FingerprintField:
-    """The field of rows.
+def learn(
+    levels: np.ndarray, places: np.ndarray, seed: int = 0, like: FingerprintField | None = None
+) -> FingerprintField:
+    """The field of rows, with the kernel of another where one is given.
 
     Example:
         field = learn(rows.level[train], rows.position[train])
-        field.log_likelihood(torch.from_numpy(rows.level[7]), candidates, offset=6.0)
+        field.moments(torch.from_numpy(candidates)).mean
 
     Levels are (n, P) [dBm], NaN where silent, places (n, 3) float64 [m]; `ValueError` where all are silent.
     """
@@ -120,7 +93,8 @@ def learn(levels: np.ndarray, places: np.ndarray, seed: int = 0) -> FingerprintF
     outputs = torch.cat([heard.float(), torch.where(heard, level - base, 0.0)], 1)
     mean = outputs.mean(0)
     outputs -= mean
-    prior, vertical = settings(outputs[:, len(base) :], places, seed)
+    kernel = (like.process.prior, like.vertical) if like else None
+    prior, vertical = kernel or settings(outputs[:, len(base) :], places, seed)
     at = stretched(places, vertical)
     process = given(prior, Values.of(at, outputs), seed)
     del outputs
@@ -150,5 +124,5 @@ def hearing(said: Tensor, heard: Tensor) -> tuple[tuple[float, float], float]:
         entries = calibrated(said, odds).reshape(-1, 1), heard.reshape(-1)
         fitted = LogisticRegression(C=1e3).fit(*entries)
         odds = float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
-    rows = [(one[None], here[None].float()) for one, here in zip(calibrated(said, odds), heard, strict=True)]
-    return odds, max(SENSITIVITIES, key=lambda one: sum(float(shifted(*row, one)) for row in rows))
+    shift, here = calibrated(said, odds), heard.float()  # rows at their own places: the diagonal
+    return odds, max(SENSITIVITIES, key=lambda one: float(shifted(shift, here, one).diagonal().sum()))

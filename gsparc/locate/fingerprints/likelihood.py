@@ -8,13 +8,14 @@ form; what it adds to all log odds of hearing is normal too, and summed over Gau
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
+
+from gsparc.locate.likelihood import Misfit, of_levels
 
 NODES = 7  # of the sum over sensitivities; of a deviation of 1 more change no log density by 0.01 nats
 MIDDLE_DBM = -70.0  # levels are small numbers about it: squares lose less in float32
@@ -52,8 +53,8 @@ def shifted(odds: Tensor, here: Tensor, deviation: float) -> Tensor:
     return here @ odds.T + torch.logsumexp(here.sum(1)[:, None, None] * shift + (share - silent), -1)
 
 
-def log_likelihood(levels: Tensor, at: Levels, offset: float | None, sensitivity: float = 0.0) -> Tensor:
-    """Log density (m, B) [nats] of fingerprints at places.
+def misfit(levels: Tensor, at: Levels, offset: float | None, sensitivity: float = 0.0) -> Misfit:
+    """Of m fingerprints at places, in single precision; what is heard and what not is its `silent`.
 
     Args:
         levels: (m, P) [dBm], NaN where silent.
@@ -61,13 +62,7 @@ def log_likelihood(levels: Tensor, at: Levels, offset: float | None, sensitivity
         offset: deviation of what the device adds to all levels [dB]; None or 0: it adds nothing.
         sensitivity: deviation of what it adds to all log odds of hearing.
     """
-    here = torch.isfinite(levels).float()
-    level = torch.where(here > 0, levels.float() - MIDDLE_DBM, 0.0)
-    weight, mean = 1 / at.variance.float(), at.mean.float() - MIDDLE_DBM
-    # Sums over what was heard of squares, products and logarithms are products of matrices.
-    constant = 0.5 * (weight.log() - math.log(2 * math.pi) - weight * mean * mean)
-    found = here @ constant.T + level @ (weight * mean).T - 0.5 * (level * level) @ weight.T
-    if offset:
-        sums, total = level @ weight.T - here @ (weight * mean).T, here @ weight.T + offset**-2
-        found = found + 0.5 * (sums.square() / total - (total * offset**2).log())
-    return found + HEARING * shifted(torch.logit(at.heard.float()), here, sensitivity)
+    near, mean = levels.float() - MIDDLE_DBM, at.mean.float() - MIDDLE_DBM
+    found = of_levels(near, mean, at.variance.float(), offset or 0.0)
+    here = torch.isfinite(near).float()
+    return replace(found, silent=HEARING * shifted(torch.logit(at.heard.float()), here, sensitivity))

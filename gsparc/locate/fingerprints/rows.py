@@ -32,6 +32,7 @@ LAYOUT = {
     "test": Expected(("S",), "b", optional=True),
     "time_s": Expected(("S",), optional=True),
 }
+UNPLACED = LAYOUT | {"position": Expected(("S", "D"))}  # NaN where nobody knows
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,8 @@ class Fingerprints:
         return replace(self, level=np.where(found >= 0, self.level[:, found], np.nan), access_point=names)
 
 
-def read_fingerprints(path: str | Path) -> Fingerprints:
-    """Rows of an archive or a table.
+def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
+    """Rows of an archive or a table; without places, NaN stands for these unless they must be `placed`.
 
     Example:
         rows = read_fingerprints("wifine-floor4.npz")
@@ -82,8 +83,10 @@ def read_fingerprints(path: str | Path) -> Fingerprints:
         DataError: no such file, or something in it is missing or wrong.
     """
     path = Path(path)
-    raw = _of_table(path) if is_table(path) else read_raw(path)
-    held = check_layout(raw, path, LAYOUT)
+    raw = _of_table(path, placed) if is_table(path) else read_raw(path)
+    if not placed:
+        raw.arrays.setdefault("position", np.full((len(raw.arrays.get("rss_dbm", ())), 3), np.nan))
+    held = check_layout(raw, path, LAYOUT if placed else UNPLACED)
     level, position = held["rss_dbm"].astype(np.float32), held["position"].astype(np.float64)
     count, dimensions = position.shape
     if dimensions not in (2, 3):
@@ -112,7 +115,7 @@ def read_fingerprints(path: str | Path) -> Fingerprints:
     )  # fmt: skip
 
 
-def _of_table(path: Path) -> Raw:
+def _of_table(path: Path, placed: bool) -> Raw:
     """The same arrays of a table with columns WAP001, ..., LONGITUDE, LATITUDE [m], FLOOR, BUILDINGID."""
     import pandas as pd  # half a second
 
@@ -121,7 +124,7 @@ def _of_table(path: Path) -> Raw:
     except (ValueError, OSError) as error:
         raise DataError(f"{path}: not readable as CSV text ({reason(error)})") from None
     names = [name for name in frame.columns if name.startswith("WAP")]
-    places = ["LONGITUDE", "LATITUDE"]
+    places = ["LONGITUDE", "LATITUDE"] if placed or "LONGITUDE" in frame else []
     missing = [name for name in places if name not in frame] or ([] if names else ["WAP001"])
     if missing:
         raise DataError(f"{path}, line 1: no column {missing[0]}; expected the columns of UJIIndoorLoc")
@@ -131,8 +134,9 @@ def _of_table(path: Path) -> Raw:
     arrays = {kept: frame[name].to_numpy() for name, kept in COLUMNS.items() if name in frame}
     height = STOREY_M * arrays.get("floor", np.zeros(len(frame)))
     level = frame[names].replace(SILENT, np.nan).to_numpy(np.float32)
-    position = np.c_[frame[places].to_numpy(np.float64), height]
-    return Raw({"rss_dbm": level, "position": position, "access_point": np.array(names), **arrays})
+    if places:
+        arrays["position"] = np.c_[frame[places].to_numpy(np.float64), height]
+    return Raw({"rss_dbm": level, "access_point": np.array(names), **arrays})
 
 
 def parted(

@@ -128,3 +128,13 @@ def test_the_files_of_the_campaigns(name, how, count):
     train, test = parted(rows, how)
     assert np.isfinite(rows.level).any(1).mean() > 0.99
     assert len(train) + len(test) == len(rows.level) and len(test) == count
+
+
+def test_rows_of_unknown_places_are_read_where_they_may_be(tmp_path):
+    file, table = written(tmp_path / "a.npz", position=None), tmp_path / "a.csv"
+    table.write_text("WAP001,FLOOR\n-60,2\n100,0\n")
+    for path in (file, table):
+        assert np.isnan(read_fingerprints(path, placed=False).position).all()
+        with pytest.raises(DataError, match=r"position: missing|no column LONGITUDE"):
+            read_fingerprints(path)
+    assert np.isfinite(read_fingerprints(written(tmp_path / "b.npz"), placed=False).position).all()

@@ -1,0 +1,132 @@
+"""Where fingerprints were heard, with an area that holds the place in a promised share of cases."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import torch
+
+from gsparc.locate.calibration import calibrated
+from gsparc.locate.cells import Cells
+from gsparc.locate.fingerprints.field import FingerprintField, learn
+from gsparc.locate.fingerprints.floors import cover_floors
+from gsparc.locate.fingerprints.likelihood import Levels, misfit
+from gsparc.locate.fingerprints.rows import Fingerprints, How, parted
+from gsparc.locate.likelihood import Trust
+from gsparc.locate.locator import HELD_OUT, Located
+from gsparc.locate.posterior import Posterior
+from gsparc.locate.search import Looked
+from gsparc.locate.snapshots import Snapshots
+from gsparc.locate.track import as_looked, located, smoothed, speed
+
+ROWS = 64  # at a time
+PLAIN = Trust(1.0, 1.0, 100.0)  # the field's own variances, and nothing else
+SHARED = Trust(1.0, 0.3, 100.0)  # access points of one row err together
+
+
+@dataclass(frozen=True)
+class FingerprintLocator:
+    """A field of fingerprints with the places where one can stand.
+
+    Attributes:
+        field: what would be heard.
+        cells: see `cover_floors`; `around` is whether they are near trained places alone.
+        levels: expected at the cells.
+        offset_db: deviation of what a device adds to all levels [dB].
+        speed: of walks [m/s], whose rows are located together; None: each row on its own.
+        point: trust whose mean is the place.
+        area: trust of areas.
+    """
+
+    field: FingerprintField
+    cells: Cells
+    levels: Levels
+    around: bool
+    offset_db: float
+    speed: float | None
+    point: Trust = SHARED
+    area: Trust = SHARED
+
+    @classmethod
+    def of(
+        cls, rows: Fingerprints, offset_db: float, around: bool, track: bool,
+        like: FingerprintField | None = None,
+    ) -> Self:  # fmt: skip
+        """Learned from rows of known places, with the kernel of another field where one is given."""
+        field, cells = learn(rows.level, rows.position, like=like), cover_floors(rows.position, around)
+        pace = speed(rows.position, rows.time_s, rows.walk) if track else None
+        return cls(field, cells, field.moments(torch.from_numpy(cells.centre)), around, offset_db, pace)
+
+    def look(self, rows: Fingerprints) -> Iterator[Looked]:
+        """The misfit of each row at all cells, or what its whole walk says."""
+        alone = (
+            Looked(self.cells, found.of(number))
+            for level in torch.from_numpy(rows.level).split(ROWS)
+            for found in [misfit(level, self.levels, self.offset_db, self.field.sensitivity)]
+            for number in range(len(level))
+        )
+        if self.speed is None:
+            yield from alone
+            return
+        known = [one.by(SHARED) for one in alone]
+        for walk in np.unique(rows.walk):
+            own = np.flatnonzero(rows.walk == walk)
+            steps = smoothed([known[row] for row in own], rows.time_s[own], self.speed)
+            known = [steps[np.searchsorted(own, row)] if row in own else one for row, one in enumerate(known)]
+        yield from map(as_looked, known)
+
+    def locate(self, rows: Fingerprints) -> list[Located]:
+        """Each row."""
+        start = time.perf_counter()
+        found = [
+            located(one.by(self.area), self.area.level, place(one.by(self.point))) for one in self.look(rows)
+        ]
+        each = (time.perf_counter() - start) / max(len(found), 1)
+        return [replace(one, seconds=each) for one in found]
+
+
+def place(known: Posterior) -> np.ndarray:
+    """The mean (3,) [m] of the floor that has most mass, which errs less than the likeliest cell."""
+    mass, centre = known.mass, known.cells.centre
+    floor = np.unique(centre[:, 2], return_inverse=True)[1].reshape(-1)
+    own = floor == np.bincount(floor, mass).argmax()
+    return mass[own] @ centre[own] / mass[own].sum()
+
+
+def trusted(
+    locator: FingerprintLocator, rows: Fingerprints, how: How, side_m: float, held_out: float, groups: int,
+    share: float, seed: int,
+) -> tuple[FingerprintLocator, int]:  # fmt: skip
+    """The same with trusts of rows that were left out, and the number of these.
+
+    The field is learned again, with its kernel, without each of a few `groups` of rows, drawn like test rows
+    (`how`, `side_m`, `held_out`: see `parted`). Areas are calibrated on them to hold a `share` of places; of
+    three trusts that one makes the places whose mean error is least.
+    """
+    held: list[Looked] = []
+    true = []
+    for number in range(groups):
+        train, test = parted(rows, how, side_m, held_out, seed + 1 + number)
+        track = locator.speed is not None
+        own = FingerprintLocator.of(rows.at(train), locator.offset_db, locator.around, track, locator.field)
+        few = np.random.default_rng(seed).permutation(len(test))[: -(-HELD_OUT // groups)]
+        looks = list(own.look(rows.at(test if track else test[few])))  # a walk is one
+        held += [looks[row] for row in few] if track else looks
+        true.append(rows.position[test[few]])
+    places = np.concatenate(true)
+
+    def error(trust: Trust) -> float:
+        return float(np.linalg.norm([place(one.by(trust)) for one in held] - places, axis=1).mean())
+
+    area = calibrated(held, places, share, SHARED, blurred=False)
+    return replace(locator, point=min((SHARED, PLAIN, area), key=error), area=area), len(places)
+
+
+def as_snapshots(rows: Fingerprints) -> Snapshots:
+    """What plain methods learn from."""
+    values = torch.from_numpy(rows.level).double()
+    return Snapshots("rssi", values, None, rows.position, np.arange(len(values)))
