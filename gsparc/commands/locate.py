@@ -129,7 +129,7 @@ def _report(
 
 def _fingerprints(config: DictConfig) -> dict[str, Any]:
     """A field of fingerprints is learned, and rows that it did not learn from are located."""
-    chosen, seed = config.dataset, int(config.seed)
+    chosen, seed, groups = config.dataset, int(config.seed), int(config.calibrate)
     if chosen.file is None or not OmegaConf.is_missing(config, "ckpt"):
         raise ValueError("dataset=fingerprints learns its own field: give dataset.file=FILE, and no ckpt")
     POSITIVE.check("dataset.side_m", chosen.side_m)
@@ -153,9 +153,9 @@ def _fingerprints(config: DictConfig) -> dict[str, Any]:
         "time/fit_s": time.perf_counter() - started,
     }  # fmt: skip
     promise = "nothing is promised without calibration, or of another campaign"
-    if config.calibrate:
+    if groups:
         drawn, share = how in ("random", "places", "blocks", "walks"), float(config.share)
-        inner, groups = how if drawn else "places", int(config.calibrate)
+        inner: Any = how if drawn else "places"
         locator, facts["locate/calibrated_on"] = trusted(locator, known, inner, *cut, groups, share, seed)
         promise = f"{share:.0%} are promised" if drawn else promise
     answers = {"field": locator.locate(heard)}
