@@ -23,6 +23,7 @@ EXCEPTIONS = {  # who solves a system for itself, and why
     "gsparc/data/datasets/powder.py": "a map from degrees to metres by least squares",
     "gsparc/data/checks/level_steps.py": "a mean law by least squares",
     "gsparc/physics/lags.py": "a basis of an array's lags",
+    "gsparc/models/refined_places.py": "three coordinates of a place's error",
     "gsparc/models/directional/position_refine.py": "three coordinates of a source",
     "gsparc/models/directional/triangulation.py": "three coordinates of a source",
     "gsparc/models/uplink/search.py": "a batch of source fits in single precision, at times singular",
