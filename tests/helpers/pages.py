@@ -8,6 +8,7 @@ import shlex
 from pathlib import Path
 
 import numpy as np
+from access_points import walks
 from campaigns import brief, channels, compose, powers, spectra
 from crashes import small_campaign
 from measured import write_npz, write_release, write_walk
@@ -91,6 +92,7 @@ class Tiny:
                 "techtile": lambda: write_release(path),
                 "powder": lambda: write_walk(path),
                 "ble": lambda: write_npz(path, "ble"),
+                "fingerprints": lambda: self._walks(path.with_suffix(".npz")),
             }[name]
             path.mkdir(exist_ok=True) if name in ("techtile", "powder", "ble") else None
             self.made[name] = str(make())
@@ -106,6 +108,14 @@ class Tiny:
                 path_gain=np.ones(3 * len(rx), np.complex64), split_train=np.arange(48),
                 split_test=np.arange(48, 60),
             )  # fmt: skip
+        return path
+
+    def _walks(self, path: Path) -> Path:
+        rows = walks(6, 0)
+        test = np.arange(len(rows.level)) % 3 == 0
+        np.savez(
+            path, rss_dbm=rows.level, position=rows.position, walk=rows.walk, time_s=rows.time_s, test=test
+        )
         return path
 
     def model(self, command: str) -> str:
@@ -156,6 +166,15 @@ class Tiny:
             words["init_from"] = str(run / "model.ckpt")
         if name == "predict":
             words |= {"places": "places.csv", "out": f"{run}.csv"}
+        if name == "locate" and words.get("dataset") == "fingerprints":
+            words.pop("ckpt")  # it learns its own field
+            words |= {"dataset.split": words.get("dataset.split", "random").replace("SPLIT", "random")}
+            words["dataset.side_m"] = "3"
+            if "data" in words:
+                words["data"] = words["dataset.file"]
+        elif name == "locate":
+            here = {"data": str(self.folder / "tradeoff.npz"), "plan": "floor.png"}
+            words |= {key: here[key] for key in words if key in here}
         if name == "evaluate":
             words.pop("dataset.root", None)
         if name == "compare":
