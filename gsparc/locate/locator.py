@@ -52,6 +52,12 @@ class Located:
     posterior: Posterior
     seconds: float
 
+    @classmethod
+    def of(cls, posterior: Posterior, level: float, place: np.ndarray, seconds: float = 0.0) -> Self:
+        """At a place (3,) [m, local], with the area of cells that hold a mass `level`."""
+        area = float(posterior.cells.size[posterior.within(level)].sum())
+        return cls(place, area, len(posterior.modes(level)), posterior, seconds)
+
 
 @dataclass(frozen=True)
 class Locator:
@@ -107,12 +113,8 @@ class Locator:
         for number in range(len(heard)):
             started = time.perf_counter()
             posterior = self.look(heard.at(np.array([number]))).by(self.trust)
-            inside = posterior.within(self.trust.level)
-            modes = posterior.modes(self.trust.level)
-            area = float(posterior.cells.size[inside].sum())
-            found.append(
-                Located(posterior.peak(), area, len(modes), posterior, time.perf_counter() - started)
-            )
+            one = Located.of(posterior, self.trust.level, posterior.peak())
+            found.append(replace(one, seconds=time.perf_counter() - started))
         return found
 
 

@@ -74,15 +74,9 @@ def as_looked(known: Posterior) -> Looked:
     return Looked(known.cells, Misfit(none, none, none[:, 0], density))
 
 
-def located(known: Posterior, level: float, place: np.ndarray, seconds: float = 0.0) -> Located:
-    """At a place (3,) [m], with the area of cells that hold a mass."""
-    area = float(known.cells.size[known.within(level)].sum())
-    return Located(place, area, len(known.modes(level)), known, seconds)
-
-
 def followed(alone: Sequence[Located], trained: Snapshots, heard: Snapshots, level: float) -> list[Located]:
     """Each snapshot given all others, at the mean of its cells: rows are seconds of one track."""
     start, pace = time.perf_counter(), speed(trained.place, trained.rows, np.zeros(len(trained)))
     steps = smoothed([one.posterior for one in alone], heard.rows, pace)
     each = alone[0].seconds + (time.perf_counter() - start) / len(alone)
-    return [located(one, level, one.mass @ one.cells.centre, each) for one in steps]
+    return [Located.of(one, level, one.mass @ one.cells.centre, each) for one in steps]

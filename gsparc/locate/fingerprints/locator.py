@@ -21,7 +21,7 @@ from gsparc.locate.locator import HELD_OUT, Located
 from gsparc.locate.posterior import Posterior
 from gsparc.locate.search import Looked
 from gsparc.locate.snapshots import Snapshots
-from gsparc.locate.track import as_looked, located, smoothed, speed
+from gsparc.locate.track import as_looked, smoothed, speed
 
 ROWS = 64  # at a time
 PLAIN = Trust(1.0, 1.0, 100.0)  # the field's own variances, and nothing else
@@ -76,14 +76,16 @@ class FingerprintLocator:
         for walk in np.unique(rows.walk):
             own = np.flatnonzero(rows.walk == walk)
             steps = smoothed([known[row] for row in own], rows.time_s[own], self.speed)
-            known = [steps[np.searchsorted(own, row)] if row in own else one for row, one in enumerate(known)]
+            for row, step in zip(own, steps, strict=True):
+                known[row] = step
         yield from map(as_looked, known)
 
     def locate(self, rows: Fingerprints) -> list[Located]:
         """Each row."""
         start = time.perf_counter()
         found = [
-            located(one.by(self.area), self.area.level, place(one.by(self.point))) for one in self.look(rows)
+            Located.of(one.by(self.area), self.area.level, place(one.by(self.point)))
+            for one in self.look(rows)
         ]
         each = (time.perf_counter() - start) / max(len(found), 1)
         return [replace(one, seconds=each) for one in found]
