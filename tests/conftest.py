@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from invented import divide, invent
 from releases import real
 from threadpoolctl import threadpool_limits
 
+from gsparc.data import executor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 
@@ -39,6 +41,37 @@ def campaign() -> Callable[..., Measurements]:
 def folds() -> Callable[..., Split]:
     """`folds(rows, folds)`: a split of it."""
     return divide
+
+
+@pytest.fixture
+def elsewhere():
+    """`elsewhere("joblib")`, `elsewhere("ray", nodes=2)`: other processes do pieces of work until the end."""
+    cluster, threads = None, torch.get_num_threads()
+
+    def use(engine: str, nodes: int = 2):
+        nonlocal cluster
+        torch.set_num_threads(1)
+        address = None
+        if engine == "ray":
+            pytest.importorskip("ray", reason="ray is not installed")
+            from ray.cluster_utils import Cluster
+
+            small = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+            cluster = Cluster(initialize_head=True, head_node_args=small)
+            for _ in range(nodes - 1):
+                cluster.add_node(**small)
+            address = cluster.address
+        executor.use(executor.Engine(engine, nodes, address))
+        return cluster
+
+    yield use
+    executor.use(executor.Engine())
+    torch.set_num_threads(threads)
+    if cluster is not None:
+        import ray
+
+        ray.shutdown()
+        cluster.shutdown()
 
 
 @pytest.fixture

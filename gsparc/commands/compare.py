@@ -8,16 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsparc.commands.output import columns, run_directory, show
+from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.experiment.cells import Budget, contenders, plan, plugged
-from gsparc.evaluation.experiment.fitting import Failed, Filled, fill_all, prepare
+from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.problem import problems_of
@@ -47,12 +46,8 @@ def task(config: DictConfig) -> list[Row]:
         for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
-    several = HydraConfig.get().mode == RunMode.MULTIRUN
-    failed = Failed(run_dir.parent) if several else None
-    filled = fill_all(prepared, bool(settings["train"]), limit_s, failed)
-    if settings["worker"]:
-        log.info("every cell is filled or has failed; the report is worker 0's")
-        return []
+    with held(kept, "cells"):
+        filled = fill_all(prepared, bool(settings["train"]), limit_s)
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each

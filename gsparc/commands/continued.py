@@ -11,9 +11,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.run_lock import in_use
+from gsparc.commands.run_lock import held, in_use
 from gsparc.commands.settings import plain
-from gsparc.data.files import claimed, whole_file
+from gsparc.data.files import whole_file
 from gsparc.evaluation.report.sweep import FAILURE
 from gsparc.evaluation.summary import provenance
 from gsparc.models.parts import LAST
@@ -39,9 +39,7 @@ def once(
     Raises:
         ValueError: another process is doing it.
     """
-    with claimed(run_dir / ".job.lock") as mine:
-        if not mine:
-            raise ValueError(f"{run_dir}: another process does this job; wait for its end")
+    with held(run_dir / ".job"):  # the run's own is its work's
         settings = json.loads(json.dumps(plain(config), default=str))
         now = {"settings": settings, "data": _files(settings.get("dataset"), run_dir)}
         record, other = _read(run_dir / RECORD), None

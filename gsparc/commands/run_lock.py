@@ -67,8 +67,8 @@ def hold(folder: Path, jobs: bool = False) -> None:
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Hold one folder meanwhile, for callers from Python; nothing where a command of this process holds it.
+def held(folder: Path, setting: str = "hydra.run.dir") -> Iterator[None]:
+    """Hold the folder of a setting meanwhile; nothing where a command of this process holds it.
 
     Raises:
         ValueError: another process has locked it, or it cannot be locked.
@@ -78,9 +78,9 @@ def held(folder: Path) -> Iterator[None]:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = _locked(folder)
+        lock = _locked(folder, setting)
     except (OSError, NotImplementedError) as error:
-        raise ValueError(f"{folder}: cannot be locked ({error}); give another folder") from None
+        raise ValueError(f"{folder}: cannot be locked ({error}); give another {setting}=...") from None
     except InUse as busy:
         raise ValueError(str(busy)) from None
     try:
@@ -98,7 +98,7 @@ def in_use(folder: Path) -> bool:
     return False
 
 
-def _locked(folder: Path) -> FileLock:
+def _locked(folder: Path, setting: str = "hydra.run.dir") -> FileLock:
     """Its lock, held."""
     lock = FileLock(folder.resolve() / LOCK)
     try:
@@ -108,7 +108,7 @@ def _locked(folder: Path) -> FileLock:
         with suppress(OSError):
             holder = f" ({(folder / HOLDER).read_text(encoding='utf-8')})"
         raise InUse(
-            f"{folder}: another run writes here{holder}; wait for its end, or give hydra.run.dir=..."
+            f"{folder}: another run writes here{holder}; wait for its end, or give another {setting}=..."
         ) from None
     return lock
 

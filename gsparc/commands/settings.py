@@ -12,6 +12,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from threadpoolctl import threadpool_limits
 
+from gsparc.data import executor
+from gsparc.data.executor import Engine
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import plain as plain
@@ -69,6 +71,8 @@ class RunSettings(Checked):
                 Limit("a finite number", math.isfinite).check(key, value)
         if found.threads is not None:
             torch.set_num_threads(found.threads)
+        address = (given.get("ray") or {}).get("address")
+        executor.use(Engine(given.get("engine", "process"), given.get("workers"), address))
         threadpool_limits(
             1, "blas"
         )  # NumPy's: two threads beside other work took 10 to 400 times as long as one

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
 from gsparc.commands import simulate_pictures as pictures
 from gsparc.commands.output import run_directory
+from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import open_console
@@ -60,7 +59,7 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 
 def task(config: DictConfig) -> Outcome | None:
-    """Simulate, then table, summary and pictures, of several jobs in that which wrote the file.
+    """Simulate, then table, summary and pictures.
 
     `scene=help [out=FILE.png]` lists scenes.
     """
@@ -71,10 +70,8 @@ def task(config: DictConfig) -> Outcome | None:
         return None
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
-    outcome = simulate(campaign(config), out, shared=HydraConfig.get().mode == RunMode.MULTIRUN)
-    if outcome is None:
-        log.info("%s is written, by another job", out)
-        return None
+    with held(out.with_name(out.name + ".parts"), "out"):
+        outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
     if isinstance(outcome.survey.engine, HasTriangles):

@@ -11,11 +11,9 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from gsparc.data.files import whole_file
@@ -35,7 +33,7 @@ class Shards:
     """
 
     def __init__(self, out: Path, plan: Mapping[str, Any]) -> None:
-        self.out, self.plan = out, _text(plan)
+        self.out, self.plan = out, json.dumps(plan, sort_keys=True, indent=1, default=str)
         self.folder = out.with_name(out.name + ".parts")
         self._removed = out.with_name(out.name + ".gone")
         self._sweep()
@@ -56,14 +54,10 @@ class Shards:
         path = self.folder / f"{name}.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
-    def lock(self, piece: object) -> Path:
-        """File by which one process claims a piece of the work, a shard or a decision."""
-        return self.folder / f"{piece}.lock"
-
     @property
     def signature(self) -> dict[str, str]:
         """Attribute of the dataset that says which plan it was made by."""
-        return _signature(self.plan)
+        return {"plan_sha256": hashlib.sha256(self.plan.encode()).hexdigest()}
 
     def path(self, number: int) -> Path:
         """File of a shard; it is there once the shard is finished."""
@@ -106,27 +100,7 @@ class Shards:
 
     def _sweep(self) -> None:
         if self._removed.exists():
-            with suppress(FileNotFoundError):  # another process sweeps, too
-                shutil.rmtree(self._removed)
-
-
-def written_by(out: Path, plan: Mapping[str, Any]) -> bool:
-    """Whether a dataset's file was made by a plan; False where it is of another kind."""
-    try:
-        with h5py.File(out) as file:
-            stored = {name: file.attrs.get(name) for name in _signature(_text(plan))}
-    except OSError:
-        return False
-    known = {name: one.decode() if isinstance(one, bytes) else one for name, one in stored.items()}
-    return known == _signature(_text(plan))
-
-
-def _text(plan: Mapping[str, Any]) -> str:
-    return json.dumps(plan, sort_keys=True, indent=1, default=str)
-
-
-def _signature(text: str) -> dict[str, str]:
-    return {"plan_sha256": hashlib.sha256(text.encode()).hexdigest()}
+            shutil.rmtree(self._removed)
 
 
 def _write(path: Path, content: str) -> None:

@@ -6,13 +6,13 @@ import errno
 import json
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from campaigns import spectra
 from hydra import initialize_config_module
 
+from gsparc.commands.run_lock import held
 from gsparc.evaluation.experiment import fitting
 from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, prepare
@@ -174,7 +174,7 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     only = "only=[own/random/mean/*,own/random/nearest/*,own/random/swiftwrf/*]"
     first = compare(tmp_path, only)
     assert first.returncode == 0, first.stderr
-    assert "3 cells, 0 of them are there" in first.stdout and "min left" in first.stdout
+    assert "3 cells, 0 of them are there" in first.stdout and "3 of 3 cells, about 0 s left" in first.stdout
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["own/random/0.3/first"] in ("nearest", "mean", "swiftwrf")
     assert summary["own/random/0.3/swiftwrf/query_ms_p50"] > 0
@@ -183,9 +183,10 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     again = compare(tmp_path, only, "latency=false")
     assert "3 cells, 3 of them are there" in again.stdout
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
-    other = compare(tmp_path, only, "worker=1", f"hydra.run.dir={tmp_path / 'other'}")
-    assert other.returncode == 0 and "the report is worker 0's" in other.stdout
-    assert not (tmp_path / "other" / "compare.md").exists()  # every worker started by hand wrote one
+    with held(tmp_path / "cells"):
+        other = compare(tmp_path, only, f"hydra.run.dir={tmp_path / 'other'}")
+    assert other.returncode == 1 and "another run writes here; wait for its end" in other.stderr
+    assert "give another cells=" in other.stderr and not (tmp_path / "other" / "compare.md").exists()
     absent = compare(tmp_path, only, "datasets.own.file=null", "train=false")
     assert absent.returncode == 0 and "here as far as results were kept" in absent.stdout + absent.stderr
     assert "3 cells, 3 of them are there" in absent.stdout
@@ -193,6 +194,21 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     (cell,) = (tmp_path / "cells").glob("own-random-mean-*/cell.json")
     cell.write_text("{")
     assert "3 cells, 2 of them are there" in compare(tmp_path, only, "latency=false").stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["joblib", "ray"])
+def test_cells_filled_elsewhere_are_the_same(tmp_path, engine):
+    pytest.importorskip(engine, reason=f"{engine} is not installed")
+    spectra(tmp_path / "own.npz")
+    only, found = "only=[own/random/mean/*,own/random/nearest/*,own/random/gp/*,own/random/idw/*]", []
+    for cells, chosen in (("one", "process"), ("two", engine)):
+        done = compare(tmp_path, only, "latency=false", f"engine={chosen}", f"cells={tmp_path / cells}")
+        assert done.returncode == 0 and "4 of 4 cells" in done.stdout, done.stderr
+        files = sorted((tmp_path / cells).glob("*/cell.json"))
+        facts = [json.loads(file.read_text()) for file in files]
+        found.append([{k: v for k, v in one.items() if k.startswith("test/")} for one in facts])
+    assert found[0] == found[1] and len(found[0]) == 4 and min(map(len, found[0])) > 1
 
 
 @pytest.mark.slow
@@ -218,23 +234,3 @@ def test_mistakes_are_one_line(tmp_path):
 def test_a_star_may_stand_for_several_parts_of_a_cell(pattern, rfid, newrf):
     assert _may_match(pattern, "rfid", "random") == rfid
     assert _may_match(pattern, "newrf", "random") == newrf
-
-
-@pytest.mark.slow
-def test_two_comparisons_at_once_share_their_cells(tmp_path):
-    """In one folder of cells each is filled once and both report; in one folder of a run one is told."""
-    spectra(tmp_path / "own.npz")
-    only = "only=[own/random/mean/*,own/random/nearest/*,own/random/gp/*]"
-    with ThreadPoolExecutor(3) as pool:
-        runs = [tmp_path / name for name in ("run", "other", "run")]
-        done = list(pool.map(lambda run: compare(tmp_path, only, f"hydra.run.dir={run}"), runs))
-    assert sorted(one.returncode for one in done) == [0, 0, 1], [one.stderr[-300:] for one in done]
-    (told,) = (one.stderr for one in done if one.returncode)
-    assert "another run writes here" in told and "Traceback" not in told
-    filled = [
-        line for one in done for line in one.stdout.splitlines() if line[0:1] == "[" and " dB after " in line
-    ]
-    assert len(filled) == 3, "each by one of them"
-    tables = [(run / "compare.csv").read_text().splitlines() for run in runs[:2]]
-    assert [line.split(",")[:5] for line in tables[0]] == [line.split(",")[:5] for line in tables[1]]
-    assert not list(tmp_path.rglob("*.partial"))

@@ -1,23 +1,23 @@
 """Whole campaigns on our own engine: no ray tracer needed."""
 
 import json
-import multiprocessing
 import os
 import shutil
 import signal
+import sys
 import time
 import tracemalloc
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cloudpickle
 import h5py
 import numpy as np
 import pytest
-import torch
 
 from gsparc.commands.check import main as check
 from gsparc.commands.simulate_pictures import effect_shares, floor_plan
-from gsparc.data import blocks, files
+from gsparc.data import blocks
 from gsparc.data.datasets.sionna import _heard
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
@@ -482,41 +482,30 @@ def test_scenes_that_cannot_be_are_refused(tmp_path, changes, words):
     assert not list(tmp_path.iterdir())
 
 
-def shares(out: Path, begun: Path, killed_at: int | None) -> None:
-    """One of several processes that make a dataset; `begun` counts the shards and decisions they begin."""
-    real = ShoeboxEngine.trace
+@dataclass
+class Counted(campaigns._Tracing):
+    """Writes beside the file which shards are begun; the process of the third ends, once."""
 
-    def counted(self, receivers, *rest, **named):
+    def __call__(self, shard):
+        begun, killed = (self.shards.out.with_name(name) for name in ("begun", "killed"))
         with begun.open("a") as file:
-            file.write(f"{len(receivers)} {receivers[0].sum()}\n")
-        if killed_at is not None and len(begun.read_text().splitlines()) == killed_at:
+            file.write(f"{shard[0]}\n")
+        if shard[0] == 3 and not killed.exists():
+            killed.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return real(self, receivers, *rest, **named)
-
-    ShoeboxEngine.trace = counted
-    files.POLL_S = 0.02
-    torch.set_num_threads(1)  # OpenMP's threads are not in a forked process, which would wait for them
-    simulate(plan(shard=8), out, shared=True)
+        return super().__call__(shard)
 
 
-def test_two_processes_share_shards_and_one_is_killed(tmp_path):
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["joblib", "ray"])
+def test_workers_share_shards_and_one_is_killed(tmp_path, monkeypatch, engine, elsewhere):
     simulate(plan(shard=8), tmp_path / "whole.h5")
-    out, begun = tmp_path / "shared.h5", tmp_path / "begun"
-    fork = multiprocessing.get_context("fork")
-    workers = [fork.Process(target=shares, args=(out, begun, at)) for at in (3, None)]
-    workers[0].start()
-    while workers[0].is_alive() and not begun.exists():
-        time.sleep(0.01)
-    workers[1].start()
-    for worker in workers:
-        worker.join(120)
-    assert workers[1].exitcode == 0 and workers[0].exitcode in (0, -signal.SIGKILL)
-    traced = begun.read_text().splitlines()
-    killed = workers[0].exitcode != 0
-    assert len(set(traced)) == 8 and len(traced) == 8 + killed
-    (one, _), (two, _) = arrays(tmp_path / "whole.h5"), arrays(out)
+    monkeypatch.setattr(campaigns, "_Tracing", Counted)
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    elsewhere(engine)
+    simulate(plan(shard=8), tmp_path / "shared.h5")
+    begun = (tmp_path / "begun").read_text().split()
+    assert (tmp_path / "killed").exists() and set(begun) == set("12345678") and len(begun) <= 10
+    (one, _), (two, _) = arrays(tmp_path / "whole.h5"), arrays(tmp_path / "shared.h5")
     for name in one:
         np.testing.assert_array_equal(one[name], two[name], err_msg=name)
-    assert simulate(plan(shard=8), out, shared=True) is None  # a job that comes late
-    with pytest.raises(ValueError, match="exists"):
-        simulate(plan(shard=9), out, shared=True)

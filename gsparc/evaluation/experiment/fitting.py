@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import statistics
 import time
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -15,7 +16,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.files import each_once, no_room
+from gsparc.data.executor import each
+from gsparc.data.files import no_room
 from gsparc.data.schema import Kind
 from gsparc.evaluation.console import one_line, plain
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
@@ -86,11 +88,6 @@ class Prepared:
     config: DictConfig
     folder: Path
     scored: bool = True
-
-    @property
-    def lock(self) -> Path:
-        """File by which one process claims to fill the cell."""
-        return self.folder / ".lock"
 
     @property
     def expected_s(self) -> float:
@@ -196,83 +193,49 @@ def fill(prepared: Prepared) -> Filled:
     return Filled(prepared.cell, folder, facts)
 
 
-class Failed:
-    """Cells that processes of one multirun could not fill; those of an earlier multirun are tried again.
-
-    Args:
-        sweep: the multirun's folder.
-    """
-
-    def __init__(self, sweep: Path) -> None:
-        self.folder, self.start = sweep / "failed", sweep / "multirun.yaml"  # which Hydra writes at the start
-
-    def has(self, name: str) -> bool:
-        """Whether a cell failed since the start."""
-        file = self.folder / name
-        if not file.exists():
-            return False
-        return not self.start.exists() or file.stat().st_mtime_ns >= self.start.stat().st_mtime_ns
-
-    def add(self, name: str, why: str) -> None:
-        """Say that a cell failed."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / name).write_text(why + "\n", encoding="utf-8")
+def _tried(one: Prepared) -> Filled | str:
+    """The cell, or why it cannot be filled; the other methods' table comes nevertheless."""
+    try:
+        return one.found() or fill(one)
+    except Exception as error:  # any error of a plugin
+        if no_room(error):  # the others would be trained in vain
+            raise
+        unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
+        return one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
 
 
-def fill_all(
-    prepared: Sequence[Prepared],
-    train: bool = True,
-    limit_s: float | None = None,
-    failed: Failed | None = None,
-) -> list[Filled]:
-    """Find or fill one cell after another, saying how far it is and how long it will take.
+def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | None = None) -> list[Filled]:
+    """Find or fill cells, saying how far it is and how long it will take.
 
     A cell that cannot be filled is said and left out; the others go on. One that is not tried keeps what was
-    measured with earlier program text. Processes that fill the same cells share them.
+    measured with earlier program text.
 
     Args:
         prepared: the most wanted first.
         train: whether missing cells are filled.
         limit_s: no cell is started that would end later [s].
-        failed: where processes tell each other of cells that cannot be filled.
     """
     missing = [one for one in prepared if one.found() is None]
     log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(missing))
-    started = time.monotonic()
-    broken, late = set[str](), set[str]()  # cells
+    started, broken = time.monotonic(), set[str]()
 
-    def cannot(one: Prepared) -> bool:
-        return str(one.cell) in broken or (failed is not None and failed.has(one.folder.name))
-
-    def done(one: Prepared) -> bool:
-        return one.found() is not None or str(one.cell) in late or cannot(one)
-
-    def work(one: Prepared) -> None:
-        if limit_s is not None and time.monotonic() - started + one.expected_s > limit_s:
+    def fits(one: Prepared) -> bool:
+        late = limit_s is not None and time.monotonic() - started + one.expected_s > limit_s
+        if late:
             log.warning("max_hours: %s is not started", one.cell)
-            late.add(str(one.cell))
-            return
-        left = sum(other.expected_s for other in missing if not done(other))
-        number = prepared.index(one) + 1
-        log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
-        try:
-            found = fill(one)
+        return not late
+
+    here = [one for one in missing if train and one.problem.data is not None]
+    try:
+        for number, found in each(_tried, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
+            if isinstance(found, str):
+                log.warning("%s cannot be filled: %s", here[number].cell, found)
+                broken.add(str(here[number].cell))
+                continue
             score = f"{score_db(found.facts['dataset/kind'], found.facts):.2f} dB" if found.scored() else "-"
             log.info("%s: %s after %.1f s", found.cell, score, found.facts["time/train_s"])
-        except KeyboardInterrupt:
-            kept = "interrupted; finished cells are kept: the same command goes on with the others"
-            raise KeyboardInterrupt(kept) from None
-        except Exception as error:  # any error of a plugin: the other methods' table comes nevertheless
-            if no_room(error):  # the others would be trained in vain
-                raise
-            unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
-            log.warning("%s cannot be filled: %s", one.cell, one_line(error), exc_info=unforeseen)
-            broken.add(str(one.cell))
-            if failed is not None:
-                failed.add(one.folder.name, one_line(error))
-
-    if train:
-        here = [one for one in missing if one.problem.data is not None]
-        each_once(here, lambda one: one.lock, done, work)
-    kept = [one.found() or (None if cannot(one) else one.found_earlier()) for one in prepared]
+    except KeyboardInterrupt:
+        said = "interrupted; finished cells are kept: the same command goes on with the others"
+        raise KeyboardInterrupt(said) from None
+    kept = [one.found() or (None if str(one.cell) in broken else one.found_earlier()) for one in prepared]
     return [one for one in kept if one is not None]

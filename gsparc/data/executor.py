@@ -1,0 +1,202 @@
+"""Where independent pieces of work are done: in this process, in several of this machine (joblib), on Ray.
+
+Work is stored by what it does, and looks for what is stored first: a piece that is begun again, because the
+process that did it has died or the command was interrupted, is then not computed again.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import chain, islice
+from typing import Any, TypeVar
+
+import cloudpickle
+import joblib
+import torch
+from joblib.externals.loky.process_executor import BrokenProcessPool
+from threadpoolctl import threadpool_limits
+
+from gsparc.data.errors import reason
+from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, whole
+
+log = logging.getLogger(__name__)
+
+TRIES = 3  # of a piece whose process dies
+_Piece = TypeVar("_Piece")
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class Engine(Checked):
+    """Where pieces are done.
+
+    Attributes:
+        engine: `process`, `joblib` or `ray`.
+        workers: processes at once; None: as many as have `threads` cores each.
+        address: of a Ray cluster, HOST:PORT or `auto`; None: one that is started on this machine.
+    """
+
+    engine: str = setting("process", choice("process", "joblib", "ray"))
+    workers: int | None = setting(None, or_null(whole(1)))
+    address: str | None = None
+
+
+_chosen = Engine()
+
+
+def use(engine: Engine) -> None:
+    """Choose it for this process; pieces do theirs where they are.
+
+    Raises:
+        SettingError: it needs a package that is not there.
+    """
+    global _chosen
+    if engine.engine == "ray":
+        _ray()
+    _chosen = engine
+
+
+def elsewhere() -> bool:
+    """Whether pieces are done in other processes."""
+    return _chosen.engine != "process"
+
+
+def each(
+    work: Callable[[_Piece], _Result],
+    pieces: Sequence[_Piece],
+    what: str = "",
+    *,
+    cost: Callable[[_Piece], float] = lambda piece: 1.0,
+    wanted: Callable[[_Piece], bool] = lambda piece: True,
+    threads: int = 1,
+) -> Iterator[tuple[int, _Result]]:
+    """Numbers of pieces and what `work` makes of them, as they end; in order in this process.
+
+    Work and pieces are pickled for other processes, work once for each; these have the threads of this one.
+
+    Args:
+        work, pieces: independent of one another.
+        what: pieces are called in the log, which says after each how many are left and how long; "": no log.
+        cost: of a piece beside the others, for the time left.
+        wanted: asked when a piece would begin; others are left out.
+        threads: of this process that do pieces side by side where no other process does.
+
+    Raises:
+        Exception: the first that `work` raises; pieces that have begun are cancelled.
+        BrokenProcessPool, ray.exceptions.RayError: a piece ended its process `TRIES` times.
+    """
+    costs, ended = [cost(piece) for piece in pieces], 0.0
+    numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
+    began = time.monotonic()
+    if _chosen.engine == "process" and threads == 1:
+        found: Generator[tuple[int, Any]] = ((number, work(pieces[number])) for number in numbers)
+    elif _chosen.engine == "process":
+        calls = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
+        found = _jobs(calls, threads, "threading")
+    else:
+        blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
+        found = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
+    with closing(found):  # what has begun is cancelled
+        for count, (number, result) in enumerate(found, 1):
+            if isinstance(result, _Raised):
+                raise result.error
+            ended += costs[number]
+            if what:
+                left = (time.monotonic() - began) * (sum(costs) / max(ended, 1e-9) - 1)
+                log.info("%d of %d %s, about %s left", count, len(pieces), what, _duration(left))
+            yield number, result
+
+
+@dataclass(frozen=True)
+class _Raised:
+    error: Exception
+
+
+@lru_cache(maxsize=1)
+def _read(blob: bytes) -> Callable[[Any], Any]:
+    work, folder, threads = cloudpickle.loads(blob)
+    os.chdir(folder)  # paths of settings may be relative
+    torch.set_num_threads(threads)  # another number rounds otherwise
+    threadpool_limits(1, "blas")
+    return work
+
+
+def _piece(blob: bytes, number: int, piece: Any) -> tuple[int, Any]:
+    try:
+        return number, _read(blob)(piece)
+    except Exception as error:  # as it is, not in an error of the engine: the command says it in one line
+        return number, _Raised(error)
+
+
+def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Iterator[tuple[int, Any]]:
+    jobs = joblib.Parallel(
+        workers, backend, return_as="generator_unordered", pre_dispatch=workers, batch_size=1, max_nbytes=None
+    )
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", "[0-9]+ tasks which were still being", UserWarning
+        )  # cancelled at an error
+        yield from jobs(joblib.delayed(call)(*given) for call, *given in calls)
+
+
+def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+    workers = _chosen.workers or max(joblib.cpu_count() // torch.get_num_threads(), 1)
+    lost, begun = Counter[int](), dict[int, None]()
+
+    def calls() -> Iterator[tuple[Any, ...]]:
+        for number in chain(numbers, list(begun)):
+            begun[number] = None
+            yield _piece, blob, number, pieces[number]
+
+    while True:
+        try:
+            for number, result in _jobs(calls(), workers, "loky"):
+                del begun[number]
+                yield number, result
+            return
+        except BrokenProcessPool as error:
+            lost.update(list(begun))
+            if max(lost.values(), default=TRIES) >= TRIES:
+                raise
+            log.warning("a process died, what it did is begun again (%s)", reason(error).partition(". ")[0])
+
+
+def _ray() -> Any:
+    """Ray, connected."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError:
+        raise SettingError("engine='ray': Ray is not here; pip install 'gsparc[ray]'") from None
+    return ray
+
+
+def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+    ray, threads = _ray(), torch.get_num_threads()
+    if not ray.is_initialized():
+        ray.init(_chosen.address, include_dashboard=False, logging_level="error", log_to_driver=False)
+    call = ray.remote(num_cpus=threads, max_retries=TRIES)(_piece)
+    stored, running = ray.put(blob), []
+    try:
+        while True:
+            most = _chosen.workers or max(int(ray.cluster_resources().get("CPU", 1)) // threads, 1)
+            running += [call.remote(stored, n, pieces[n]) for n in islice(numbers, most - len(running))]
+            if not running:
+                return
+            (first, *_), running = ray.wait(running)
+            yield ray.get(first)
+    finally:
+        for one in running:
+            ray.cancel(one, force=True)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,130 @@
+"""Pieces of work: the same results wherever they are done, each stored once though its process dies."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import cloudpickle
+import numpy as np
+import pytest
+from joblib.externals.loky.process_executor import BrokenProcessPool
+
+from gsparc.data import executor
+from gsparc.data.executor import Engine, each
+from gsparc.data.limits import SettingError
+
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
+COUNT = 12
+ENGINES = ["process", "joblib", "ray"]
+
+
+class Stored:
+    """Stores the square of a piece and who began it; the `killed` one ends its process, once or always."""
+
+    def __init__(self, folder: Path, killed: int | None = None, always: bool = False) -> None:
+        self.folder, self.killed, self.always = folder, killed, always
+
+    def __call__(self, piece: int) -> int:
+        file = self.folder / f"{piece}.npy"
+        if not file.exists():
+            begun = self.folder / f"{piece}.begun"
+            before = begun.exists()
+            with begun.open("a") as lines:
+                lines.write(f"{os.getpid()}\n")
+            if piece == self.killed and (self.always or not before):
+                os.kill(os.getpid(), signal.SIGKILL)
+            time.sleep(0.02)
+            np.save(file, piece * piece)
+        return int(np.load(file))
+
+
+def test_here_pieces_are_done_in_order_and_what_is_not_wanted_is_left_out(tmp_path):
+    found = list(each(Stored(tmp_path), range(COUNT), wanted=lambda piece: piece % 3 > 0))
+    assert found == [(n, n * n) for n in range(COUNT) if n % 3]
+    assert {int(file.read_text()) for file in tmp_path.glob("*.begun")} == {os.getpid()}
+
+
+def test_threads_of_this_process_do_pieces_side_by_side():
+    began = time.perf_counter()
+    found = list(each(lambda piece: time.sleep(0.1) or piece, range(6), threads=3))
+    assert sorted(found) == [(n, n) for n in range(6)] and time.perf_counter() - began < 0.5
+
+
+def test_one_line_says_how_many_are_left_and_how_long(caplog):
+    caplog.set_level(logging.INFO, "gsparc")
+    list(each(lambda piece: time.sleep(piece / 10), [1, 3], "cells", cost=float))
+    assert caplog.messages[0] in ("1 of 2 cells, about 0 s left", "1 of 2 cells, about 1 s left")
+    assert caplog.messages[1:] == ["2 of 2 cells, about 0 s left"]
+
+
+def test_an_error_ends_the_work_here():
+    seen = []
+    with pytest.raises(ZeroDivisionError):
+        list(each(lambda piece: seen.append(piece) or 1 // piece, [2, 1, 0, 5]))
+    assert seen == [2, 1, 0]
+
+
+def test_settings_that_cannot_be_are_refused(monkeypatch):
+    with pytest.raises(SettingError, match="one of process, joblib, ray"):
+        Engine("dask")
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SettingError, match=r"pip install 'gsparc\[ray\]'"):
+        executor.use(Engine("ray"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES[1:])
+def test_a_piece_whose_process_dies_is_begun_again_and_no_stored_one(tmp_path, engine, elsewhere):
+    elsewhere(engine)
+    found = dict(each(Stored(tmp_path, killed=4), range(COUNT)))
+    assert found == {n: n * n for n in range(COUNT)}
+    begun = {int(file.stem): file.read_text().split() for file in tmp_path.glob("*.begun")}
+    assert len(begun[4]) == 2 and len(set().union(*begun.values())) > 1
+    assert sum(map(len, begun.values())) <= COUNT + 2  # joblib ends the other process, too
+    assert str(os.getpid()) not in set().union(*begun.values())
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.npy")}
+    assert dict(each(Stored(tmp_path), range(COUNT))) == found
+    assert before == {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.npy")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES[1:])
+def test_a_piece_that_always_ends_its_process_ends_the_work(tmp_path, engine, elsewhere):
+    elsewhere(engine)
+    with pytest.raises(Exception) as raised:
+        list(each(Stored(tmp_path, killed=2, always=True), range(4)))
+    assert isinstance(raised.value, BrokenProcessPool) or type(raised.value).__module__.startswith("ray.")
+    assert all((tmp_path / f"{n}.npy").exists() for n in (0, 1))
+    tried = (tmp_path / "2.begun").read_text().split()
+    assert executor.TRIES <= len(tried) <= executor.TRIES + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES[1:])
+def test_an_error_is_raised_as_it_is_and_the_others_are_cancelled(engine, elsewhere):
+    elsewhere(engine)
+    list(each(abs, [1, 2]))  # workers are there
+    began = time.perf_counter()
+    with pytest.raises(ZeroDivisionError, match=r"^integer division or modulo by zero$"):
+        list(each(lambda piece: 1 // piece if piece < 2 else time.sleep(60), [0, 2, 3, 4]))
+    assert time.perf_counter() - began < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes", [2, 4])
+def test_a_node_of_ray_is_lost_half_way(tmp_path, nodes, elsewhere):
+    cluster = elsewhere("ray", nodes=nodes)
+    found, lost = {}, None
+    for number, value in each(Stored(tmp_path), range(4 * COUNT)):
+        found[number] = value
+        if len(found) == COUNT:
+            lost = cluster.list_all_nodes()[-1]
+            cluster.remove_node(lost, allow_graceful=False)
+    assert found == {n: n * n for n in range(4 * COUNT)} and lost is not None
+    begun = [len(file.read_text().split()) for file in tmp_path.glob("*.begun")]
+    assert sum(begun) <= 4 * COUNT + 1  # what the lost node was at
