@@ -40,7 +40,9 @@ def once(
         ValueError: another process is doing it.
     """
     with held(run_dir / ".job"):  # the run's own is its work's
-        settings = json.loads(json.dumps(plain(config), default=str))
+        where = ("engine", "workers", "ray")
+        told = {name: value for name, value in plain(config).items() if name not in where}
+        settings = json.loads(json.dumps(told, default=str))
         now = {"settings": settings, "data": _files(settings.get("dataset"), run_dir)}
         record, other = _read(run_dir / RECORD), None
         same = record is not None and all(record.get(key, now[key]) == now[key] for key in now)

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.evaluation.console import open_console
 from gsparc.evaluation.open_runs import open_files
 from gsparc.maps.field_map import FieldMap, geotiff_wanted, write_geotiff
 from gsparc.maps.floor_plan import FloorPlan, read_plan
@@ -53,7 +50,7 @@ def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, re
         )
     method, make, data, fold, context = trained(path, dataset)
     log.info("a promise for this map: %d fits without blocks of places", settings.folds)
-    found = gather(method, make, data, fold, settings, context, log.info)
+    found = gather(method, make, data, fold, settings, context)
     found.coverage(settings.share)  # too little evidence is said before anything is stored
     found.keep(path)
     return found
@@ -82,15 +79,6 @@ def trained(
     )  # fmt: skip
     make = partial(build, config["model"], trusted=False)
     return run.methods[0], make, run.data, run.split.folds[0], context
-
-
-@contextmanager
-def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """A bar with the time that is left, as a function of the share that is done."""
-    columns = TextColumn(what), BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeElapsedColumn()
-    with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=open_console()) as bars:
-        bar = bars.add_task(what, total=1.0)
-        yield lambda share: bars.update(bar, completed=share)
 
 
 def plan_of(config: DictConfig) -> FloorPlan | None:
@@ -177,8 +165,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     promise = None
     if config.promised:
         promise = promise_of(str(config.ckpt), settings["dataset"], how, bool(config.renew))
-    with progress("cells") as tick:
-        found = map_of(predictor, promise=promise, asked=tick, **asked)
+    found = map_of(predictor, promise=promise, **asked)
     kept = None if promise is None else promise.coverage(how.share)
     lines = lines_of(found, kept)
     unit = str(config.unit or predictor.site.level_unit)

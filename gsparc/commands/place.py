@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.map import coordinates, progress, promise_of, trained
+from gsparc.commands.map import coordinates, promise_of, trained
 from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
@@ -36,8 +36,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         promise = promise_of(path, settings["dataset"], PromiseSettings(**settings["promise"]), False)
     if config.left_out:
         error = new_station_error(*trained(path, settings["dataset"]), int(config.left_out))
-    with progress("candidates") as tick:
-        found = place_next(predictor, count=config.count, promise=promise, error=error, asked=tick, **asked)
+    found = place_next(predictor, count=config.count, promise=promise, error=error, **asked)
     columns = coordinates(found.places, predictor)
     columns |= {found.what: found.goal, "low": found.low, "high": found.high}
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})

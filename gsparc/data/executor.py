@@ -16,6 +16,8 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, islice
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any, TypeVar
 
 import cloudpickle
@@ -29,6 +31,7 @@ from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, 
 
 log = logging.getLogger(__name__)
 
+SAY_S = 2.0  # between lines about progress
 TRIES = 3  # of a piece whose process dies
 _Piece = TypeVar("_Piece")
 _Result = TypeVar("_Result")
@@ -95,7 +98,7 @@ def each(
     """
     costs, ended = [cost(piece) for piece in pieces], 0.0
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
-    began = time.monotonic()
+    began = said = time.monotonic()
     if _chosen.engine == "process" and threads == 1:
         found: Generator[tuple[int, Any]] = ((number, work(pieces[number])) for number in numbers)
     elif _chosen.engine == "process":
@@ -109,7 +112,8 @@ def each(
             if isinstance(result, _Raised):
                 raise result.error
             ended += costs[number]
-            if what:
+            if what and time.monotonic() - said > SAY_S:
+                said = time.monotonic()
                 left = (time.monotonic() - began) * (sum(costs) / max(ended, 1e-9) - 1)
                 log.info("%d of %d %s, about %s left", count, len(pieces), what, _duration(left))
             yield number, result
@@ -121,17 +125,19 @@ class _Raised:
 
 
 @lru_cache(maxsize=1)
-def _read(blob: bytes) -> Callable[[Any], Any]:
-    work, folder, threads = cloudpickle.loads(blob)
+def _read(where: Any) -> Callable[[Any], Any]:
+    """Work out of a file or Ray's store, once for all pieces."""
+    stored = Path(where).read_bytes() if isinstance(where, str) else _ray().get(where)
+    work, folder, threads = cloudpickle.loads(stored)
     os.chdir(folder)  # paths of settings may be relative
     torch.set_num_threads(threads)  # another number rounds otherwise
     threadpool_limits(1, "blas")
     return work
 
 
-def _piece(blob: bytes, number: int, piece: Any) -> tuple[int, Any]:
+def _piece(where: list[Any], number: int, piece: Any) -> tuple[int, Any]:
     try:
-        return number, _read(blob)(piece)
+        return number, _read(*where)(piece)
     except Exception as error:  # as it is, not in an error of the engine: the command says it in one line
         return number, _Raised(error)
 
@@ -141,9 +147,7 @@ def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Iterator[tuple[in
         workers, backend, return_as="generator_unordered", pre_dispatch=workers, batch_size=1, max_nbytes=None
     )
     with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", "[0-9]+ tasks which were still being", UserWarning
-        )  # cancelled at an error
+        warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
         yield from jobs(joblib.delayed(call)(*given) for call, *given in calls)
 
 
@@ -151,22 +155,27 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
     workers = _chosen.workers or max(joblib.cpu_count() // torch.get_num_threads(), 1)
     lost, begun = Counter[int](), dict[int, None]()
 
-    def calls() -> Iterator[tuple[Any, ...]]:
+    def calls(where: str) -> Iterator[tuple[Any, ...]]:
         for number in chain(numbers, list(begun)):
             begun[number] = None
-            yield _piece, blob, number, pieces[number]
+            yield _piece, [where], number, pieces[number]
 
-    while True:
-        try:
-            for number, result in _jobs(calls(), workers, "loky"):
-                del begun[number]
-                yield number, result
-            return
-        except BrokenProcessPool as error:
-            lost.update(list(begun))
-            if max(lost.values(), default=TRIES) >= TRIES:
-                raise
-            log.warning("a process died, what it did is begun again (%s)", reason(error).partition(". ")[0])
+    with NamedTemporaryFile() as file:
+        file.write(blob)
+        file.flush()
+        while True:
+            try:
+                for number, result in _jobs(calls(file.name), workers, "loky"):
+                    del begun[number]
+                    yield number, result
+                return
+            except BrokenProcessPool as error:
+                lost.update(list(begun))
+                if max(lost.values(), default=TRIES) >= TRIES:
+                    raise
+                log.warning(
+                    "what a process did that died is begun again (%s)", reason(error).partition(". ")[0]
+                )
 
 
 def _ray() -> Any:
@@ -188,7 +197,7 @@ def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Itera
     try:
         while True:
             most = _chosen.workers or max(int(ray.cluster_resources().get("CPU", 1)) // threads, 1)
-            running += [call.remote(stored, n, pieces[n]) for n in islice(numbers, most - len(running))]
+            running += [call.remote([stored], n, pieces[n]) for n in islice(numbers, most - len(running))]
             if not running:
                 return
             (first, *_), running = ray.wait(running)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from gsparc.data.errors import DataError
+from gsparc.data.executor import each
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
@@ -47,7 +47,6 @@ def map_of(
     promise: Promise | Literal["stored"] | None = "stored",
     share: float = 0.9,
     tolerance_db: float = 0.1,
-    asked: Callable[[float], None] = lambda share: None,
     dry: bool = False,
 ) -> FieldMap:
     """Predict every cell of an area.
@@ -68,7 +67,6 @@ def map_of(
         share: of measurements that intervals are to hold.
         tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
             every cell. Known places must be stored with the model.
-        asked: called with the share of the work that is done.
         dry: predict one cell of each station alone: whether everything asked for is possible.
 
     Raises:
@@ -93,8 +91,7 @@ def map_of(
     every = np.flatnonzero(grid.inside)
     for layer, (name, number) in enumerate(zip(names, numbers, strict=True)):
         asking = predictor if site.stations is None else predictor.at(name)
-        expected = len(every) / stride**2 * (1.3 if stride > 1 else 1)
-        ask = _asker(asking, grid, other_end, _reporter(asked, layer, len(names), expected))
+        ask = _asker(asking, grid, other_end, f" of {name}" if name else "")
         (mean, spread), count = refined(ask, grid.inside, stride, tolerance_db)
         told += count
         for cells in _chunks(every, BANDS):
@@ -109,7 +106,6 @@ def map_of(
             said = level, level - half, level + half, np.where(np.isfinite(level), wrong, np.nan)
             for array, values in zip(arrays, said, strict=True):
                 array[layer].reshape(-1)[cells] = values
-    asked(1.0)
     if told < len(names) * len(every):
         notes.append(
             f"{told} of {len(names) * len(every)} predictions were made, the others interpolated "
@@ -190,22 +186,8 @@ def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
     return 1 << max(int(np.log2(max(apart / grid.step, 1.0))) - 1, 0)
 
 
-def _reporter(
-    asked: Callable[[float], None], layer: int, layers: int, expected: float
-) -> Callable[[int], None]:
-    """Says the share of all work after so many more predictions; the last percent is not known before."""
-    done = 0
-
-    def report(more: int) -> None:
-        nonlocal done
-        done += more
-        asked((layer + min(done / max(expected, 1.0), 0.99)) / layers)
-
-    return report
-
-
 def _asker(
-    predictor: Predictor, grid: Grid, other: Sequence[float] | None, report: Callable[[int], None]
+    predictor: Predictor, grid: Grid, other: Sequence[float] | None, name: str
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Level and deviation (n, 2) [dB] of cells (n,), in chunks, as many at once as torch has threads."""
 
@@ -213,15 +195,10 @@ def _asker(
         return np.column_stack(levels_at(predictor, grid.places(cells), other))
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        parts, found = _chunks(cells, CHUNK), []
-        pool = ThreadPoolExecutor(torch.get_num_threads())
-        try:
-            for part, values in zip(parts, pool.map(one, parts), strict=True):
-                found.append(values)
-                report(len(part))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)  # an interrupt waits for a chunk, not for all
-        return np.concatenate(found) if found else np.zeros((0, 2))
+        found, parts = np.zeros((len(cells), 2)), _chunks(cells, CHUNK)
+        for number, values in each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
+            found[number * CHUNK : number * CHUNK + len(values)] = values
+        return found
 
     return ask
 

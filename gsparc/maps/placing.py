@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from gsparc.data.errors import DataError
+from gsparc.data.executor import each
 from gsparc.data.schema import End, Measurements
 from gsparc.data.splits import Fold
 from gsparc.maps.area import Grid
@@ -82,7 +83,6 @@ def place_next(
     count: int = 100,
     promise: Promise | None = None,
     error: NewStation | None = None,
-    asked: Callable[[float], None] = lambda share: None,
     dry: bool = False,
 ) -> Placing:
     """Try one more station at every candidate.
@@ -96,7 +96,6 @@ def place_next(
         count: candidates, about.
         promise: see `map_of`, of the stations that stand.
         error: see `new_station_error`; None: the model's own deviations.
-        asked: called with the share of the work that is done.
         dry: predict one cell of each station that stands alone: whether everything asked for is possible.
 
     Raises:
@@ -132,17 +131,22 @@ def place_next(
     old_power = np.nan_to_num(now.strongest(now.power_db).reshape(-1)[flat], nan=-np.inf)
     old_outage = np.nan_to_num(now.outage.reshape(-1)[flat], nan=1.0)
     error = error or NewStation()
-    found = np.empty((len(candidates), 3))
-    for row, place in enumerate(candidates):
+
+    def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells)
+        goals = np.empty(3)
         for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
             if goal == "worst":
-                found[row, k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
+                goals[k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
                 continue
             wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
             outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
-            found[row, k] = np.mean(1 - np.minimum(old_outage, outage))
-        asked((row + 1) / len(candidates))
+            goals[k] = np.mean(1 - np.minimum(old_outage, outage))
+        return goals
+
+    found = np.empty((len(candidates), 3))
+    for row, goals in each(tried, candidates, "candidates"):
+        found[row] = goals
     before = float(np.quantile(old_power, DECILE) if goal == "worst" else np.mean(1 - old_outage))
     order = np.argsort(-found[:, 0], kind="stable")
     value, low, high = found[order].T
@@ -168,7 +172,7 @@ def new_station_error(
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
-        learned, _ = without(method, make, data, inner, context)
+        learned = without(method, make, data, inner, context)
         parts.append(evidence_of(learned, data, inner, np.full(int(own.sum()), one)))
     errors = [(one.level_db - one.mean_db)[~one.silent] for one in parts]
     means = np.array([error.mean() for error in errors if len(error)])

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.errors import DataError
+from gsparc.data.executor import each
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
@@ -98,7 +99,6 @@ def gather(
     fold: Fold,
     settings: PromiseSettings,
     context: FitContext,
-    done: Callable[[str], None] = lambda _: None,
 ) -> Promise:
     """Learn `settings.folds` times without blocks of the training rows, and ask about these.
 
@@ -110,7 +110,6 @@ def gather(
         data, fold: that the model learned from.
         settings: see there.
         context: of the refits.
-        done: called with a line after each refit.
 
     Raises:
         DataError: too few places for any block.
@@ -124,33 +123,35 @@ def gather(
     side = settings.block_m or longest / 10
     if not side > 0:
         raise DataError("a promise about a map needs rows at more than one place; measure more")
-    parts = []
-    for number in range(settings.folds):
+
+    def evidence_without(number: int) -> Evidence:
         split = SplitSettings("blocks", side_m=side * SIDES[number % len(SIDES)], val_fraction=0.1)
         cut = cut_inside(data, fold, split, 1, settings.seed + number // len(SIDES))
         inner = answerable(method, data, cut.folds[0])
-        learned, how = without(method, make, data, inner, replace(context, split=split))
+        learned = without(method, make, data, inner, replace(context, split=split))
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
         unit = cut.unit[tried] + number * (len(data) + 1)
-        parts.append(evidence_of(learned, data, replace(inner, test=tried), unit))
-        done(f"{number + 1} of {settings.folds}: {how} without {len(np.unique(unit))} blocks of places")
+        return evidence_of(learned, data, replace(inner, test=tried), unit)
+
+    found = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
+    parts = [found[number] for number in range(settings.folds)]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
     return Promise(evidence, places, station_of(data, known), side)
 
 
 def without(
     method: Method, make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext
-) -> tuple[Method, str]:
-    """A method that knows nothing of the test rows of a fold, and how it was made."""
+) -> Method:
+    """A method that knows nothing of the test rows of a fold."""
     if isinstance(method, Reconditions):
         found = method.reconditioned(data, np.sort(np.concatenate([fold.train, fold.val])))
         if found is not None:
-            return found, "conditioned"
+            return found
     found = for_links(make, data)
     with tempfile.TemporaryDirectory() as folder:
         found.fit(data, fold, replace(context, run_dir=Path(folder)))
-    return found, "fitted"
+    return found
 
 
 def answerable(method: Method, data: Measurements, fold: Fold) -> Fold:

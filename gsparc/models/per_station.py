@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.executor import each, elsewhere
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
@@ -31,7 +32,7 @@ from gsparc.models.target_rows import heard
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
+from gsparc.training.time_budget import Spent, less_repeatable
 
 log = logging.getLogger(__name__)
 
@@ -129,24 +130,19 @@ class PerStation(Method):
         self.site, notes = data.site, []
         left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
         kept = self.wrapped.resumable and context.run_dir != Path()
-        limited: Clock | None = None
-        cost = Cost()
         if kept and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
-        for turn, number in enumerate(numbers):
+        alone = not elsewhere()
+
+        def fitted(turn: int) -> tuple[Method, FitReport]:
+            number, share = numbers[turn], None
             folder = "unheard" if number == UNHEARD else f"station{number}"
-            share = None
-            if whole is not None:
-                even = (whole - budget.spent) / (len(numbers) - turn)
+            if whole is not None:  # what earlier ones left, where these are known
+                even = (whole - budget.spent) / (len(numbers) - turn) if alone else whole / len(numbers)
                 share = max(even, LEAST_SHARE * whole / len(numbers))
             resume = None if left is None else left / folder
             own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
-            name = "all stations" if numbers == [UNHEARD] else self._name_of(number)
-            if self.wrapped.takes_budget and len(numbers) > 1:
-                log.info(
-                    "station %d of %d: %s%s", turn + 1, len(numbers), name, _rest(turn, len(numbers), budget)
-                )
             rows, part = self._part(data, number)
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             copy, before = self._make(), budget.counted.wall
@@ -162,11 +158,18 @@ class PerStation(Method):
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
-            self._copies[number] = copy
-            limited = less_repeatable(limited, report.limited_by)
-            cost += report.cost
-            notes += [f"{name}: {note}" for note in report.notes]
-        return FitReport(budget.counted.wall, tuple(notes), limited, cost)
+            return copy, report
+
+        found = dict(each(fitted, range(len(numbers)), "stations" if self.wrapped.takes_budget else ""))
+        reports = [found[turn][1] for turn in range(len(numbers))]
+        for turn, number in enumerate(numbers):
+            self._copies[number] = found[turn][0]
+            name = "all stations" if numbers == [UNHEARD] else self._name_of(number)
+            notes += [f"{name}: {note}" for note in reports[turn].notes]
+        limited = less_repeatable(*(one.limited_by for one in reports))
+        return FitReport(
+            budget.counted.wall, tuple(notes), limited, sum((one.cost for one in reports), Cost())
+        )
 
     def _numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
         """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.
@@ -335,14 +338,6 @@ class OfStation(View):
         rows = torch.arange(len(tx))
         station = torch.full_like(rows, self.number)
         return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
-
-
-def _rest(turn: int, count: int, budget: TimeBudget) -> str:
-    """What a log says of the seconds that are left, before the station `turn` of so many."""
-    rest = budget.seconds - budget.spent
-    if math.isinf(rest):
-        rest = budget.spent / turn * (count - turn) if turn else math.inf
-    return "" if math.isinf(rest) else f", about {max(rest, 0.0):.0f} s left for all"
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import time
+
 import numpy as np
 import pytest
+import torch
 from campaigns import channels
 from towns import MASTS, town_model
 
@@ -13,7 +17,7 @@ from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.maps.field_map import REFUSED, best_server, loads, server_chance, sinr
 from gsparc.maps.intervals import Evidence
-from gsparc.maps.making import _usual, answering, map_of
+from gsparc.maps.making import _usual, answering, levels_at, map_of
 from gsparc.maps.pictures import layers
 from gsparc.maps.promise import Promise
 from gsparc.maps.refining import refined
@@ -48,12 +52,30 @@ def test_chunks_do_not_change_a_map(predictor, monkeypatch):
     assert np.allclose(map_of(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
 
 
-def test_an_interrupt_is_heeded_between_chunks(predictor):
-    def stop(share):
-        raise KeyboardInterrupt
+def test_an_interrupt_is_heeded_between_chunks(predictor, monkeypatch):
+    def slow(*given):
+        time.sleep(0.05)
+        return levels_at(*given)
 
+    monkeypatch.setattr("gsparc.maps.making.levels_at", slow)
+    monkeypatch.setattr("gsparc.maps.making.CHUNK", 20)
+    began = time.perf_counter()
+    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
     with pytest.raises(KeyboardInterrupt):
-        map_of(predictor, step_m=1.0, asked=stop)
+        map_of(predictor, step_m=1.0)
+    assert time.perf_counter() - began < 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["joblib", "ray"])
+def test_a_map_made_elsewhere_is_the_same_bits(predictor, engine, elsewhere):
+    torch.set_num_threads(1)
+    here = map_of(predictor, step_m=1.0)
+    elsewhere(engine)
+    there = map_of(predictor, step_m=1.0)
+    for name in ("power_db", "lower_db", "upper_db", "best_server", "outage"):
+        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
 
 
 def test_stations_by_name_or_number_in_the_order_asked_for(predictor):

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from gsparc.data.errors import DataError
+from gsparc.data.executor import each
 from gsparc.data.files import whole_file
 from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import End, Kind
@@ -68,7 +69,7 @@ def answers(
     row = np.array([row for row, _ in pairs], np.int64)
     number = np.array([-1 if number is None else number for _, number in pairs], np.int64)
     stations = predictor.site.stations
-    parts: list[tuple[np.ndarray, Prediction]] = []
+    blocks: list[tuple[Predictor, np.ndarray]] = []
     silent: list[str] = []
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
@@ -79,13 +80,18 @@ def answers(
                 raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
             silent.append(f"left out: {error}")
             continue
-        for start in range(0, len(chosen), CHUNK):
-            rows = chosen[start : start + CHUNK]
-            ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
-            said = asking.predict(**ends)
-            if not parts:
-                accept(tuple(said.mean.shape[1:]))
-            parts.append((rows, said))
+        blocks += [(asking, rows) for rows in np.split(chosen, range(CHUNK, len(chosen), CHUNK))]
+
+    def predicted(block: int) -> Prediction:
+        asking, rows = blocks[block]
+        ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
+        return asking.predict(**ends)
+
+    parts: list[tuple[np.ndarray, Prediction]] = []
+    for block, said in each(predicted, range(len(blocks)), "blocks of places"):
+        if not parts:
+            accept(tuple(said.mean.shape[1:]))
+        parts.append((blocks[block][1], said))
     if not parts:
         raise DataError(silent[0])
     rows = np.concatenate([rows for rows, _ in parts])

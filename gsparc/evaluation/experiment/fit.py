@@ -13,6 +13,7 @@ from hydra.utils import instantiate
 from lightning import Callback, Trainer
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.executor import each, elsewhere
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
@@ -122,21 +123,25 @@ def fit_and_score(
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
-    methods, seconds, processor, notes = [], [], [], []
-    limited: Clock | None = None
-    cost = NO_COST
-    for number, fold in enumerate(split.folds):
+    # Loggers and loaders of a run are of its process: elsewhere a fold has neither curves nor a DataModule.
+    left = {"loggers": (), "datamodule": None} if elsewhere() and len(split.folds) > 1 else {}
+    contexts = [replace(context(number), **left) for number in range(len(split.folds))]
+
+    def fitted(number: int) -> tuple[Method, FitReport, float]:
+        fold = split.folds[number]
         there, rows = (data, fold) if learned is None else learned(data, fold)
-        method, settings = for_links(make, there), context(number)
-        before = time.process_time()
-        report = parts.fit(method, there, rows, settings)
-        processor.append(time.process_time() - before)
-        seconds.append(report.seconds)
-        limited = less_repeatable(limited, report.limited_by)
-        cost += report.cost
-        notes += [note for note in report.notes if number == 0]
-        methods.append(method)
+        method, before = for_links(make, there), time.process_time()
+        report = parts.fit(method, there, rows, contexts[number])
+        return method, report, time.process_time() - before
+
+    found: dict[int, tuple[Method, FitReport, float]] = {}
+    for number, one in each(fitted, range(len(split.folds)), "folds"):
+        found[number] = one
         if keep is not None:
-            keep(number, method, report)
-    found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes), limited, cost)
-    return found if eval_on is None else found.scored_on(data, split, eval_on)
+            keep(number, *one[:2])
+    methods, reports, processor = zip(*(found[number] for number in sorted(found)), strict=True)
+    fits = Outcome(
+        methods, tuple(one.seconds for one in reports), processor, {}, 0.0, reports[0].notes,
+        less_repeatable(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
+    )  # fmt: skip
+    return fits if eval_on is None else fits.scored_on(data, split, eval_on)
