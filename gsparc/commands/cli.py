@@ -21,7 +21,7 @@ from gsparc.commands.plugins import offer, offer_scenes
 from gsparc.commands.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, one_line
 
-LAUNCHERS = ("submitit.", "joblib.externals.loky.")  # where their errors are defined
+LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
 
 
 class _Failed(BaseException):

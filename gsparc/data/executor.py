@@ -11,7 +11,7 @@ import os
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
@@ -56,11 +56,7 @@ _chosen = Engine()
 
 
 def use(engine: Engine) -> None:
-    """Choose it for this process; pieces do theirs where they are.
-
-    Raises:
-        SettingError: it needs a package that is not there.
-    """
+    """Choose it for this process, or `SettingError`: Ray is not there."""
     global _chosen
     if engine.engine == "ray":
         _ray()
@@ -99,29 +95,24 @@ def each(
     costs, ended = [cost(piece) for piece in pieces], 0.0
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
     began = said = time.monotonic()
-    if _chosen.engine == "process" and threads == 1:
-        found: Generator[tuple[int, Any]] = ((number, work(pieces[number])) for number in numbers)
-    elif _chosen.engine == "process":
-        calls = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
-        found = _jobs(calls, threads, "threading")
+    if not elsewhere():
+        here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
+        found: Any = (
+            (call(number) for call, number in here) if threads == 1 else _jobs(here, threads, "threading")
+        )
     else:
         blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
         found = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
     with closing(found):  # what has begun is cancelled
         for count, (number, result) in enumerate(found, 1):
-            if isinstance(result, _Raised):
-                raise result.error
+            if isinstance(result, Exception):
+                raise result
             ended += costs[number]
             if what and time.monotonic() - said > SAY_S:
                 said = time.monotonic()
                 left = (time.monotonic() - began) * (sum(costs) / max(ended, 1e-9) - 1)
-                log.info("%d of %d %s, about %s left", count, len(pieces), what, _duration(left))
+                log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
             yield number, result
-
-
-@dataclass(frozen=True)
-class _Raised:
-    error: Exception
 
 
 @lru_cache(maxsize=1)
@@ -139,13 +130,12 @@ def _piece(where: list[Any], number: int, piece: Any) -> tuple[int, Any]:
     try:
         return number, _read(*where)(piece)
     except Exception as error:  # as it is, not in an error of the engine: the command says it in one line
-        return number, _Raised(error)
+        return number, error
 
 
 def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Iterator[tuple[int, Any]]:
-    jobs = joblib.Parallel(
-        workers, backend, return_as="generator_unordered", pre_dispatch=workers, batch_size=1, max_nbytes=None
-    )
+    how: dict[str, Any] = {"pre_dispatch": workers, "batch_size": 1, "max_nbytes": None}
+    jobs = joblib.Parallel(workers, backend, return_as="generator_unordered", **how)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
         yield from jobs(joblib.delayed(call)(*given) for call, *given in calls)
@@ -173,13 +163,10 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
                 lost.update(list(begun))
                 if max(lost.values(), default=TRIES) >= TRIES:
                     raise
-                log.warning(
-                    "what a process did that died is begun again (%s)", reason(error).partition(". ")[0]
-                )
+                log.warning("begun again: what a process did that died (%s)", reason(error).split(". ")[0])
 
 
 def _ray() -> Any:
-    """Ray, connected."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray
@@ -205,7 +192,3 @@ def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Itera
     finally:
         for one in running:
             ray.cancel(one, force=True)
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

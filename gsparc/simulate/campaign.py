@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -119,22 +118,24 @@ class _Tracing:
     effects: Effects
     shards: Shards
     survey: Survey | None
+    compiled: bool = False
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "survey": None}
 
-    def __call__(self, shard: tuple[int, np.ndarray]) -> tuple[int, float]:
-        """Process, and its CPU seconds of a row; NaN where the shard is there."""
+    def __call__(self, shard: tuple[int, np.ndarray]) -> float:
+        """CPU seconds of a row, once compiled; NaN of a process's first shard, or where the shard is there."""
         (number, rows), begin, busy = shard, time.perf_counter(), deciding.busy_s()
         if self.shards.path(number).exists():
-            return os.getpid(), math.nan
+            return math.nan
         if self.survey is None:
             self.survey = build(self.campaign.scene, self.campaign.sampling)
         paths = self.survey.trace(rows, self.effects)
         spent = (deciding.busy_s() - busy) / len(rows)
         made = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
         self.shards.put(number, {**made, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
-        return os.getpid(), spent
+        first, self.compiled = not self.compiled, True
+        return math.nan if first else spent
 
 
 def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Shards) -> float | None:
@@ -144,17 +145,13 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Sha
         CPU seconds of a row, once compiled; None where too few were traced.
     """
     left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
-    parts = list(enumerate(np.split(left, range(campaign.shard, len(left), campaign.shard)), 1))
-    missing = [(n, rows) for n, rows in parts if len(rows) and not shards.path(n).exists()]
+    parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]
+    missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]
     if len(missing) < len(parts):
         log.info("%d of %d shards are there already", len(parts) - len(missing), len(parts))
     work = _Tracing(campaign, effects, shards, survey)
-    first, warm = set[int](), []
-    for _, (process, spent) in each(work, missing, "shards", cost=lambda shard: len(shard[1])):
-        if process in first:
-            warm.append(spent)
-        first.add(process)
-    return float(np.nanmean(warm)) if warm else None
+    spent = [row_s for _, row_s in each(work, missing, "shards", cost=lambda shard: len(shard[1]))]
+    return float(np.nanmean(spent)) if np.isfinite(spent).any() else None
 
 
 def _decided_on(shards: Shards) -> np.ndarray:
