@@ -124,7 +124,7 @@ class _Tracing:
         return {**vars(self), "survey": None}
 
     def __call__(self, shard: tuple[int, np.ndarray]) -> float:
-        """CPU seconds of a row, once compiled; NaN of a process's first shard, or where the shard is there."""
+        """CPU seconds of a row; NaN of a process's first shard, which compiles, or of one that is there."""
         (number, rows), begin, busy = shard, time.perf_counter(), deciding.busy_s()
         if self.shards.path(number).exists():
             return math.nan

@@ -36,7 +36,7 @@ def ended(folder: Path) -> dict[Path, int]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_a_killed_job_is_gone_on_with_and_nothing_is_done_twice(tmp_path, launcher):
     package = f"hydra_{launcher.partition('_')[0]}_launcher"
     pytest.importorskip(f"hydra_plugins.{package}", reason=f"{package} is not installed")
