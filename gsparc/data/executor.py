@@ -180,7 +180,8 @@ def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Itera
     if not ray.is_initialized():
         ray.init(_chosen.address, include_dashboard=False, logging_level="error", log_to_driver=False)
     call = ray.remote(num_cpus=threads, max_retries=TRIES)(_piece)
-    stored, running = ray.put(blob), []
+    stored = ray.put(blob)
+    running: list[Any] = []
     try:
         while True:
             most = _chosen.workers or max(int(ray.cluster_resources().get("CPU", 1)) // threads, 1)

@@ -124,7 +124,7 @@ def fit_and_score(
         RuntimeError: training diverged.
     """
     # Loggers and loaders of a run are of its process: elsewhere a fold has neither curves nor a DataModule.
-    left = {"loggers": (), "datamodule": None} if elsewhere() and len(split.folds) > 1 else {}
+    left: dict[str, Any] = {"loggers": (), "datamodule": None} if elsewhere() and len(split.folds) > 1 else {}
     contexts = [replace(context(number), **left) for number in range(len(split.folds))]
 
     def fitted(number: int) -> tuple[Method, FitReport, float]:
