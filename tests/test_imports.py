@@ -29,7 +29,7 @@ ARROWS = {
     "field": "data ops physics processes",
     "training": "data field ops processes",
     "models": "data field ops physics processes simulate training",
-    "prediction": "data locate models ops processes training",
+    "prediction": "data field locate models ops physics processes training",
     "locate": "data models ops processes training",
     "evaluation": "conf data locate models prediction simulate training",
     "maps": "data evaluation models prediction processes training",

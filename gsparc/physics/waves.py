@@ -55,7 +55,7 @@ def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = 
     """
     frequency = _double(frequency_hz, distance)
     tones = len(frequency)
-    if tones < 6 or not _evenly_spaced(frequency):
+    if tones < 6 or not evenly_spaced(frequency):
         return wave(distance[..., None], frequency, dtype)
     fine = math.isqrt(tones - 1) + 1
     coarse = wave(distance[..., None], frequency[::fine], dtype)
@@ -65,7 +65,8 @@ def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = 
     return (coarse[..., :, None] * comb[..., None, :]).flatten(-2)[..., :tones]
 
 
-def _evenly_spaced(frequency: Tensor) -> bool:
+def evenly_spaced(frequency: Tensor) -> bool:
+    """Whether tones (F,) [Hz] are a comb."""
     step = frequency.diff()
     # A thousandth of a radian over a kilometre of range: 50 Hz
     return bool(((step - step.mean()).abs().cumsum(0) < 50.0).all())

@@ -56,6 +56,13 @@ class Neighbourhood:
         """Of all places."""
         return cKDTree(self.places)
 
+    def shares(self, most: int) -> list[tuple[np.ndarray, int]]:
+        """Rows (m,) of each set, the densest first, and how many of `most` neighbours are of it."""
+        sparser = len(self._trees) - 1
+        share = int(most * WIDER) // max(sparser, 1)
+        counts = [most - share * sparser, *[share] * sparser]
+        return [(own, count) for (own, _), count in zip(self._trees[::-1], counts, strict=True)]
+
     def nearest(
         self, queries: np.ndarray, without: np.ndarray | None = None, most: int = NEIGHBOURS
     ) -> np.ndarray:
@@ -67,12 +74,9 @@ class Neighbourhood:
                 alone there is then no neighbour.
             most: neighbours.
         """
-        sparser = len(self._trees) - 1
-        share = int(most * WIDER) // max(sparser, 1)
         found: list[np.ndarray] = []
-        for own, tree in self._trees[::-1]:
-            count = share if found else most - share * sparser
-            more = 0 if without is None else 1
+        more = 0 if without is None else 1
+        for (own, count), (_, tree) in zip(self.shares(most), self._trees[::-1], strict=True):
             row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if without is not None:
                 later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]

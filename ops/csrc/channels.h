@@ -16,6 +16,7 @@ template <class S> struct ChannelArgs {
     double first, step;             // frequencies [Hz]
     const S *gains, *steering;      // (B, N, 2), (N, A, 2); complex numbers are pairs
     const double* delays;           // (N,) [s]
+    ChannelArgs() = default;
     ChannelArgs(const Call& call, Reader& in) : threads(call.threads), first(call.numbers[0]), step(call.numbers[1]) {
         in.sizes(samples, count, antennas, subcarriers);
         in.read(gains, steering, delays);
@@ -58,9 +59,11 @@ template <class S> inline void tones(const ChannelArgs<S>& a, double delay, S* o
     for (int k = filled; k < n; ++k) lanes[k] = {0, 0};
     for (int k = 0; k < n; ++k) out[k] = S(lanes[k].re), out[padded + k] = S(lanes[k].im);
     const Vec<S> re = splat(S(step.re)), im = splat(S(step.im));  // of n subcarriers
+    Vec<S> x = load(out), y = load(out + padded);
     for (int k = n; k < padded; k += n) {
-        const Vec<S> x = load(out + k - n), y = load(out + padded + k - n);
-        store(out + k, fma(re, x, -(im * y))), store(out + padded + k, fma(re, y, im * x));
+        const Vec<S> before = x;
+        x = fma(re, x, -(im * y)), y = fma(re, y, im * before);
+        store(out + k, x), store(out + padded + k, y);
     }
 }
 

@@ -8,6 +8,7 @@
 #include "project.h"
 #include "query.h"
 #include "similarity.h"
+#include "thaw.h"
 #include "machine_limits.h"
 
 namespace gsparc {

@@ -3,6 +3,7 @@
 #include <math.h>
 
 #include "kernels.h"
+#include "scratch.h"
 #include "simd.h"
 #include "strips.h"
 
@@ -77,53 +78,78 @@ template <class S> struct Correlation {
 
 template <class S> inline int whole_lanes(int count) { return (count + Lanes<S>::n - 1) / Lanes<S>::n * Lanes<S>::n; }
 
+// Features of a process at places: correlations with anchors, whitened; see processes/features.py.
+template <class S> struct Features {
+    int axes, anchors, count;
+    Correlation<S> kernel;
+    const S *at, *whitening;  // (E, D), (E, F)
+
+    // Into `to` (F,); returns the share that they leave unknown. `scratch` has room for twice the anchors in whole lanes.
+    S of(const S* place, S* to, S* scratch) const {
+        const int padded = whole_lanes<S>(anchors);
+        for (int e = 0; e < padded; ++e) scratch[e] = e < anchors ? distance(place, at + e * axes, axes) : S(0);
+        kernel.apply(scratch, anchors, scratch + padded);
+        combined<S>(scratch, whitening, anchors, count, nullptr, to);
+        double known = 0;
+        for (int f = 0; f < count; ++f) known += double(to[f]) * to[f];
+        return known > 1 ? S(0) : S(1 - known);
+    }
+};
+
 // Places to spectra of a static array: features of a process, vectors linear in them, lag numbers, harmonics of each row
 // of pixels, pixels. See physics/bartlett.py for the tables.
 template <class S> struct ArraySpectrumArgs {
-    int samples, axes, anchors, features, elements, height, columns, lags[2], waves[2], threads;
-    Correlation<S> kernel;
-    const S *places, *at, *whitening, *weights, *offset;  // (B, D), (E, D), (E, F), (F, 2 M + 2), (2 M + 2,)
+    int samples, elements, height, columns, lags[2], waves[2], threads;
+    Features<S> process;
+    const S *places, *weights, *offset;                   // (B, D), (F, 2 M + 2), (2 M + 2,)
     const S* pairs;                                       // (2 M M, all lag numbers)
     const S *table[2], *wave[2];                          // (lags, H K), (K, columns); the second absent: no half turn
     const S* square;                                      // (H, W) of the background
     S *image, *unknown;                                   // (B, H, W), (B,)
+    ArraySpectrumArgs() = default;
     explicit ArraySpectrumArgs(const Call& call) : threads(call.threads) {
         Reader in(call);
-        in.sizes(samples, axes, anchors, features, elements, height, columns, lags[0], waves[0], lags[1], waves[1]);
-        in.read(places, at, whitening, weights, offset, pairs, table[0], wave[0], table[1], wave[1], square, image, unknown);
-        kernel = {S(call.numbers[0]), S(call.numbers[1]), {S(call.numbers[2])}, {S(call.numbers[3])}, 1};
+        in.sizes(samples, process.axes, process.anchors, process.count, elements, height, columns, lags[0], waves[0], lags[1], waves[1]);
+        in.read(places, process.at, process.whitening, weights, offset, pairs, table[0], wave[0], table[1], wave[1], square, image, unknown);
+        process.kernel = {S(call.numbers[0]), S(call.numbers[1]), {S(call.numbers[2])}, {S(call.numbers[3])}, 1};
     }
 };
 
-template <class S> void array_spectrum_of(const ArraySpectrumArgs<S>& a, int sample) {
+template <class S> struct ArraySpectrumMemory {
+    S *encoded, *features, *vector, *products, *numbers, *harmonics, *row;
+    ArraySpectrumMemory(const ArraySpectrumArgs<S>& a, Scratch& in) {
+        encoded = in.take<S>(2 * whole_lanes<S>(a.process.anchors)), features = in.take<S>(a.process.count), vector = in.take<S>(2 * a.elements + 2);
+        products = in.take<S>(2 * a.elements * a.elements), numbers = in.take<S>(a.lags[0] + a.lags[1]);
+        harmonics = in.take<S>(int64_t(a.height) * (a.waves[0] + a.waves[1])), row = in.take<S>(2 * a.columns);
+    }
+};
+
+template <class S> void array_spectrum_of(const ArraySpectrumArgs<S>& a, int sample, Scratch scratch) {
     constexpr S tiny = S(1e-9);
-    const int m = a.elements, padded = whole_lanes<S>(a.anchors), parts = 2 * m + 2;
-    Buffer<S> encoded(2 * padded), features(a.features), vector(parts), products(2 * m * m);
-    for (int e = 0; e < a.anchors; ++e) encoded[e] = distance(a.places + sample * a.axes, a.at + e * a.axes, a.axes);
-    a.kernel.apply(encoded.data, a.anchors, encoded.data + padded);
-    combined<S>(encoded.data, a.whitening, a.anchors, a.features, nullptr, features.data);
-    combined<S>(features.data, a.weights, a.features, parts, a.offset, vector.data);
-    double known = 0;
-    for (int f = 0; f < a.features; ++f) known += double(features[f]) * features[f];
-    const S share = known > 1 ? S(0) : S(1 - known);
+    const int m = a.elements, parts = 2 * m + 2;
+    const ArraySpectrumMemory<S> own(a, scratch);
+    S *const vector = own.vector, *const products = own.products;
+    const S share = a.process.of(a.places + int64_t(sample) * a.process.axes, own.features, own.encoded);
     a.unknown[sample] = share;
+    combined<S>(own.features, a.weights, a.process.count, parts, a.offset, vector);
     for (int i = 0; i < m; ++i)
         for (int j = 0; j < m; ++j) {
-            const S *p = vector.data + 2 * i, *q = vector.data + 2 * j;
+            const S *p = vector + 2 * i, *q = vector + 2 * j;
             products[2 * (i * m + j)] = p[0] * q[0] + p[1] * q[1];
             products[2 * (i * m + j) + 1] = p[1] * q[0] - p[0] * q[1];
         }
-    const int lags = a.lags[0] + a.lags[1], width = a.wave[1] ? 2 * a.columns : a.columns;
+    const int width = a.wave[1] ? 2 * a.columns : a.columns;
     const int64_t sizes[2] = {int64_t(a.height) * a.waves[0], int64_t(a.height) * a.waves[1]};
-    Buffer<S> numbers(lags), harmonics(sizes[0] + sizes[1]), row(2 * a.columns);
-    combined<S>(products.data, a.pairs, 2 * m * m, lags, nullptr, numbers.data);
-    combined<S>(numbers.data, a.table[0], a.lags[0], sizes[0], nullptr, harmonics.data);
-    if (a.wave[1]) combined<S>(numbers.data + a.lags[0], a.table[1], a.lags[1], sizes[1], nullptr, harmonics.data + sizes[0]);
+    S *const numbers = own.numbers, *const harmonics = own.harmonics;
+    if (!a.wave[1]) for (int x = 0; x < a.columns; ++x) own.row[a.columns + x] = 0;  // nothing flips
+    combined<S>(products, a.pairs, 2 * m * m, a.lags[0] + a.lags[1], nullptr, numbers);
+    combined<S>(numbers, a.table[0], a.lags[0], sizes[0], nullptr, harmonics);
+    if (a.wave[1]) combined<S>(numbers + a.lags[0], a.table[1], a.lags[1], sizes[1], nullptr, harmonics + sizes[0]);
     for (int y = 0; y < a.height; ++y) {
         const S* square = a.square + int64_t(y) * width;
-        S *stays = row.data, *flips = row.data + a.columns, *out = a.image + (int64_t(sample) * a.height + y) * width;
-        combined<S>(harmonics.data + int64_t(y) * a.waves[0], a.wave[0], a.waves[0], a.columns, nullptr, stays);
-        if (a.wave[1]) combined<S>(harmonics.data + sizes[0] + int64_t(y) * a.waves[1], a.wave[1], a.waves[1], a.columns, nullptr, flips);
+        S *stays = own.row, *flips = own.row + a.columns, *out = a.image + (int64_t(sample) * a.height + y) * width;
+        combined<S>(harmonics + int64_t(y) * a.waves[0], a.wave[0], a.waves[0], a.columns, nullptr, stays);
+        if (a.wave[1]) combined<S>(harmonics + sizes[0] + int64_t(y) * a.waves[1], a.wave[1], a.waves[1], a.columns, nullptr, flips);
         const auto put = [&](S value, int x) {
             value += share * square[x];
             value = value < tiny ? tiny : value;
@@ -136,7 +162,9 @@ template <class S> void array_spectrum_of(const ArraySpectrumArgs<S>& a, int sam
 
 template <class S> int64_t array_spectrum(const Call& call) {
     const ArraySpectrumArgs<S> a(call);
-    auto run = [&](int sample, int) { array_spectrum_of(a, sample); };
+    const int64_t bytes = bytes_of<ArraySpectrumMemory<S>>(a);
+    Workspace<char> memory(bytes * a.threads);
+    auto run = [&](int sample, int worker) { array_spectrum_of(a, sample, Scratch{uintptr_t(memory.data + worker * bytes)}); };
     parallel_for(a.samples, a.threads, run);
     return 0;
 }
@@ -149,6 +177,7 @@ template <class S> struct NearestArgs {
     const S *queries, *places, *noise;  // (B, D), (n, D), (n,)
     const int64_t* rows;                // (B, k)
     S *weights, *known;                 // (B, k), (B,)
+    NearestArgs() = default;
     explicit NearestArgs(const Call& call) : threads(call.threads) {
         Reader in(call);
         const double* v = call.numbers;
@@ -158,33 +187,45 @@ template <class S> struct NearestArgs {
     }
 };
 
+template <class S> struct NearestMemory {
+    S *lower, *cross, *correlated, *white;
+    NearestMemory(const NearestArgs<S>& a, Scratch& in) {
+        const int stride = whole_lanes<S>(a.near);
+        lower = in.take<S>(int64_t(a.near) * stride), cross = in.take<S>(stride);
+        correlated = in.take<S>(stride), white = in.take<S>(stride);
+    }
+};
+
 // False where the rows' covariance has no Cholesky factor.
-template <class S> bool nearest_weights_of(const NearestArgs<S>& a, int sample) {
+template <class S> bool nearest_weights_of(const NearestArgs<S>& a, int sample, Scratch scratch) {
     const int k = a.near, stride = whole_lanes<S>(k);
-    Buffer<S> lower(int64_t(k) * stride), cross(stride), scratch(stride), white(stride);
+    const NearestMemory<S> memory(a, scratch);
+    S *const cross = memory.cross, *const white = memory.white;
     const int64_t* rows = a.rows + int64_t(sample) * k;
     const S* query = a.queries + int64_t(sample) * a.axes;
+    for (int i = k; i < stride; ++i) cross[i] = 0;
     for (int i = 0; i < k; ++i) cross[i] = distance(query, a.places + rows[i] * a.axes, a.axes);
-    a.kernel.apply(cross.data, k, scratch.data);
+    a.kernel.apply(cross, k, memory.correlated);
     double known = 0;
     for (int i = 0; i < k; ++i) {  // row by row: of L its part left of the diagonal, then the diagonal
-        S* own = lower.data + int64_t(i) * stride;
+        S* own = memory.lower + int64_t(i) * stride;
         for (int j = 0; j < i; ++j) own[j] = distance(a.places + rows[i] * a.axes, a.places + rows[j] * a.axes, a.axes);
-        a.kernel.apply(own, i, scratch.data);
+        for (int j = i; j < whole_lanes<S>(i); ++j) own[j] = 0;
+        a.kernel.apply(own, i, memory.correlated);
         for (int j = 0; j < i; ++j) {
-            const S* other = lower.data + int64_t(j) * stride;
+            const S* other = memory.lower + int64_t(j) * stride;
             own[j] = (own[j] - dot(own, other, j)) / other[j];
         }
         const S left = S(1) + a.noise[rows[i]] - dot(own, own, i);
         if (!(left > 0)) return false;
         own[i] = sqrt(left);
-        white[i] = (cross[i] - dot(own, white.data, i)) / own[i];
+        white[i] = (cross[i] - dot(own, white, i)) / own[i];
         known += double(white[i]) * white[i];
     }
     a.known[sample] = S(known);
     S* weights = a.weights + int64_t(sample) * k;
     for (int i = k - 1; i >= 0; --i) {  // L^T weights = white, by columns of L^T
-        const S* own = lower.data + int64_t(i) * stride;
+        const S* own = memory.lower + int64_t(i) * stride;
         weights[i] = white[i] / own[i];
         for (int j = 0; j < i; ++j) white[j] -= own[j] * weights[i];
     }
@@ -195,7 +236,11 @@ template <class S> bool nearest_weights_of(const NearestArgs<S>& a, int sample) 
 template <class S> int64_t nearest_weights(const Call& call) {
     const NearestArgs<S> a(call);
     Buffer<bool> failed(a.samples);
-    auto run = [&](int sample, int) { failed[sample] = !nearest_weights_of(a, sample); };
+    const int64_t bytes = bytes_of<NearestMemory<S>>(a);
+    Workspace<char> memory(bytes * a.threads);
+    auto run = [&](int sample, int worker) {
+        failed[sample] = !nearest_weights_of(a, sample, Scratch{uintptr_t(memory.data + worker * bytes)});
+    };
     parallel_for(a.samples, a.threads, run);
     for (int sample = 0; sample < a.samples; ++sample)
         if (failed[sample]) return sample;

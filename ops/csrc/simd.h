@@ -152,6 +152,18 @@ template <> GSPARC_INLINE Vec<float> lesser<float>(Vec<float> a, Vec<float> b) {
 template <> GSPARC_INLINE Vec<float> greater<float>(Vec<float> a, Vec<float> b) { return (Vec<float>)_mm256_max_ps((__m256)a, (__m256)b); }
 #endif
 
+template <class S> GSPARC_INLINE Vec<S> square_root(Vec<S> x) {
+    for (int i = 0; i < Lanes<S>::n; ++i) x[i] = __builtin_sqrt(x[i]);
+    return x;
+}
+#if defined(__AVX512F__)
+template <> GSPARC_INLINE Vec<float> square_root<float>(Vec<float> x) { return (Vec<float>)_mm512_sqrt_ps((__m512)x); }
+template <> GSPARC_INLINE Vec<double> square_root<double>(Vec<double> x) { return (Vec<double>)_mm512_sqrt_pd((__m512d)x); }
+#elif defined(__AVX2__)
+template <> GSPARC_INLINE Vec<float> square_root<float>(Vec<float> x) { return (Vec<float>)_mm256_sqrt_ps((__m256)x); }
+template <> GSPARC_INLINE Vec<double> square_root<double>(Vec<double> x) { return (Vec<double>)_mm256_sqrt_pd((__m256d)x); }
+#endif
+
 GSPARC_INLINE Vec<float> magnitude(Vec<float> x) { return (Vec<float>)((Int<float>)x & 0x7fffffff); }
 GSPARC_INLINE Vec<double> magnitude(Vec<double> x) { return (Vec<double>)((Int<double>)x & 0x7fffffffffffffff); }
 

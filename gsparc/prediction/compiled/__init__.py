@@ -1,0 +1,1 @@
+"""A trained field as the file that `ops/csrc/field` answers from, without Python."""

@@ -1,0 +1,64 @@
+"""The file of a compiled field: named arrays, a version and a checksum; `ops/csrc/field/blob.cpp` reads it."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.data.files import whole_file
+from gsparc.prediction.predictor import Predictor
+
+MAGIC, VERSION, LINE = b"GSPARC\r\n", 1, 64
+TYPES = {np.dtype(t): i for i, t in enumerate((np.float32, np.float64, np.int32, np.int64))}
+HEAD, SECTION = struct.Struct("<8sIIqq"), struct.Struct("<24sIIqq")
+CHECKED = 16  # bytes before those that the checksum is of
+
+
+@dataclass(frozen=True)
+class Form:
+    """One of the forms that are compiled.
+
+    Attributes:
+        kind: 1 an array's spectrum, 2 a frozen image, 3 sources, 4 a process of powers.
+        numbers: sizes and parameters, in the order in which the form's constructor reads them.
+        arrays: by name, contiguous, of a type in `TYPES`.
+        predictor: answers as the form does, for its error; None: the model itself does.
+    """
+
+    kind: int
+    numbers: list[float]
+    arrays: dict[str, np.ndarray] = field(repr=False)
+    predictor: Predictor | None = None
+
+
+def packed(form: Form, origin: np.ndarray, error: float) -> bytes:
+    """The file's bytes.
+
+    Args:
+        form: as made.
+        origin: (3,) [m] of its places in the world.
+        error: of the form against the model, of the root mean square of the model's answers.
+    """
+    numbers = np.array([form.kind, error, *origin, *form.numbers], np.float64)
+    arrays = {"numbers": numbers, **{name: value for name, value in form.arrays.items() if value.size}}
+    at = HEAD.size + SECTION.size * len(arrays)
+    table, body = [], []
+    for name, value in arrays.items():
+        gap = -at % LINE
+        body += [bytes(gap), np.ascontiguousarray(value).tobytes()]
+        table.append(SECTION.pack(name.encode(), TYPES[value.dtype], 0, at + gap, value.size))
+        at += gap + value.nbytes
+    checked = struct.pack("<qq", at, len(arrays)) + b"".join([*table, *body])
+    return HEAD.pack(MAGIC, VERSION, zlib.crc32(checked), at, len(arrays))[:CHECKED] + checked
+
+
+def write(path: Path, form: Form, origin: np.ndarray, error: float) -> int:
+    """Write `packed` whole or not at all; returns its bytes."""
+    found = packed(form, origin, error)
+    with whole_file(path) as partial:
+        partial.write_bytes(found)
+    return len(found)

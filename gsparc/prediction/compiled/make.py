@@ -1,0 +1,217 @@
+"""Which compiled form a model is, exactly or distilled, and how far its answers are from the model's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.field.frozen import FrozenArray, FrozenView
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.image_sources.clutter.blocking import Clutter
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.phased_gp import PhasedPosterior
+from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.rows import gather
+from gsparc.models.method import Method
+from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.per_station import PerStation
+from gsparc.models.planned_field import PlannedField
+from gsparc.models.powers.field import PowerField
+from gsparc.models.splat.method import LearnedField
+from gsparc.ops import Pose
+from gsparc.prediction.compiled.blob import Form
+from gsparc.prediction.compiled.channels import sources_form
+from gsparc.prediction.compiled.powers import powers_form
+from gsparc.prediction.compiled.spectra import array_form, process_form, view_form
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
+
+ANSWERED = {"spectrum": 400, "csi": 600, "rssi": 3_000}  # places whose answers a distilled form is made from
+KEPT = 96  # components of spectra: what a query reads grows with them
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A form and how far it is from its model.
+
+    Attributes:
+        form: to be written.
+        error: root mean square difference at random places, of that of the model's answers; 0 where they are the same.
+        said: in words, for people.
+    """
+
+    form: Form
+    error: float
+    said: str
+
+
+def compiled(predictor: Predictor, count: int = 256, seed: int = 0) -> Compiled:
+    """The form of a model of one station.
+
+    Args:
+        predictor: of the model.
+        count: random places that a distilled form's error is measured at.
+        seed: of places.
+
+    Raises:
+        ValueError: no form answers as this model does, or it is of several stations.
+    """
+    method, site = predictor.method, predictor.site
+    if isinstance(method, PerStation):
+        assert site.stations is not None
+        raise ValueError(f"station= is needed, one of {', '.join(site.stations.name)}")
+    if site.static_end is None and site.kind != "rssi":
+        raise ValueError(f"{method.name} of two moving ends has no compiled form; only powers have")
+    exact = exact_form(method, site)
+    if exact is not None:
+        return Compiled(exact, 0.0, f"{_NAMES[exact.kind]}, exactly")
+    form = distilled_form(predictor, seed)
+    assert form.predictor is not None
+    places = random_places(site, count, seed + 1)
+    own, whole = (answers(one, places) for one in (form.predictor, predictor))
+    error = float(np.sqrt(np.mean(np.abs(own - whole) ** 2) / np.mean(np.abs(whole) ** 2)))
+    said = f"{_NAMES[form.kind]}, distilled: {error:.2%} of the answers' root mean square from {method.name}"
+    if site.kind == "rssi":
+        apart = 10 * np.log10(np.maximum(own, 1e-30) / np.maximum(whole, 1e-30))
+        said += f", {math.sqrt(float(np.mean(apart**2))):.2g} dB"
+    return Compiled(form, max(error, 1e-12), f"{said} at {count} random places")
+
+
+_NAMES = {1: "an array's spectrum", 2: "a frozen image", 3: "a sum of sources", 4: "a process of powers"}
+
+
+def exact_form(method: Method, site: Site) -> Form | None:
+    """The form whose answers are the model's but for rounding; None where there is none."""
+    if isinstance(method, PlannedField):
+        if method.field is not None:
+            return _of_field(method.field, site)
+        if method._average is not None:
+            return exact_form(method._average[0], site) if not method.size() else None
+    if isinstance(method, LearnedField):
+        return _rendered(method, site)
+    if isinstance(method, GaussianProcess):
+        if method.powers is not None:
+            return powers_form(method.powers, site.target_scale)
+        return process_form(method) if site.kind == "spectrum" else None
+    if isinstance(method, ImageSourceGP):
+        cluttered = any(len(member.scene.clutter) for member in method.members)
+        return None if cluttered else sources_form(method, site, method.query)
+    return None
+
+
+def _of_field(field: Any, site: Site) -> Form | None:
+    """Of a field with weights in closed form."""
+    if isinstance(field, Mixture):
+        parts = list(field.parts())
+        alone = len(parts) == 1 and (field.residual is None or not field.share)
+        return _of_field(parts[0][1], site) if alone else None
+    if isinstance(field, PowerField):
+        plain = field.process is not None and field.fringes is None
+        return powers_form(field.process, site.target_scale) if plain else None
+    method = getattr(field, "method", None)
+    return None if method is None else exact_form(method, site)
+
+
+def _rendered(method: LearnedField, site: Site) -> Form | None:
+    if site.kind != "spectrum" or site.static_position is None:
+        return None
+    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    place = torch.from_numpy(np.asarray(site.static_position, np.float32))
+    frozen = method.frozen_at(Pose(place, torch.from_numpy(np.asarray(rotation, np.float32))))
+    if isinstance(frozen, FrozenArray):
+        return array_form(method.fitted(), frozen)
+    return view_form(frozen) if isinstance(frozen, FrozenView) else None
+
+
+def distilled_form(predictor: Predictor, seed: int) -> Form:
+    """A form near a model: its array's part alone, or a process given its answers at random places.
+
+    Raises:
+        ValueError: channels that are not made of sources.
+    """
+    method, site = predictor.method, predictor.site
+    if isinstance(method, PlannedField) and method.field is None and method._average is not None:
+        found = _rendered(method, site)  # without the process that it is averaged with
+        if found is not None:
+            alone = LearnedField.__new__(type(method))
+            alone.__dict__.update(method.__dict__, _average=None)
+            return replace(found, predictor=Predictor(alone, site))
+    places = random_places(site, ANSWERED[site.kind], seed)
+    data = answered(predictor, places)
+    every = np.arange(len(places))
+    if site.kind == "csi":
+        return _sources_given(_sources_of(method), data)
+    process = GaussianProcess(KEPT)
+    process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
+    form = exact_form(process, site)
+    assert form is not None
+    return replace(form, predictor=Predictor(process, site))
+
+
+def _sources_of(method: Method) -> ImageSourceGP:
+    """The sources of largest weight in a model of channels."""
+    field = getattr(method, "field", None)
+    parts = sorted(field.parts(), key=lambda one: -one[0]) if isinstance(field, Mixture) else [(1.0, field)]
+    for one in [method, *(getattr(part, "method", None) for _, part in parts)]:
+        if isinstance(one, ImageSourceGP):
+            return one
+    raise ValueError(
+        f"{method.name}: channels that are not made of image sources have no compiled form "
+        "(model=image_source_gp is made of them)"
+    )
+
+
+def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
+    """The heaviest search's sources without clutter, their gains given a model's answers."""
+    member = method.members[int(torch.as_tensor(method.weights).argmax())]
+    data = replace(data, target=data.target * method.factors.numpy()[:, None])
+    rows = method.frame.inside(gather(data, np.arange(len(data)), len(data), method.seed))
+    phased = replace(member.phased, scene=replace(member.scene, clutter=Clutter.none()))
+    alone = ImageSourceGP.__new__(ImageSourceGP)
+    alone.__dict__.update(method.__dict__, weights=torch.ones(1))
+    alone.members = [PhasedPosterior(rows, phased, method.noise_floor)]
+    alone.query = Query(alone.members)
+    form = sources_form(alone, data.site, alone.query)
+    return replace(form, predictor=Predictor(alone, data.site))
+
+
+def random_places(site: Site, count: int, seed: int) -> np.ndarray:
+    """Places (count, 3) of what moves, (count, 6) of both ends, local [m], in the box of the measured ones."""
+    low, high = site.moving_box
+    return np.random.default_rng(seed).uniform(low, high, (count, len(low))).astype(np.float32)
+
+
+def answers(predictor: Predictor, places: np.ndarray) -> np.ndarray:
+    """The model's answers (B, ...) in physical units at local places (B, 3) or (B, 6) [m]."""
+    site = predictor.site
+    ends = {site.moving_end: places} if site.static_end else {"tx": places[:, :3], "rx": places[:, 3:]}
+    ask = getattr(predictor, site.kind)
+    found = [
+        ask(**{end: place[i : i + 64].astype(np.float64) + site.origin for end, place in ends.items()})
+        for i in range(0, len(places), 64)
+    ]
+    return np.concatenate(found)
+
+
+def answered(predictor: Predictor, places: np.ndarray) -> Measurements:
+    """Measurements whose targets are the model's answers at local places [m]."""
+    site, count = predictor.site, len(places)
+    still = np.zeros(3) if site.static_position is None else site.static_position
+    tx, rx = (np.broadcast_to(still, (count, 3)) for _ in range(2))
+    if site.static_end is None:
+        tx, rx = places[:, :3], places[:, 3:]
+    elif site.moving_end == "tx":
+        tx = places
+    else:
+        rx = places
+    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    return Measurements(
+        site, tx.astype(np.float64), rx.astype(np.float64), np.broadcast_to(rotation, (count, 3, 3)),
+        answers(predictor, places) / site.target_scale,
+    )  # fmt: skip
