@@ -36,11 +36,13 @@ def task(config: DictConfig) -> dict[str, Any]:
     with whole_folder(out) as folder:
         size = write(folder / "field.gsparc", found.form, np.asarray(predictor.site.origin), found.error)
         shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
-        shutil.copytree(SOURCES, folder / "source", ignore=shutil.ignore_patterns("cuda", "projection", "bindings.cpp"))
+        shutil.copytree(
+            SOURCES, folder / "source", ignore=shutil.ignore_patterns("cuda", "projection", "bindings.cpp")
+        )
     facts = {
         "export/bytes": size, "export/error": found.error, "export/form": found.form.kind,
         "model/name": predictor.method.name, "out": str(out), "ckpt": str(path),
     }  # fmt: skip
-    build = f"cmake -S {out}/source/field -B {out}/build -DCMAKE_BUILD_TYPE=Release && cmake --build {out}/build"
+    build = f"cmake -S {out}/source/field -B {out}/build && cmake --build {out}/build"
     lines = [found.said, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
     return finish(run_directory(), facts, lines=lines, before="summary ")

@@ -39,10 +39,12 @@ template <class S> void combined(const S* by, const S* rows, int count, int64_t 
 
 template <class S> inline S dot(const S* a, const S* b, int count) {
     constexpr int n = Lanes<S>::n;
-    Vec<S> sums = {};
+    Vec<S> sums[4] = {};  // one would wait for itself
     int i = 0;
-    for (; i + n <= count; i += n) sums += load(a + i) * load(b + i);
-    S total = sum<S>(sums);
+    for (; i + 4 * n <= count; i += 4 * n)
+        for (int k = 0; k < 4; ++k) sums[k] = fma(load(a + i + k * n), load(b + i + k * n), sums[k]);
+    for (; i + n <= count; i += n) sums[0] = fma(load(a + i), load(b + i), sums[0]);
+    S total = sum<S>((sums[0] + sums[1]) + (sums[2] + sums[3]));
     for (; i < count; ++i) total += a[i] * b[i];
     return total;
 }

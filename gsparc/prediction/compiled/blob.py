@@ -1,4 +1,4 @@
-"""The file of a compiled field: named arrays, a version and a checksum; `ops/csrc/field/blob.cpp` reads it."""
+"""A compiled field's file: named arrays, a version and a checksum; read by `ops/csrc/field/blob.cpp`."""
 
 from __future__ import annotations
 

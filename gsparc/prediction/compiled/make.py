@@ -32,7 +32,11 @@ from gsparc.prediction.compiled.spectra import array_form, process_form, view_fo
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
-ANSWERED = {"spectrum": 400, "csi": 600, "rssi": 3_000}  # places whose answers a distilled form is made from
+ANSWERED = {
+    "spectrum": 400,
+    "csi": 1_500,
+    "rssi": 3_000,
+}  # places whose answers a distilled form is made from
 KEPT = 96  # components of spectra: what a query reads grows with them
 
 
@@ -42,7 +46,7 @@ class Compiled:
 
     Attributes:
         form: to be written.
-        error: root mean square difference at random places, of that of the model's answers; 0 where they are the same.
+        error: root mean square difference at random places, of that of the answers; 0: none but rounding.
         said: in words, for people.
     """
 
@@ -112,8 +116,9 @@ def _of_field(field: Any, site: Site) -> Form | None:
         alone = len(parts) == 1 and (field.residual is None or not field.share)
         return _of_field(parts[0][1], site) if alone else None
     if isinstance(field, PowerField):
-        plain = field.process is not None and field.fringes is None
-        return powers_form(field.process, site.target_scale) if plain else None
+        if field.process is None or field.fringes is not None:
+            return None
+        return powers_form(field.process, site.target_scale)
     method = getattr(field, "method", None)
     return None if method is None else exact_form(method, site)
 
@@ -182,7 +187,7 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
 
 
 def random_places(site: Site, count: int, seed: int) -> np.ndarray:
-    """Places (count, 3) of what moves, (count, 6) of both ends, local [m], in the box of the measured ones."""
+    """Local places (count, 3) of what moves, (count, 6) of both ends [m], in the box of the measured."""
     low, high = site.moving_box
     return np.random.default_rng(seed).uniform(low, high, (count, len(low))).astype(np.float32)
 

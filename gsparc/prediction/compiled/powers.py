@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
 from gsparc.prediction.compiled.blob import Form
 from gsparc.processes.kernel import Kernel
@@ -50,18 +49,14 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
         whole = posterior.factor.root.numpy()  # type: ignore[union-attr]
         root = whole[np.tril_indices(count)]
     law, lengths, shares = trend.law, [*kernel.lengths, 1.0][:2], [*kernel.shares, 0.0][:2]
-    about = (
-        [trend.level, 0.0, 1.0]
-        if law is None
-        else [law.level, law.exponent, max(law.floor, TINY_M)]
-    )
+    about = [trend.level, 0.0, 1.0] if law is None else [law.level, law.exponent, max(law.floor, TINY_M)]
     beside = np.full((places.shape[1], -(-count // LANES) * LANES), BEYOND)
     beside[:, :count] = places[order].T
     arrays = {
-        "places": places[order], "columns": beside if every else np.zeros(0), "extra": noise.numpy()[order] + JITTER,
-        "values": values.double().numpy()[order], "slopes": columns.numpy()[order], "weighed": weighed.numpy(),
-        "unsure": unsure, "still": np.array([] if law is None or law.place is None else law.place, np.float64),
-        "root": root, "sets": sets, "boxes": boxes,
+        "places": places[order], "columns": beside if every else np.zeros(0),
+        "extra": noise.numpy()[order] + JITTER, "values": values.double().numpy()[order],
+        "slopes": columns.numpy()[order], "weighed": weighed.numpy(), "unsure": unsure, "root": root,
+        "still": np.array([] if law is None else law.place or [], np.float64), "sets": sets, "boxes": boxes,
     }  # fmt: skip
     numbers = [
         places.shape[1], count, sets[:, 1].sum(), len(sets), columns.shape[1], every, given is None, every,

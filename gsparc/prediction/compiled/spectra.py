@@ -25,7 +25,7 @@ def array_form(model: GaussianModel, frozen: FrozenArray) -> Form | None:
     square, sizes = frozen.renderer.square, [len(table) for table in rest]
     numbers = [
         *encoding.anchors.shape[::-1], encoding.width, *parts_of(encoding.length, encoding.kernel),
-        frozen.offset.numel() // 2 - 1, square.shape[0], rest[1].shape[1], *(sizes + [0, 0])[:4],
+        frozen.offset.numel() // 2 - 1, square.shape[0], rest[1].shape[1], *[*sizes, 0, 0][:4],
     ]  # fmt: skip
     names = ("table0", "wave0", "table1", "wave1")
     arrays = {
@@ -56,7 +56,7 @@ def view_form(frozen: FrozenView) -> Form | None:
     arrays = {
         "at": encoding.anchors.double().numpy(), "whitening": encoding.whitening.double().numpy(),
         "weights": emission.weight2.detach()[:, :, 0].T.float().numpy(),
-        "offset": emission.bias2.detach()[:, 0].numpy(), "means": means if needed else np.zeros(0, np.float32),
+        "offset": emission.bias2.detach()[:, 0].numpy(), "means": means if needed else means[:0],
         "starts": starts, "ranks": ranks, "blocks": blocks,
     }  # fmt: skip
     return Form(2, [float(number) for number in numbers], arrays)
@@ -81,8 +81,9 @@ def process_form(process: GaussianProcess) -> Form | None:
     ]  # fmt: skip
     arrays = {
         "at": places, "whitening": weights, "weights": np.eye(count, dtype=np.float32)[1:],
-        "offset": np.eye(1, count, dtype=np.float32)[0], "starts": np.arange(tiles + 1, dtype=np.int64) * count,
-        "ranks": np.tile(np.arange(count, dtype=np.int32), tiles), "blocks": blocks.reshape(-1, ROWS * COLUMNS),
+        "offset": np.eye(1, count, dtype=np.float32)[0], "blocks": blocks.reshape(-1, ROWS * COLUMNS),
+        "starts": np.arange(tiles + 1, dtype=np.int64) * count,
+        "ranks": np.tile(np.arange(count, dtype=np.int32), tiles),
     }  # fmt: skip
     return Form(2, [float(number) for number in numbers], arrays)
 

@@ -58,7 +58,7 @@ struct ImageForm final : Form {
 
     int answer(const float* place, float* values, float* variance, float* unknown, Scratch scratch) const override {
         const Memory own(*this, scratch);
-        double at[6];
+        double at[6] = {};
         for (int axis = 0; axis < process.axes; ++axis) at[axis] = double(place[axis]);
         const float share = float(process.of(at, own.known, own.encoded));
         for (int i = 0; i < process.count; ++i) own.features[i] = float(own.known[i]);

@@ -120,7 +120,7 @@ struct PowersForm final : Form {
     }
 
     int answer(const float* place, float* values_out, float* variance, float* unknown, Scratch scratch) const override {
-        double at[6], terms_here[kMostTerms] = {1};
+        double at[6] = {}, terms_here[kMostTerms] = {1};
         for (int axis = 0; axis < facts.axes; ++axis) at[axis] = double(place[axis]);
         double mean = level;
         if (law) {

@@ -59,7 +59,7 @@ struct SourcesForm final : Form {
         int most = 0;
         for (int i = 0; i < combs; ++i) {
             const double tones = comb[3 * i + 2];
-            if (!(tones >= 1 && tones <= 1 << 20)) refuse("a comb of %g tones", tones);
+            if (!(tones >= 1 && tones <= 1 << 20) || facts.shape[1] > 1 << 20) refuse("a comb of %g tones", tones);
             facts.shape[1] += int(tones), most = tones > most ? int(tones) : most;
         }
         facts.values = 2 * int64_t(facts.shape[0]) * facts.shape[1];

@@ -21,7 +21,8 @@ struct SpectrumForm final : Form {
 
     SpectrumForm(const Blob& blob, Numbers& in) {
         read_features(blob, in, args.process);
-        in.sizes(args.elements, args.height, args.columns, args.lags[0], args.waves[0], args.lags[1], args.waves[1]);
+        args.elements = in.size(4096);
+        in.sizes(args.height, args.columns, args.lags[0], args.waves[0], args.lags[1], args.waves[1]);
         const int64_t parts = 2 * int64_t(args.elements) + 2, lags = int64_t(args.lags[0]) + args.lags[1], height = args.height;
         blob.read("weights", args.weights, args.process.count * parts);
         blob.read("offset", args.offset, parts);
