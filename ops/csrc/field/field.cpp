@@ -40,14 +40,6 @@ std::unique_ptr<gsparc::Form> form_of(const gsparc::Blob& blob) {
     return nullptr;
 }
 
-bool sound(const gsparc::Form& form, const float* place) {
-    for (int axis = 0; axis < form.facts.axes; ++axis)
-        if (!isfinite(place[axis])) return false;
-    return true;
-}
-
-gsparc::Scratch lent(void* scratch) { return {reinterpret_cast<uintptr_t>(scratch)}; }
-
 }  // namespace
 
 #define GSPARC_EXPORT extern "C" __attribute__((visibility("default")))
@@ -89,13 +81,7 @@ GSPARC_EXPORT gsparc_facts gsparc_about(const gsparc_field* field) { return fiel
 GSPARC_EXPORT int gsparc_query(const gsparc_field* field, const float* place, float* values, float* variance, float* unknown,
                                void* scratch) {
     const gsparc::Form& form = *field->form;
-    return sound(form, place) ? form.answer(place, values, variance, unknown, lent(scratch)) : GSPARC_BAD_PLACE;
-}
-
-GSPARC_EXPORT int64_t gsparc_channel_scratch(const gsparc_field* field, int32_t tones) { return field->form->channel_scratch(tones); }
-
-GSPARC_EXPORT int gsparc_channel(const gsparc_field* field, const float* place, double first, double step, int32_t tones,
-                                 float* values, void* scratch) {
-    const gsparc::Form& form = *field->form;
-    return sound(form, place) ? form.channel(place, first, step, tones, values, lent(scratch)) : GSPARC_BAD_PLACE;
+    for (int axis = 0; axis < form.facts.axes; ++axis)
+        if (!isfinite(place[axis])) return GSPARC_BAD_PLACE;
+    return form.answer(place, values, variance, unknown, gsparc::Scratch{reinterpret_cast<uintptr_t>(scratch)});
 }

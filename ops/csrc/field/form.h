@@ -11,8 +11,6 @@ struct Form {
     virtual ~Form() = default;
     // `place` is finite; `variance` and `unknown` may be null.
     virtual int answer(const float* place, float* values, float* variance, float* unknown, Scratch scratch) const = 0;
-    virtual int channel(const float*, double, double, int, float*, Scratch) const { return GSPARC_NO_SOURCES; }
-    virtual int64_t channel_scratch(int) const { return 0; }
 };
 
 }  // namespace gsparc

@@ -18,7 +18,7 @@ extern "C" {
 typedef struct gsparc_field gsparc_field;
 
 enum { GSPARC_SPECTRUM = 1, GSPARC_CHANNEL = 2, GSPARC_POWER = 3 };           /* kinds of values */
-enum { GSPARC_DONE = 0, GSPARC_BAD_PLACE = 1, GSPARC_UNSOLVED = 2, GSPARC_NO_SOURCES = 3 }; /* what calls return */
+enum { GSPARC_DONE = 0, GSPARC_BAD_PLACE = 1, GSPARC_UNSOLVED = 2 }; /* what queries return */
 
 typedef struct {
     int32_t kind;
@@ -40,12 +40,6 @@ gsparc_facts gsparc_about(const gsparc_field* field);
  * `variance`: expected squared error of a power, NaN of others; `unknown`: the share in [0, 1] of what the training rows do
  * not tell, NaN where that is not known. Either may be null, which is quicker. */
 int gsparc_query(const gsparc_field* field, const float* place, float* values, float* variance, float* unknown, void* scratch);
-
-/* A channel at `tones` frequencies first + k step [Hz]: 2 * antennas * tones floats; scratch memory of
- * gsparc_channel_scratch(field, tones) bytes. */
-int gsparc_channel(const gsparc_field* field, const float* place, double first, double step, int32_t tones, float* values,
-                   void* scratch);
-int64_t gsparc_channel_scratch(const gsparc_field* field, int32_t tones);
 
 #ifdef __cplusplus
 }

@@ -63,13 +63,9 @@ struct SourcesForm final : Form {
             facts.shape[1] += int(tones), most = tones > most ? int(tones) : most;
         }
         facts.values = 2 * int64_t(facts.shape[0]) * facts.shape[1];
-        facts.scratch = channel_scratch(most);
-    }
-
-    int64_t channel_scratch(int tones) const override {
         Scratch counted{0};
-        Memory(*this, tones, counted);
-        return int64_t(counted.next);
+        Memory(*this, most, counted);
+        facts.scratch = int64_t(counted.next);
     }
 
     int answer(const float* place, float* values, float* variance, float* unknown, Scratch scratch) const override {
@@ -77,11 +73,6 @@ struct SourcesForm final : Form {
             sum(place, comb[3 * i], comb[3 * i + 1], int(comb[3 * i + 2]), facts.shape[1], at, values, scratch);
         if (variance) *variance = NAN;
         if (unknown) *unknown = NAN;
-        return GSPARC_DONE;
-    }
-
-    int channel(const float* place, double first, double step, int tones, float* values, Scratch scratch) const override {
-        sum(place, first, step, tones, tones, 0, values, scratch);
         return GSPARC_DONE;
     }
 
