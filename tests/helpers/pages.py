@@ -164,6 +164,8 @@ class Tiny:
             if not run.exists():
                 train(compose(*self.line("train", ("dataset=rfid",), run)), run)
             words["init_from"] = str(run / "model.ckpt")
+        if name == "export":
+            words |= {"station": "west", "out": f"{run}-c"}
         if name == "predict":
             words |= {"places": "places.csv", "out": f"{run}.csv"}
         if name == "locate" and words.get("dataset") == "fingerprints":
@@ -192,7 +194,7 @@ class Tiny:
 
 
 # Commands about a model.
-ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link", "locate")
+ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link", "locate", "export")
 ALIKE = {"exp005": "techtile", "exp006": "techtile", "plane": "own", "hall_1": "ble", "hall_2": "ble"}
 SHORT = {"threads": "1"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}

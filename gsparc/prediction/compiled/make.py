@@ -147,11 +147,11 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
             alone = LearnedField.__new__(type(method))
             alone.__dict__.update(method.__dict__, _average=None)
             return replace(found, predictor=Predictor(alone, site))
-    places = random_places(site, ANSWERED[site.kind], seed)
-    data = answered(predictor, places)
-    every = np.arange(len(places))
-    if site.kind == "csi":
-        return _sources_given(_sources_of(method), data)
+    sources = _sources_of(method) if site.kind == "csi" else None
+    data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
+    if sources is not None:
+        return _sources_given(sources, data)
+    every = np.arange(len(data))
     process = GaussianProcess(KEPT)
     process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
     form = exact_form(process, site)
