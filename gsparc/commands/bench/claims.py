@@ -15,7 +15,7 @@ from gsparc.commands.bench.scene import Scene, scene
 from gsparc.ops.projection import Projection
 from gsparc.prediction.timing import ClockSettings
 
-# Of forward / limit: for fewer Gaussians than MANY, and for more. Where it comes from: docs/cpu.md.
+# Of forward / limit: for fewer Gaussians than MANY, and for more. Where it comes from: docs/kernels.md.
 FORWARD: dict[Projection, tuple[float, float]] = {"tangent": (4.0, 5.0), "equirect": (3.0, 4.0)}
 MANY = 25_000
 FROZEN = 1.5  # times the bytes that it must read
