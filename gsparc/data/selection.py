@@ -1,6 +1,6 @@
 """Parts of a campaign: some stations, some runs, powers above a level, fewer rows; what goes is counted.
 
-All work on the arrays of a file (`Raw`, named as in docs/own-data.md) before they are interpreted.
+All work on the arrays of a file (`Raw`, named as in docs/reference/schema.md) before they are interpreted.
 """
 
 from __future__ import annotations
@@ -370,7 +370,7 @@ def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | P
     """Each station of `steps` becomes several of the same place and kind, `NAME`, `NAME from row 1162`, ...
 
     Args:
-        raw: arrays of a file, named as in docs/own-data.md.
+        raw: arrays of a file, named as in docs/reference/schema.md.
         steps: by name or number of a station, the first rows (from 0) after each step.
         source: for messages.
 

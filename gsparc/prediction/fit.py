@@ -54,7 +54,7 @@ def fit(
         seed: of whatever is random.
         save: a checkpoint to write, for `gsparc.load` and all commands.
         settings: arguments of the model's class.
-        **arrays: anything else of the schema of `docs/own-data.md`: `carrier_hz`, `frequency_hz`,
+        **arrays: anything else of the schema of `docs/reference/schema.md`: `carrier_hz`, `frequency_hz`,
             `array_position`, `station_position`, ...
 
     Raises:

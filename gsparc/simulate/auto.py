@@ -18,7 +18,7 @@ from gsparc.simulate.paths import Paths
 log = logging.getLogger(__name__)
 
 # Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
-# street canyon and in the conference room (docs/simulate.md). It ranks sets of effects; what a choice
+# street canyon and in the conference room (docs/results/simulate.md). It ranks sets of effects; what a choice
 # saves is measured on the rows of the file.
 PRICE = {
     "line_of_sight": 0.0, "specular": 0.25, "refraction": 0.0, "diffraction": 0.22, "edge_diffraction": 0.1,

@@ -7,6 +7,7 @@ python tests/grid/sweep.py RESULTS.jsonl --seed 7   # 100 combinations drawn by 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import logging
 import sys
@@ -19,10 +20,9 @@ from judging import Outcome, repeated, run
 from product import PARTS
 from rich.console import Console
 from rich.table import Table
-from worlds import CHOICES, World, covering, drawn, every
+from worlds import World, covering, drawn, every
 
 MANY = 100
-MARK = "<!-- written by tests/grid/sweep.py -->\n"
 
 
 def one(world: World, folder: Path, more: tuple[str, ...]) -> tuple[Outcome, list[str]]:
@@ -59,25 +59,13 @@ def table(lines: list[dict]) -> Table:
     return shown
 
 
-def page(lines: list[dict]) -> str:
-    """All results in Markdown, kind by kind, with the share that is no more than a plain process."""
-    text = ""
-    for kind in CHOICES["kind"]:
-        some = sorted((e for e in lines if e["world"].split("-")[0] == kind), key=lambda e: e["world"])
-        plain = sum(e["plain"] for e in some)
-        text += f"\n### {kind}: {len(some)} combinations, {plain} no more than a plain process\n\n"
-        rows = [HEADS, ["---"] * len(HEADS), *map(cells, some)]
-        text += "".join(f"| {' | '.join(row)} |\n" for row in rows)
-    return text
-
-
 def main() -> int:
     """Exit status 1 where something was refused, behind or did not answer."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("results", type=Path)
     parser.add_argument("--seed", type=int, help="draw 100 combinations instead of the covering set")
     parser.add_argument("--rows", type=int, nargs="+", default=[30, 300, 3000])
-    parser.add_argument("--page", type=Path, help="write the table as Markdown, below what stands there")
+    parser.add_argument("--csv", type=Path, help="write the table, as docs/results/kinds.csv is")
     parser.add_argument("more", nargs="*", help="overrides, such as budget_s=5")
     given = parser.parse_args()
     logging.disable(logging.WARNING)
@@ -100,9 +88,9 @@ def main() -> int:
             file.write(json.dumps(done[-1]) + "\n")
         console.print(f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False)
     console.print(table(done))
-    if given.page is not None:
-        kept = given.page.read_text().partition(MARK)[0] if given.page.exists() else ""
-        given.page.write_text(kept + MARK + page(done))
+    if given.csv is not None:
+        with given.csv.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([HEADS, *map(cells, done)])
     bad = [
         entry
         for entry in done

@@ -103,7 +103,7 @@ def drawn(worlds: list[World], count: int, seed: int) -> Iterator[World]:
 
 
 def arrays(world: World, seed: int) -> dict[str, np.ndarray]:
-    """The measurements of a world as arrays of the schema in docs/own-data.md."""
+    """The measurements of a world as arrays of the schema in docs/reference/schema.md."""
     rng = np.random.default_rng([seed, zlib.crc32(world.name.encode())])
     count = world.stations
     fixed = np.c_[rng.uniform(0.3, 0.7, count) * ROOM[0], [0.2] * count, [2.6] * count]

@@ -35,7 +35,7 @@ class Campaign(DataModule):
     """
 
     choice: ClassVar[str]  # of conf/dataset
-    reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/own-data.md
+    reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Campaign(DataModule):
         self.level_steps = rows_by_station(level_steps or {})
 
     def raw(self) -> Raw:
-        """The file's arrays, named as in docs/own-data.md; `DataError` where they are bad."""
+        """The file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
         return self.reader(self.file, **self.settings)
 
     def load(self) -> Measurements:
