@@ -42,7 +42,7 @@ class Corridor(DataModule):
         self.count = count
 
     def load(self):
-        """Arrays with the names, shapes and units of docs/reference/schema.md become measurements, or are refused."""
+        """Arrays named as in docs/reference/schema.md become measurements, or are refused."""
         rng = np.random.default_rng(0)
         receiver = rng.uniform([1, 0, 1], [60, 2, 2], (self.count, 3))
         transmitter = np.array([0.0, 1.0, 2.5])

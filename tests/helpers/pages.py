@@ -185,6 +185,7 @@ class Tiny:
             only = [f"{key.split('.')[1]}/*/{method}/*" for key in words if key.startswith("datasets.")
                     for method in ("mean", "nearest")]  # fmt: skip
             words |= {"only": f"[{','.join(only)}]", "cells": str(run.parent / "cells"), "latency": "false"}
+            words |= {"splits.blocks_300m.choose": "['split=blocks','split.side_m=5']"}  # a small city
         words |= TINY.get(name, {})
         gsparc = words.get("model", "gsparc") == "gsparc" and words.get("experiment") != "sionna"
         if name in ("train", "study") and gsparc:
@@ -195,7 +196,14 @@ class Tiny:
 
 # Commands about a model.
 ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link", "locate", "export")
-ALIKE = {"exp005": "techtile", "exp006": "techtile", "plane": "own", "hall_1": "ble", "hall_2": "ble"}
+ALIKE = {
+    "city": "powder",
+    "exp005": "techtile",
+    "exp006": "techtile",
+    "plane": "own",
+    "hall_1": "ble",
+    "hall_2": "ble",
+}
 SHORT = {"threads": "1"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
 TINY = {  # what makes each command short

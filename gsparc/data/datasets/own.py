@@ -25,7 +25,7 @@ def raw_of_own(
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
 ) -> Raw:
-    """Read a file of the schema in docs/reference/schema.md, or a table under the schema's names; notes are logged.
+    """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
 
     Args:
         path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
