@@ -32,7 +32,7 @@ from gsparc.models.target_rows import heard
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import Spent, less_repeatable
+from gsparc.training.time_budget import Spent, TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
 
@@ -143,6 +143,9 @@ class PerStation(Method):
                 share = max(even, LEAST_SHARE * whole / len(numbers))
             resume = None if left is None else left / folder
             own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
+            if alone and self.wrapped.takes_budget and len(numbers) > 1:
+                said = turn + 1, len(numbers), self._name_of(number), _rest(turn, len(numbers), budget)
+                log.info("station %d of %d: %s%s", *said)
             rows, part = self._part(data, number)
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             copy, before = self._make(), budget.counted.wall
@@ -160,7 +163,7 @@ class PerStation(Method):
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
-        found = dict(each(fitted, range(len(numbers)), "stations" if self.wrapped.takes_budget else ""))
+        found = dict(each(fitted, range(len(numbers)), "" if alone else "stations"))
         reports = [found[turn][1] for turn in range(len(numbers))]
         for turn, number in enumerate(numbers):
             self._copies[number] = found[turn][0]
@@ -338,6 +341,14 @@ class OfStation(View):
         rows = torch.arange(len(tx))
         station = torch.full_like(rows, self.number)
         return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
+
+
+def _rest(turn: int, count: int, budget: TimeBudget) -> str:
+    """What a log says of the seconds that are left, before the station `turn` of so many."""
+    rest = budget.seconds - budget.spent
+    if math.isinf(rest):
+        rest = budget.spent / turn * (count - turn) if turn else math.inf
+    return "" if math.isinf(rest) else f", about {max(rest, 0.0):.0f} s left for all"
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:

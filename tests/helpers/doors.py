@@ -13,7 +13,7 @@ from unittest import mock
 from ledger import LEDGER
 
 WHOLE = re.compile(
-    r"\.hydra(/.*)?|(\.job)?\.lock|[\w.]+\.log|split\.json|job\.json"
+    r"\.hydra(/.*)?|(\.job/)?\.lock|\.job|[\w.]+\.log|split\.json|job\.json"
 )  # notes of a run before it computes anything
 
 
