@@ -144,8 +144,8 @@ class PerStation(Method):
             resume = None if left is None else left / folder
             own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
             if alone and self.wrapped.takes_budget and len(numbers) > 1:
-                said = turn + 1, len(numbers), self._name_of(number), _rest(turn, len(numbers), budget)
-                log.info("station %d of %d: %s%s", *said)
+                turns = turn + 1, len(numbers), self._name_of(number), _rest(turn, len(numbers), budget)
+                log.info("station %d of %d: %s%s", *turns)
             rows, part = self._part(data, number)
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             copy, before = self._make(), budget.counted.wall
