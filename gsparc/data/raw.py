@@ -64,7 +64,7 @@ def read_raw(path: str | Path) -> Raw:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected *.npz, *.h5 or *.hdf5")
+        raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.hdf5, or Parquet with dataset.cell_m")
     if path.suffix.lower() == ".npz":
         return _read_npz(path)
     if path.suffix.lower() in HDF5_SUFFIXES:

@@ -145,7 +145,7 @@ def place_next(
         return goals
 
     found = np.empty((len(candidates), 3))
-    for row, goals in each(tried, candidates, "candidates"):
+    for row, goals in each(tried, list(candidates), "candidates"):
         found[row] = goals
     before = float(np.quantile(old_power, DECILE) if goal == "worst" else np.mean(1 - old_outage))
     order = np.argsort(-found[:, 0], kind="stable")

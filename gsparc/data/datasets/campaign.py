@@ -50,7 +50,8 @@ class Campaign(DataModule):
         **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
-        self.file, self.settings = Path(file), settings
+        self.file = str(file) if "://" in str(file) else Path(file)  # which would make one of two slashes
+        self.settings = settings
         self.selection = Selection(stations, runs, min_rssi_db, max_rows)
         self.level_steps = rows_by_station(level_steps or {})
 

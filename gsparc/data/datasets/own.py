@@ -24,6 +24,7 @@ def raw_of_own(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
+    cell_m: float | None = None,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
 
@@ -31,11 +32,12 @@ def raw_of_own(
         path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
+        cell_m: of Parquet, also a folder or a URL of it: means of rows [dB] by cells of this side [m].
 
     Raises:
         DataError: bad input, or a file of another campaign.
     """
-    raw, notes = raw_of(Path(path), columns, stations_file)
+    raw, notes = raw_of(path, columns, stations_file, cell_m)
     campaign = campaign_of(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
@@ -100,18 +102,21 @@ def read_any(
 
 
 def raw_of(
-    path: Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+    path: str | Path,
+    columns: Mapping[str, object] | None = None,
+    stations_file: str | Path | None = None,
+    cell_m: float | None = None,
 ) -> Noted:
     """The arrays of a file of the schema, or of a table, and how its columns were understood.
 
     Raises:
         DataError: not readable, or columns that nothing can be made of.
     """
-    if not is_table(path):
+    if cell_m is None and not is_table(path):
         told = any(value is not None for value in (columns or {}).values())
         for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return Noted(read_raw(path))
     from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
 
-    return understand_table(path, columns or {}, stations_file)
+    return understand_table(path, columns or {}, stations_file, cell_m)

@@ -15,6 +15,7 @@ import pandas as pd
 from gsparc.data.errors import nearest
 from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS
+from gsparc.data.tables.cells import LOOKED_AT, merged
 from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
 from gsparc.data.tables.places import (
     PER_STATION,
@@ -25,7 +26,7 @@ from gsparc.data.tables.places import (
     places,
     read_stations,
 )
-from gsparc.data.tables.sheet import Sheet, sheet_of
+from gsparc.data.tables.sheet import Sheet, read_parquet, sheet_of
 
 log = logging.getLogger(__name__)
 
@@ -53,10 +54,13 @@ def read_table(
 
 
 def understand_table(
-    path: str | Path, columns: Mapping[str, object] = NOTHING, stations_file: str | Path | None = None
+    path: str | Path,
+    columns: Mapping[str, object] = NOTHING,
+    stations_file: str | Path | None = None,
+    cell_m: float | None = None,
 ) -> Noted:
-    """As `read_table`, with the notes."""
-    sheet, notes = sheet_of(path)
+    """As `read_table`, with the notes; rows of Parquet are merged by cells of `cell_m` where said."""
+    sheet, notes = sheet_of(path) if cell_m is None else (read_parquet(str(path), LOOKED_AT), [])
     listed = None
     if stations_file is not None:
         second, _ = sheet_of(stations_file, sheet.problems)
@@ -65,6 +69,9 @@ def understand_table(
         sheet.problems.raise_if_any()
     chosen, guessed = choose(sheet, columns, () if listed is None else listed.names)
     sheet.problems.raise_if_any()
+    if cell_m is not None:
+        chosen.pop("row_name", None)  # rows of a cell have many
+        sheet = merged(sheet, chosen, cell_m)
     builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
     sheet.problems.raise_if_any()

@@ -5,16 +5,22 @@ from __future__ import annotations
 import codecs
 import csv
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from fsspec.core import url_to_fs
 
-from gsparc.data.errors import DataError, Problems
+from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.tables import TABLE_SUFFIXES
 from gsparc.data.tables.heads import understand
+
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
 
 # What stands for no value, in small letters.
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "#n/a", "null", "none", "nil", "?", ".")
@@ -99,21 +105,28 @@ class Sheet:
         return values
 
 
-def read_parquet(source: str) -> Sheet:
-    """The columns of a Parquet file.
+@contextmanager
+def opened(source: str) -> Iterator[Dataset]:
+    """The dataset in a Parquet file, a folder of them, or a URL that fsspec knows.
 
     Raises:
-        DataError: pyarrow is missing, or the file is damaged.
+        DataError: pyarrow is missing, or a file is damaged, also while it is read in the block.
     """
     try:
-        from pyarrow import ArrowException
-        from pyarrow.parquet import read_table
+        from pyarrow import ArrowException, dataset
     except ImportError:
         raise DataError(f"{source}: Parquet needs pyarrow; say: pip install 'gsparc[tables]'") from None
     try:
-        frame = read_table(source).to_pandas()
-    except (ArrowException, OSError, ValueError) as error:
-        raise DataError(f"{source}: damaged or not a Parquet file ({str(error).splitlines()[0]})") from None
+        system, at = url_to_fs(source) if "://" in source else (None, source)
+        yield dataset.dataset(at, filesystem=system, format="parquet", partitioning="hive")
+    except (ArrowException, OSError, ValueError, ImportError) as error:
+        raise DataError(f"{source}: damaged or not a Parquet file ({reason(error)})") from None
+
+
+def read_parquet(source: str, most: int | None = None) -> Sheet:
+    """The columns of what `opened` opens, of the first `most` rows where said; `DataError` likewise."""
+    with opened(source) as files:
+        frame = (files.to_table() if most is None else files.head(most)).to_pandas()
     unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
     frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
     if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
@@ -125,7 +138,8 @@ def read_parquet(source: str) -> Sheet:
     if not len(frame):
         raise DataError(f"{source}: no rows")
     rows = tuple(f"row {i}" for i in range(len(frame)))
-    return Sheet(source, heads, tuple(frame.iloc[:, i] for i in range(len(heads))), rows)
+    columns = tuple(frame.iloc[:, i] for i in range(len(heads)))
+    return Sheet(source, heads, columns, rows, problems=Problems(source))
 
 
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}

@@ -1,0 +1,76 @@
+"""Levels in Parquet that do not fit into memory: rows become means by cells of places while they are read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsparc.data.errors import DataError
+from gsparc.data.limits import POSITIVE
+from gsparc.data.tables.columns import Chosen, Column
+from gsparc.data.tables.heads import AXES, KINDS
+from gsparc.data.tables.sheet import Sheet, opened
+
+LOOKED_AT = 10_000  # rows by which columns are understood
+METRES = 111_320.0  # of a degree of latitude
+ENDS = ("", "rx_", "tx_")
+CHUNK = {"batch_readahead": 2, "fragment_readahead": 1}  # of 131,072 rows and of files: memory
+
+
+def merged(first: Sheet, chosen: Chosen, cell_m: float) -> Sheet:
+    """A row for each cell of places, and value of any other column: means of levels [dB] and coordinates.
+
+    Rows without a level are apart from those with one, as they were not heard. Memory grows with cells, not
+    with rows; the order is that of the first rows.
+
+    Args:
+        first: rows by which columns were chosen.
+        chosen: the columns.
+        cell_m: side of the cells [m].
+
+    Raises:
+        SettingError: a side that is not positive.
+        DataError: no column of levels in decibels, text where numbers are needed, damaged files.
+    """
+    POSITIVE.check("dataset.cell_m", cell_m)
+    if "rssi_db" not in chosen:
+        raise DataError(f"{first.source}: dataset.cell_m merges levels; say dataset.columns.rssi_db=COLUMN")
+    with opened(first.source) as files:
+        from pyarrow import acero, compute
+
+        wanted = {c.head: c for columns in chosen.values() for c in columns if c.head is not None}
+        keys, made, sums = [], {}, []
+        for number, (head, column) in enumerate(wanted.items()):
+            value, key = compute.field(head), f"key {number}"
+            if column.role == "rssi_db" or column.role in {end + axis for end in ENDS for axis in AXES}:
+                value = value.cast("float64")
+                made[head] = value
+                sums += [(head, f"hash_{how}", None, f"{how} {number}") for how in ("mean", "min", "max")]
+                absent = compute.is_null(value, nan_is_null=True)
+                cell = compute.floor(value * (_metres(column, chosen, first) / cell_m))
+                value = absent if column.role == "rssi_db" else cell + 0.0  # of -0.0 and 0.0 one
+            made[key] = value
+            keys.append(key)
+        scan = acero.ScanNodeOptions(files, columns=list(wanted), require_sequenced_output=True, **CHUNK)
+        project = acero.ProjectNodeOptions(list(made.values()), list(made))
+        steps = {"scan": scan, "project": project, "aggregate": acero.AggregateNodeOptions(sums, keys)}
+        plan = acero.Declaration.from_sequence([acero.Declaration(*step) for step in steps.items()])
+        frame = plan.to_table(use_threads=False).to_pandas()  # one thread adds in one order
+    for number, head in enumerate(wanted):
+        if head in made:  # a mean of equal numbers is that number, but for rounding
+            least, most = frame[f"min {number}"], frame[f"max {number}"]
+            frame[f"key {number}"] = frame[f"mean {number}"].clip(least, most)
+    columns, rows = tuple(frame[key] for key in keys), tuple(f"cell {i}" for i in range(len(frame)))
+    return replace(first, heads=tuple(wanted), columns=columns, rows=rows)
+
+
+def _metres(column: Column, chosen: Chosen, first: Sheet) -> float:
+    """Of a step of 1 in a column of coordinates [m]."""
+    factor = 1.0 if column.unit is None else column.unit.factor
+    if KINDS[column.role] != "angle":
+        return factor
+    if not column.role.endswith("longitude"):
+        return factor * METRES
+    latitude = chosen[column.role.replace("longitude", "latitude")][0].numbers(first)
+    return factor * METRES * float(np.cos(np.radians(0.0 if latitude is None else np.nanmean(latitude))))
