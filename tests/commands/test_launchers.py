@@ -60,3 +60,20 @@ def test_a_killed_job_is_gone_on_with_and_nothing_is_done_twice(tmp_path, launch
         if any(stage.is_relative_to(record.parent) for record in before):
             assert len(steps) == STEPS  # done in the first command, and then not again
         assert len(steps) - STEPS <= EVERY  # of one cut short, those after its last checkpoint
+
+
+@pytest.mark.slow
+def test_jobs_on_ray_return_what_jobs_here_do_and_are_not_done_again(tmp_path):
+    pytest.importorskip("ray", reason="ray is not installed")
+    spectra(tmp_path / "own.npz")
+    settings = ("dataset=own", f"dataset.file='{tmp_path / 'own.npz'}'", "model=mean,nearest", "threads=1")
+    found = []
+    for launcher, folder in (("basic", "here"), ("ray", "there"), ("ray", "there")):
+        where = (f"hydra.sweep.dir={tmp_path / folder}", f"hydra/launcher={launcher}")
+        command = [sys.executable, "train.py", "-m", *settings, "baselines=[]", "logger=none", *where]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        jobs = [json.loads(file.read_text()) for file in sorted((tmp_path / folder).glob("*/job.json"))]
+        found.append([(job["settings"]["model"]["_target_"], job["returned"], job["began"]) for job in jobs])
+    here, there, again = found
+    assert len(here) == 2 and [job[:2] for job in here] == [job[:2] for job in there] and there == again
