@@ -1,4 +1,4 @@
-"""`hydra/launcher=ray`: jobs of a multirun on Ray. Hydra looks for launchers in the package `hydra_plugins`."""
+"""`hydra/launcher=ray`: jobs of a multirun on Ray. Hydra looks for launchers in `hydra_plugins`."""
 
 from __future__ import annotations
 
