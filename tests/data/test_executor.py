@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cloudpickle
@@ -129,3 +131,38 @@ def test_a_node_of_ray_is_lost_half_way(tmp_path, nodes, elsewhere):
     assert found == {n: n * n for n in range(4 * COUNT)} and lost is not None
     begun = [len(file.read_text().split()) for file in tmp_path.glob("*.begun")]
     assert sum(begun) <= 4 * COUNT + 1  # what the lost node was at
+
+
+INTERRUPTED = """
+import sys, time
+from gsparc.data import executor
+if __name__ == "__main__":
+    executor.use(executor.Engine(sys.argv[1], 2))
+    list(executor.each(abs, [1, 2]))
+    print("begun", flush=True)
+    try:
+        list(executor.each(time.sleep, [60, 60, 60, 60]))
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+        sys.exit(130)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES[1:])
+def test_an_interrupt_ends_the_work_within_seconds(tmp_path, engine):
+    pytest.importorskip(engine, reason=f"{engine} is not installed")
+    (tmp_path / "work.py").write_text(INTERRUPTED)
+    heard = partial(
+        signal.signal, signal.SIGINT, signal.default_int_handler
+    )  # whoever runs tests may ignore it
+    command = [sys.executable, tmp_path / "work.py", engine]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heard
+    ) as one:
+        assert one.stdout.readline() == "begun\n"
+        time.sleep(1)
+        began = time.perf_counter()
+        os.killpg(one.pid, signal.SIGINT)  # as a terminal does
+        assert one.wait(60) == 130 and one.stdout.read() == "interrupted\n"
+    assert time.perf_counter() - began < 15

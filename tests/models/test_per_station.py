@@ -242,3 +242,12 @@ def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path
     for context in (FitContext(), FitContext(tmp_path)):
         for_links(Writes, town).fit(town, fold, context)
     assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders
+
+
+@pytest.mark.slow
+def test_stations_that_are_fitted_elsewhere_are_the_same_bits(town, fold, tmp_path, elsewhere):
+    torch.set_num_threads(1)
+    here, batch = fitted("gp", town, fold, tmp_path / "here"), town.batch(fold.test)
+    elsewhere("joblib")
+    there = fitted("gp", town, fold, tmp_path / "there")
+    assert torch.equal(here.answer(batch).mean, there.answer(batch).mean)

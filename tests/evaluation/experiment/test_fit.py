@@ -1,0 +1,29 @@
+"""Folds of a split, fitted here and in other processes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
+
+
+@pytest.mark.slow
+def test_folds_that_are_fitted_elsewhere_have_the_same_figures(campaign, folds, tmp_path, elsewhere):
+    torch.set_num_threads(1)
+    data, split = campaign("spectrum", 40), folds(40, 3)
+    kept = []
+
+    def outcome():
+        context = in_folders(FitContext(tmp_path))
+        return fit_and_score(
+            method_class("gp"), data, split, context, keep=lambda number, *unused: kept.append(number)
+        )
+
+    here = outcome()
+    elsewhere("joblib")
+    there = outcome()
+    assert here.figures == there.figures and here.figures["psnr_db"] > 0
+    assert kept[:3] == [0, 1, 2] and sorted(kept[3:]) == [0, 1, 2]
