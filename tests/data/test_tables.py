@@ -12,7 +12,7 @@ from gsparc.data.datasets.own import Own
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
 from gsparc.data.tables.heads import understand
-from gsparc.data.tables.read import read_table, understand_table
+from gsparc.data.tables.read import understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
 STATIONS = "name,x,y,z\na,1,2,3\nb,2,3,4\n"
@@ -76,7 +76,7 @@ def test_labels_of_stations():
 
 
 def test_a_plain_table(write):
-    raw = read_table(write(PLAIN))
+    raw = understand_table(write(PLAIN)).raw
     np.testing.assert_array_equal(raw.arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(raw.arrays["rssi_db"], [-80, -81.5])
     assert list(raw.arrays["row_name"]) == ["line 2", "line 3"]
@@ -104,7 +104,7 @@ def test_a_plain_table(write):
     ],
 )  # fmt: skip
 def test_the_same_table_in_other_forms(write, content, name):
-    raw = read_table(write(content, name))
+    raw = understand_table(write(content, name)).raw
     np.testing.assert_array_equal(raw.arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(raw.arrays["rssi_db"], [-80, -81.5])
 
@@ -112,7 +112,7 @@ def test_the_same_table_in_other_forms(write, content, name):
 def test_no_value_in_a_level_is_missing(write):
     marks = ["", "-", "N/A", "NA", "nan", "NaN", "null", "#N/A", "?", " "]
     text = "x,y,rssi\n1,1,-80\n" + "".join(f"{i},2,{mark}\n" for i, mark in enumerate(marks))
-    level = read_table(write(text)).arrays["rssi_db"]
+    level = understand_table(write(text)).raw.arrays["rssi_db"]
     assert np.isnan(level[1:]).all() and level[0] == -80
 
 
@@ -139,7 +139,10 @@ def test_every_guess_is_said_and_what_is_not_used(write):
     )
     assert "not used: columns 'SINR', 'battery'" in notes
     assert "no height of the receiver: taken as 0 m" in notes
-    assert read_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).arrays["rssi_db"].tolist() == [4, 8]
+    assert understand_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).raw.arrays["rssi_db"].tolist() == [
+        4,
+        8,
+    ]
 
 
 def test_many_transmitters_did_not_become_one_without_a_word(write):
@@ -155,19 +158,21 @@ def test_what_is_said_wins_over_guesses(write):
     said = {"rssi_db": "rsrp", "tx_x": "px", "tx_y": "py", "tx_z": 1.5, "rx_x": 0, "rx_y": 0, "rx_z": 2}
     # lat and lon are of an end without a name, which is a third one: it must be said to be none
     with pytest.raises(DataError, match="expected two ends"):
-        read_table(write(text), said)
-    arrays = read_table(write(text.replace("lat,lon", "a,b")), said).arrays
+        understand_table(write(text), said)
+    arrays = understand_table(write(text.replace("lat,lon", "a,b")), said).raw.arrays
     np.testing.assert_array_equal(arrays["rssi_db"], [-80, -81])
     np.testing.assert_array_equal(arrays["tx_position"], [[1, 2, 1.5], [3, 4, 1.5]])
     np.testing.assert_array_equal(arrays["rx_position"], [0, 0, 2])
-    degrees = read_table(write(text), {"lat": "lat", "lon": "lon", "rssi_db": "RSSI", "height": 1.5}).arrays
+    degrees = understand_table(
+        write(text), {"lat": "lat", "lon": "lon", "rssi_db": "RSSI", "height": 1.5}
+    ).raw.arrays
     assert degrees["latitude"].tolist() == [40, 40] and degrees["rx_height"] == 1.5
 
 
 def test_long_layout_with_places_in_columns(write):
     text = "x,y,z,rssi,gateway,gateway_x,gateway_y,gateway_z\n"
     text += "1,1,1,-80,g7,9,9,3\n1,1,1,-85,12,0,0,3\n2,1,1,-81,g7,9,9,3\n"
-    arrays = read_table(write(text)).arrays
+    arrays = understand_table(write(text)).raw.arrays
     assert arrays["station"].tolist() == [0, 1, 0] and arrays["station_name"].tolist() == ["g7", "12"]
     np.testing.assert_array_equal(arrays["station_position"], [[9, 9, 3], [0, 0, 3]])
     assert "tx_position" in arrays and "rx_position" not in arrays  # gateways listen
@@ -175,7 +180,7 @@ def test_long_layout_with_places_in_columns(write):
 
 def test_long_layout_with_transmitters_in_columns(write):
     text = "rx_x,rx_y,tx_x,tx_y,rsrp,cell\n1,1,9,9,-80,a\n2,1,9,9,-81,a\n1,1,0,0,-85,b\n"
-    arrays = read_table(write(text)).arrays
+    arrays = understand_table(write(text)).raw.arrays
     np.testing.assert_array_equal(arrays["station_position"], [[9, 9], [0, 0]])
     assert arrays["station"].tolist() == [0, 0, 1] and "tx_position" not in arrays
     assert arrays["station_height"] == 0 and arrays["rx_height"] == 0
@@ -206,7 +211,7 @@ def test_long_layout_with_a_second_file(write, caplog):
 )
 def test_wide_layout(write, heads, columns):
     text = f"x,y,z,{heads}\n1,2,3,-80,-90\n4,5,6,,-91\n"
-    arrays = read_table(write(text), columns, write(STATIONS, "stations.csv")).arrays
+    arrays = understand_table(write(text), columns, write(STATIONS, "stations.csv")).raw.arrays
     assert arrays["station_name"].tolist() == ["b", "a"] and "station" not in arrays
     np.testing.assert_array_equal(arrays["rssi_db"], [[-80, -90], [np.nan, -91]])
     np.testing.assert_array_equal(arrays["station_position"], [[2, 3, 4], [1, 2, 3]])
@@ -215,11 +220,11 @@ def test_wide_layout(write, heads, columns):
 def test_channels(write):
     text = "tx_x,tx_y,tx_z,h_re_0,h_im_0,h_re_1,h_im_1\n1,2,3,1,2,3,4\n2,2,3,5,6,,\n"
     said = {"rx_x": 0, "rx_y": 0, "rx_z": 0, "frequency_hz": "2.4e9:2.5e9"}
-    arrays = read_table(write(text), said).arrays
+    arrays = understand_table(write(text), said).raw.arrays
     assert arrays["csi"][0].tolist() == [1 + 2j, 3 + 4j] and arrays["frequency_hz"].tolist() == [2.4e9, 2.5e9]
     assert arrays["mask"].tolist() == [[True, True], [True, False]]
     one = "x,y,z,tx_x,tx_y,tx_z,real,imag,frequency_ghz\n1,2,3,0,0,0,1,2,2.4\n2,2,3,0,0,0,5,6,2.4\n"
-    raw = read_table(write(one))
+    raw = understand_table(write(one)).raw
     assert raw.arrays["frequency_hz"] == 2.4e9 and raw.arrays["csi"].shape == (2,)
     assert interpret(raw, "drive.csv").data.site.kind == "csi"
 
@@ -239,20 +244,20 @@ def test_negative_numbers_of_tones_lost_their_sign(write):
         assert any("spaced as the numbers of the tones" in note for note in table.notes)
     same = text.replace("csi_re_-1", "csi_re_02")
     with pytest.raises(DataError, match="'csi_re_02': the same tone as 'csi_re_2'"):
-        read_table(write(same), ENDS)
+        understand_table(write(same), ENDS)
     for head in ("csi_re-1", "csi_re_m1", "csi_re_0_1"):
         with pytest.raises(DataError, match=f"'{head}': .* is no number of a tone"):
-            read_table(write(text.replace("csi_re_-1", head)), ENDS)
+            understand_table(write(text.replace("csi_re_-1", head)), ENDS)
 
 
 def test_runs_and_names_of_rows(write):
-    arrays = read_table(write("x,y,rssi,run,row_name\n1,2,-3,7,p\n2,2,-3,8,q\n")).arrays
+    arrays = understand_table(write("x,y,rssi,run,row_name\n1,2,-3,7,p\n2,2,-3,8,q\n")).raw.arrays
     assert arrays["run"].tolist() == ["7", "8"] and arrays["row_name"].tolist() == ["p", "q"]
 
 
 def test_two_ends_in_degrees_become_stations(write):
     text = "rx_lat,rx_lon,tx_lat,tx_lon,rsrp\n40,8,40.1,8,-80\n40,8.1,40.1,8,-80\n40,8.2,40.3,8,-80\n"
-    arrays = read_table(write(text + "40,8.3,40.3,8,-80\n")).arrays
+    arrays = understand_table(write(text + "40,8.3,40.3,8,-80\n")).raw.arrays
     assert arrays["station_latitude"].tolist() == [40.1, 40.3] and arrays["station"].tolist() == [0, 0, 1, 1]
     assert arrays["longitude"].tolist() == [8, 8.1, 8.2, 8.3]
 
@@ -345,7 +350,7 @@ def test_a_spoilt_table_is_refused_in_a_line(write, name, monkeypatch, tmp_path)
     write(content)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError) as caught:
-        read_table("drive.csv", columns)
+        understand_table("drive.csv", columns)
     problems = caught.value.problems
     assert words in problems[0], problems
     assert all("\n" not in p and ("drive.csv" in p or "dataset." in p) for p in problems)
@@ -355,14 +360,14 @@ def test_a_spoilt_table_is_refused_in_a_line(write, name, monkeypatch, tmp_path)
 def test_channels_of_several_tones_and_stations(write):
     """They were refused with the advice to take one tone."""
     text = "x,y,station,station_x,station_y,csi_re_1,csi_im_1,csi_re_0,csi_im_0\n1,2,a,0,0,1,2,3,4\n1,2,b,5,5,5,6,7,8\n"
-    arrays = read_table(write(text), {"frequency_hz": "1e9:2e9"}).arrays
+    arrays = understand_table(write(text), {"frequency_hz": "1e9:2e9"}).raw.arrays
     assert arrays["csi"].tolist() == [[3 + 4j, 1 + 2j], [7 + 8j, 5 + 6j]]
 
 
 def test_all_bad_cells_are_listed_at_once(write):
     rows = "".join(f"{i},{'?!' if i % 2 else i},-8x\n" for i in range(20))
     with pytest.raises(DataError) as caught:
-        read_table(write("x,y,rssi\n" + rows))
+        understand_table(write("x,y,rssi\n" + rows))
     said = "\n".join(caught.value.problems)
     assert "line 2: '-8x'" in said and "line 3: '?!'" in said
     assert "the same in 15 more rows" in said and "the same in 5 more rows" in said
@@ -381,15 +386,17 @@ def test_all_bad_cells_are_listed_at_once(write):
 )
 def test_a_spoilt_list_of_stations(write, listed, words):
     with pytest.raises(DataError) as caught:
-        read_table(write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n"), {}, write(listed, "stations.csv"))
+        understand_table(
+            write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n"), {}, write(listed, "stations.csv")
+        ).raw
     assert any(words in problem for problem in caught.value.problems), caught.value.problems
 
 
 def test_names_of_files(write, tmp_path):
     with pytest.raises(DataError, match="no such file"):
-        read_table(tmp_path / "nothing.csv")
+        understand_table(tmp_path / "nothing.csv")
     with pytest.raises(DataError, match=r"expected a name ending in .csv"):
-        read_table(write(PLAIN, "drive.xlsx"))
+        understand_table(write(PLAIN, "drive.xlsx"))
 
 
 def test_marks_between_thousands_were_decimal_commas(write):
@@ -397,8 +404,8 @@ def test_marks_between_thousands_were_decimal_commas(write):
     with pytest.raises(
         DataError, match=r"line 2: '448,262': is no finite number; .* no marks between thousands"
     ):
-        read_table(write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n'))
-    some = read_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n'))
+        understand_table(write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n'))
+    some = understand_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n')).raw
     np.testing.assert_array_equal(some.arrays["rx_position"], [[448.262, 412.1], [448.263, 412.25]])
 
 
@@ -406,9 +413,9 @@ def test_access_points_that_receive_were_transmitters(write):
     """Stations whose places are called rx_x, ... receive: the other end is the transmitter, and moves."""
     lines = [f"{i},{i % 7},1,{'ab'[i % 2]},{50 * (i % 2)},0,3,{-50 - i % 13}" for i in range(40)]
     path = write("\n".join(["x,y,z,ap,rx_x,rx_y,rx_z,rssi", *lines]))
-    arrays = read_table(path).arrays
+    arrays = understand_table(path).raw.arrays
     assert "tx_position" in arrays and "rx_position" not in arrays
-    assert "rx_position" in read_table(write(path.read_text().replace("rx_", "tx_"))).arrays
+    assert "rx_position" in understand_table(write(path.read_text().replace("rx_", "tx_"))).raw.arrays
 
 
 def test_parquet(tmp_path):
@@ -418,12 +425,12 @@ def test_parquet(tmp_path):
     columns = {"lat": [40.0, 40.1], "lon": [8.0, 8.1], "RSRP [dBm]": [-80, None], "pci": [7, 8]}
     columns |= {"cell_lat": [41.0, 42.0], "cell_lon": [8.0, 8.0]}
     parquet.write_table(pyarrow.table(columns), tmp_path / "drive.parquet")
-    arrays = read_table(tmp_path / "drive.parquet").arrays
+    arrays = understand_table(tmp_path / "drive.parquet").raw.arrays
     assert arrays["station_name"].tolist() == ["7", "8"] and arrays["row_name"][1] == "row 1"
     assert arrays["rssi_db"][0] == -80 and np.isnan(arrays["rssi_db"][1])
     (tmp_path / "bad.parquet").write_bytes(b"PAR1" + bytes(20))
     with pytest.raises(DataError, match="damaged or not a Parquet file"):
-        read_table(tmp_path / "bad.parquet")
+        understand_table(tmp_path / "bad.parquet")
 
 
 def test_an_index_of_parquet_was_dropped(tmp_path):
@@ -441,7 +448,7 @@ def test_an_index_of_parquet_was_dropped(tmp_path):
     frame = pd.DataFrame({**columns, "rssi": [-80.0, -70]})
     for index in (["station"], ["station", "x"]):
         frame.set_index(index).to_parquet(tmp_path / "drive.parquet")
-        arrays = read_table(tmp_path / "drive.parquet").arrays
+        arrays = understand_table(tmp_path / "drive.parquet").raw.arrays
         assert arrays["station_name"].tolist() == ["a", "b"] and arrays["rx_position"].tolist() == [
             [0, 0],
             [1, 2],
@@ -451,14 +458,14 @@ def test_an_index_of_parquet_was_dropped(tmp_path):
 @pytest.mark.parametrize(("head", "unit"), [("RSRP [dBm]", "dBm"), ("RSRP [dBW]", "dBm"), ("rssi", "dB")])
 def test_pictures_name_the_unit_that_levels_were_turned_into(write, head, unit):
     """A column in dBW is read as dBm; its pictures said dBW, and those of a map dB whatever was measured."""
-    data = interpret(read_table(write(f"x,y,z,{head}\n1,2,3,-80\n4,5,6,-81.5\n")), "drive").data
+    data = interpret(understand_table(write(f"x,y,z,{head}\n1,2,3,-80\n4,5,6,-81.5\n")).raw, "drive").data
     assert data.site.level_unit == unit
 
 
 def test_parquet_without_pyarrow(write, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(DataError, match=r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"):
-        read_table(write(b"PAR1", "drive.parquet"))
+        understand_table(write(b"PAR1", "drive.parquet"))
     assert importlib.util.find_spec("pandas") is not None
 
 
@@ -475,7 +482,7 @@ def test_a_real_drive_as_a_table(tmp_path):
     listed = [f"{n},{x!r},{y!r}" for n, (x, y) in zip(names, fixed.tolist(), strict=True)]
     (tmp_path / "stations.csv").write_text("name,x,y\n" + "\n".join(listed))
     start = time.perf_counter()
-    arrays = read_table(tmp_path / "drive.csv", {}, tmp_path / "stations.csv").arrays
+    arrays = understand_table(tmp_path / "drive.csv", {}, tmp_path / "stations.csv").raw.arrays
     assert time.perf_counter() - start < 5
     np.testing.assert_array_equal(arrays["rssi_db"], wide)
     np.testing.assert_array_equal(arrays["rx_position"], place)

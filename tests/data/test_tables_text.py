@@ -5,7 +5,7 @@ import pytest
 
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
-from gsparc.data.tables.read import read_table, understand_table
+from gsparc.data.tables.read import understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
 
@@ -31,11 +31,11 @@ def test_stations_of_unknown_place_could_not_be_read(write):
     assert data.site.stations.name == ("b", "a") and np.isnan(data.site.stations.position).all()
     assert data.station.tolist() == [0, 1, 0, 1] and np.isfinite(data.site.box).all()
     for one, axes in ((text, "x,y"), (text.replace("x,y", "lat,lon"), "lat,lon")):
-        some = read_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv"))
+        some = understand_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv")).raw
         known = np.isfinite(interpret(some, "drive").data.site.stations.position).all(axis=1)
         assert known.tolist() == [True, False]
     with pytest.raises(DataError, match="column 'y', line 3: no value; station_y is needed"):
-        read_table(write(text), {}, write("name,x,y\na,3,4\nb,1,\n", "stations.csv"))
+        understand_table(write(text), {}, write("name,x,y\na,3,4\nb,1,\n", "stations.csv"))
 
 
 @pytest.mark.parametrize("mark", ["#", "%", "//"])
@@ -58,13 +58,15 @@ def test_comments_below_the_heads_are_said(write):
 
 
 def test_heads_in_a_comment_above_text(write):
-    arrays = read_table(write("# station,x,y,rssi,cell_x,cell_y\na,1,2,-80,0,0\nb,1,2,-81,5,5\n")).arrays
+    arrays = understand_table(
+        write("# station,x,y,rssi,cell_x,cell_y\na,1,2,-80,0,0\nb,1,2,-81,5,5\n")
+    ).raw.arrays
     assert arrays["station_name"].tolist() == ["a", "b"] and arrays["rssi_db"].tolist() == [-80, -81]
 
 
 def test_a_no_break_space_between_columns(write):
     """Cells were counted by one rule and parsed by another: KeyError: 3."""
-    arrays = read_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).arrays
+    arrays = understand_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).raw.arrays
     np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
 
 
@@ -78,4 +80,4 @@ def test_thousands_between_semicolons_were_decimals_without_a_question(write, x,
 
 def test_a_comment_mark_after_an_empty_cell_was_a_crash(write):
     with pytest.raises(DataError, match=r"line 3: begins with '# 3.*: a row, or a comment\?"):
-        read_table(write("x\ty\trssi\n1\t2\t-70\n\t# 3\t-70\n", "a.tsv"))
+        understand_table(write("x\ty\trssi\n1\t2\t-70\n\t# 3\t-70\n", "a.tsv"))

@@ -9,7 +9,7 @@ import pytest
 
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.data.tables.read import read_table
+from gsparc.data.tables.read import understand_table
 from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.scores import score
@@ -54,7 +54,7 @@ def test_watts_were_asked_of_a_model_of_milliwatts(tmp_path, model, unit, power)
     (tmp_path / "drive.csv").write_text(heads + "".join(rows))
     given = {"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0] - 30 * (model == "dBW")}
     data = from_arrays(given, {"level_unit": model})
-    table = read_table(tmp_path / "drive.csv")
+    table = understand_table(tmp_path / "drive.csv").raw
     other = from_arrays({**table.arrays, "tx_position": POSTS[0]}, table.attributes)
     same = aligned(other, data.site)
     np.testing.assert_allclose(same.target, data.target, rtol=1e-5)

@@ -1,6 +1,6 @@
 """Tables of measurements (CSV, TSV, Parquet): one row for each place, or for each place and station.
 
-`read.read_table` reads one; it is not imported here, as pandas takes half a second.
+`read.understand_table` reads one; it is not imported here, as pandas takes half a second.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import logging
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -28,29 +27,7 @@ from gsparc.data.tables.places import (
 )
 from gsparc.data.tables.sheet import Sheet, read_parquet, sheet_of
 
-log = logging.getLogger(__name__)
-
 NOTHING: Mapping[str, object] = {}
-
-
-def read_table(
-    path: str | Path, columns: Mapping[str, object] = NOTHING, stations_file: str | Path | None = None
-) -> Raw:
-    """The arrays of a table; what was guessed is logged.
-
-    Args:
-        path: *.csv, *.tsv, *.txt or *.parquet.
-        columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for all rows,
-            a pattern with a `*` for a column per station.
-        stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
-
-    Raises:
-        DataError: all problems, with row and column.
-    """
-    table = understand_table(path, columns, stations_file)
-    for note in table.notes:
-        log.info("%s: %s", path, note)
-    return table.raw
 
 
 def understand_table(
@@ -59,7 +36,18 @@ def understand_table(
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
 ) -> Noted:
-    """As `read_table`, with the notes; rows of Parquet are merged by cells of `cell_m` where said."""
+    """The arrays of a table, and what was guessed.
+
+    Args:
+        path: *.csv, *.tsv, *.txt or *.parquet.
+        columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for all rows,
+            a pattern with a `*` for a column per station.
+        stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
+        cell_m: of Parquet: rows are merged by cells of this side [m].
+
+    Raises:
+        DataError: all problems, with row and column.
+    """
     sheet, notes = sheet_of(path) if cell_m is None else (read_parquet(str(path), LOOKED_AT), [])
     listed = None
     if stations_file is not None:
