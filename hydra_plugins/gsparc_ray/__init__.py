@@ -17,7 +17,7 @@ class RayLauncher(Launcher):
     """A job has `threads` cores, one where these are null; `workers` and `address` are as of `engine=ray`."""
 
     def __init__(self, workers: int | None = None, address: str | None = None) -> None:
-        self.how = {"engine": "ray", "workers": workers, "address": address}
+        self.workers, self.address = workers, address
 
     def setup(self, **given: Any) -> None:
         """Take Hydra's `hydra_context`, `task_function` and `config`."""
@@ -45,7 +45,7 @@ class RayLauncher(Launcher):
             return run_job(task, job, "hydra.sweep.dir", "hydra.sweep.subdir", context)
 
         torch.set_num_threads(jobs[0].get("threads") or 1)
-        executor.use(executor.Engine(**self.how))
+        executor.use(executor.Engine("ray", self.workers, self.address))
         found = dict(executor.each(done, jobs, "jobs"))
         return [found[number] for number in range(len(jobs))]
 

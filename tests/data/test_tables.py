@@ -386,9 +386,7 @@ def test_all_bad_cells_are_listed_at_once(write):
 )
 def test_a_spoilt_list_of_stations(write, listed, words):
     with pytest.raises(DataError) as caught:
-        understand_table(
-            write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n"), {}, write(listed, "stations.csv")
-        ).raw
+        understand_table(write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n"), {}, write(listed, "stations.csv"))
     assert any(words in problem for problem in caught.value.problems), caught.value.problems
 
 
