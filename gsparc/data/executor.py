@@ -11,7 +11,7 @@ import os
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
@@ -35,6 +35,7 @@ SAY_S = 2.0  # between lines about progress
 TRIES = 3  # of a piece whose process dies
 _Piece = TypeVar("_Piece")
 _Result = TypeVar("_Result")
+Results = Generator[tuple[int, Any], None, None]
 
 
 @dataclass(frozen=True)
@@ -92,14 +93,12 @@ def each(
         Exception: the first that `work` raises; pieces that have begun are cancelled.
         BrokenProcessPool, ray.exceptions.RayError: a piece ended its process `TRIES` times.
     """
-    costs, ended = [cost(piece) for piece in pieces], 0.0
+    total, ended = sum(map(cost, pieces)), 0.0
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
     began = said = time.monotonic()
     if not elsewhere():
         here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
-        found: Any = (
-            (call(number) for call, number in here) if threads == 1 else _jobs(here, threads, "threading")
-        )
+        found = _jobs(here, threads, "threading")
     else:
         blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
         found = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
@@ -107,10 +106,10 @@ def each(
         for count, (number, result) in enumerate(found, 1):
             if isinstance(result, Exception):
                 raise result
-            ended += costs[number]
+            ended += cost(pieces[number])
             if what and time.monotonic() - said > SAY_S:
                 said = time.monotonic()
-                left = (time.monotonic() - began) * (sum(costs) / max(ended, 1e-9) - 1)
+                left = (said - began) * (total / max(ended, 1e-9) - 1)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
             yield number, result
 
@@ -133,15 +132,14 @@ def _piece(where: list[Any], number: int, piece: Any) -> tuple[int, Any]:
         return number, error
 
 
-def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Iterator[tuple[int, Any]]:
+def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Results:
     how: dict[str, Any] = {"pre_dispatch": workers, "batch_size": 1, "max_nbytes": None}
     jobs = joblib.Parallel(workers, backend, return_as="generator_unordered", **how)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
-        yield from jobs(joblib.delayed(call)(*given) for call, *given in calls)
+    warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
+    yield from jobs(joblib.delayed(call)(*given) for call, *given in calls)
 
 
-def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Results:
     workers = _chosen.workers or max(joblib.cpu_count() // torch.get_num_threads(), 1)
     lost, begun = Counter[int](), dict[int, None]()
 
@@ -175,7 +173,7 @@ def _ray() -> Any:
     return ray
 
 
-def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Results:
     ray, threads = _ray(), torch.get_num_threads()
     if not ray.is_initialized():
         ray.init(_chosen.address, include_dashboard=False, logging_level="error", log_to_driver=False)

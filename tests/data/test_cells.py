@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -78,3 +81,28 @@ def test_what_cannot_be_is_refused(frame, tmp_path, change, cell_m, said):
     changed = changed.drop(columns=[name for name, value in change.items() if value is None])
     with pytest.raises((DataError, SettingError), match=said):
         Own(parts(changed, tmp_path / "rows", 2), cell_m=cell_m).load()
+
+
+PEAK = """
+import resource, sys
+from gsparc.data.datasets.own import raw_of_own
+raw_of_own(sys.argv[1], cell_m=5.0)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
+"""
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_rows(tmp_path):
+    """7 million rows are 168 MB as numbers alone; a few hundred thousand fill the same cells."""
+    rng, peak_mb = np.random.default_rng(1), []
+    for count in (1, 20):
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        for part in range(count):
+            rows = {"x": rng.uniform(0, 500, 350_000), "y": rng.uniform(0, 500, 350_000), "rssi_db": -70.0}
+            pd.DataFrame(rows).to_parquet(folder / f"{part}.parquet", index=False)
+        done = subprocess.run(
+            [sys.executable, "-c", PEAK, folder], capture_output=True, text=True, check=True
+        )
+        peak_mb.append(float(done.stdout))
+    assert peak_mb[1] - peak_mb[0] < 100
