@@ -107,7 +107,7 @@ def each(
             if isinstance(result, Exception):
                 raise result
             ended += cost(pieces[number])
-            if what and time.monotonic() - said > SAY_S:
+            if what and count < len(pieces) and time.monotonic() - said > SAY_S:
                 said = time.monotonic()
                 left = (said - began) * (total / max(ended, 1e-9) - 1)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
