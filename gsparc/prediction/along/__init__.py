@@ -1,0 +1,1 @@
+"""Channels along a trajectory, as channel emulators and link simulators take them."""

@@ -1,0 +1,239 @@
+"""Taps of known channels, their Doppler, and files that readers written from the layouts read back."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from hydra import compose, initialize_config_module
+
+import gsparc
+from gsparc.commands import export
+from gsparc.data.raw import Raw, read_raw, write_raw
+from gsparc.models import checkpoint
+from gsparc.prediction.along import emulators
+from gsparc.prediction.along.taps import LIGHT, Trajectory, fitted
+from gsparc.prediction.export import Paths
+
+CARRIER = 3.5e9
+
+
+class Site:
+    kind, static_end, moving_end, name = "csi", "tx", "rx", "two rays"
+
+    def __init__(self, tones):
+        self._tones = tones
+
+    def tones(self):
+        return self._tones
+
+
+class Rays:
+    """A line of sight and a mirror image, of an array of three antennas; `paths` where it is asked to."""
+
+    sources = np.array([[0.0, 0, 5], [0, -40, 5], [-55.0, 0, 5]])
+
+    def __init__(self, tones, with_paths=False):
+        self.site, self.with_paths = Site(tones), with_paths
+
+    def csi(self, tx=None, rx=None):
+        return self._paths(rx).channel(self.site.tones())
+
+    def paths(self, rx):
+        if not self.with_paths:
+            raise ValueError("paths: channels are not made of paths")
+        return self._paths(rx)
+
+    def _paths(self, rx):
+        array = np.array([[0.0, 0, 0], [0.04, 0, 0], [0.08, 0, 0]])
+        middle = float(self.site.tones().mean())
+        away = np.linalg.norm(rx[:, None, None] - (self.sources + array[:, None])[None], axis=-1)
+        gain = (1e-3 / away * np.exp(-2j * np.pi * middle * away / LIGHT)).astype(np.complex64)
+        return Paths(gain, away / LIGHT, middle)
+
+
+def drive(speed=10.0, length=0.5):
+    start = np.array([30.0, 10, 1.5])
+    time_s = np.array([0.0, length])
+    return Trajectory(time_s, start + np.outer(time_s * speed, [1.0, 0, 0]))
+
+
+TONES = CARRIER + 240e3 * (np.arange(128) - 63.5)
+
+
+@pytest.mark.parametrize("with_paths", [False, True])
+def test_taps_sum_to_the_channel_at_any_time(with_paths):
+    model, way = Rays(TONES, with_paths), drive()
+    line = fitted(model, way, 48, 38.4e6, 3)
+    assert line.residual < 1e-3 and line.worst < 1e-2 and (line.paths is not None) == with_paths
+    between = np.linspace(0.003, 0.497, 37)  # not instants
+    tones = TONES[20:-20]
+    delay = (line.first + np.arange(48)) / line.rate_hz
+    summed = line.at(between) @ np.exp(-2j * np.pi * np.outer(delay, tones - line.carrier_hz))
+    true = model._paths(way.at(between)).channel(tones)
+    assert np.mean(np.abs(summed - true) ** 2) < 2e-3 * np.mean(np.abs(true) ** 2)
+
+
+def test_doppler_is_that_of_the_motion():
+    model, way = Rays(TONES, True), drive()
+    line = fitted(model, way, 16, 38.4e6)
+    middle = way.at(np.array([0.25]))[0]
+    towards = (model.sources - middle) / np.linalg.norm(model.sources - middle, axis=1)[:, None]
+    expected = CARRIER / LIGHT * 10 * towards[:, 0]
+    found = line.path_doppler_hz()[len(line.time_s) // 2, 0]
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+    loudest = np.abs(line.gain[:, 0]).mean(0).argmax()
+    assert line.doppler_hz()[0, loudest] == pytest.approx(expected[0], rel=0.15)
+
+
+def test_residual_is_stated_and_falls_with_taps():
+    found = [fitted(Rays(TONES), drive(length=0.1), taps).residual for taps in (1, 4, 8, 32)]
+    assert found[0] > found[1] > found[2] > found[3] and found[0] > 0.05
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="each later than the one before"):
+        Trajectory(np.array([0.0, 0.0]), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="rate_hz= is needed"):
+        fitted(Rays(TONES[:1]), drive(), 4)
+    with pytest.raises(ValueError, match="the tones span"):
+        fitted(Rays(TONES), drive(), 4, 1e6)
+    with pytest.raises(ValueError, match="wavelengths long"):
+        fitted(Rays(TONES), drive(length=1e4), 4)
+
+
+@pytest.fixture
+def line():
+    return fitted(Rays(TONES), drive(length=0.1), 7, antennas=2)
+
+
+def sionna_rk(folder, symbols):
+    """Norms, taps and indices as its loader finds them: entries of 4 + 8 n + 2 n bytes, padded to 4."""
+    about = json.loads((folder / "config.json").read_text())["channel_emulation"]
+    taps, raw = about["num_taps"], (folder / "cirs.bin").read_bytes()
+    size = (4 + 8 * taps + 2 * taps + 3) & ~3
+    assert about["num_cirs"] % symbols == 0 and len(raw) == about["num_cirs"] * size
+    rows = [struct.unpack_from(f"<f{2 * taps}f{taps}H", raw, size * i) for i in range(about["num_cirs"])]
+    each = np.array(rows)
+    return (
+        each[:, 0],
+        each[:, 1 : 1 + 2 * taps : 2] + 1j * each[:, 2 : 1 + 2 * taps : 2],
+        each[:, 1 + 2 * taps :],
+    )
+
+
+@pytest.mark.parametrize("taps", [6, 7])
+def test_sionna_rk_reads_what_was_written(tmp_path, taps):
+    line, symbol_s = fitted(Rays(TONES), drive(length=0.1), taps), 0.5e-3 / 14
+    count = emulators.write_sionna_rk(tmp_path / "emulator", line, symbol_s, 14)
+    norm, gain, index = sionna_rk(tmp_path / "emulator", 14)
+    assert count == len(norm) == 2800 and (index == np.arange(taps)).all()
+    expected = line.at(symbol_s * np.arange(count))[:, 0]
+    np.testing.assert_allclose(norm[:, None] * gain, expected, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(gain, axis=1), 1, rtol=1e-5)
+    assert emulators.check(tmp_path / "emulator", 14).refused == ()
+
+
+def test_vrtsim_reads_what_was_written(tmp_path, line):
+    scale = emulators.write_vrtsim(tmp_path / "db", line, 1e-3, "rx", 10.0)
+    entries = yaml.safe_load((tmp_path / "db" / "vrtsim.yaml").read_text())["entries"]
+    assert [(one["n_tx"], one["n_rx"]) for one in entries] == [(2, 1), (1, 2)]
+    expected = line.at(1e-3 * np.arange(101)) / scale
+    raw = (tmp_path / "db" / "cir_db.bin").read_bytes()
+    for one in entries:
+        assert (one["S"], one["snapshot_dt_s"], one["fs_hz"]) == (101, 1e-3, line.rate_hz)
+        for tx in range(one["n_tx"]):
+            for rx in range(one["n_rx"]):
+                link = rx + one["n_rx"] * tx
+                at = one["offset_bytes"] + 8 * one["L"] * (link + one["n_tx"] * one["n_rx"] * 50)
+                pairs = np.array(struct.unpack_from(f"<{2 * one['L']}f", raw, at))
+                np.testing.assert_allclose(pairs[::2] + 1j * pairs[1::2], expected[50, tx + rx], rtol=1e-5)
+    assert emulators.check(tmp_path / "db" / "vrtsim.yaml", 14).refused == ()
+
+
+def test_the_command_writes_all_and_checks_them(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    tones = 30e6 + 1e5 * np.arange(8)  # few measurements know waves of ten metres
+    rx, ray = rng.uniform([25, 5, 1], [40, 15, 2], (40, 3)), Rays(tones)
+    csi = ray.csi(rx=rx)[:, 0]
+    model = gsparc.fit(rx=rx, tx=ray.sources[0], csi=csi, frequency_hz=tones, model="complex_gp")
+    checkpoint.save(tmp_path / "model.ckpt", model.method)
+    (tmp_path / "drive.csv").write_text("time_s,x,y,z\n0,30,10,1.5\n0.02,30.2,10,1.5\n")
+    monkeypatch.setattr(export, "run_directory", lambda: tmp_path)
+
+    def run(*given):
+        with initialize_config_module("gsparc.conf", version_base=None):
+            return export.task(compose("export", list(given)))
+
+    out, common = tmp_path / "out", (f"ckpt={tmp_path}/model.ckpt", "to=cir", f"table={tmp_path}/drive.csv")
+    facts = run(*common, f"out={out}", "file=h5", "taps=4")
+    assert facts["cir/symbols"] == 560 and facts["cir/residual_db"] < -1
+    held = read_raw(out / "cir.h5")
+    assert held.arrays["gain"].shape == (4, 1, 4) and held.units["delay_s"] == "s"
+    assert "560 OFDM symbols of 4 taps" in run(f"check={out}/sionna-rk")["check/holds"]
+    assert "21 snapshots of 1 x 1 x 4 taps" in run(f"check={out}/vrtsim")["check/holds"]
+    (out / "vrtsim" / "cir_db.bin").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"check=.*but entry 0"):
+        run(f"check={out}/vrtsim")
+    (tmp_path / "still.csv").write_text("x,y,z\n30,10,1.5\n31,10,1.5\n")
+    with pytest.raises(ValueError, match="no column time_s"):
+        run(*common[:2], f"table={tmp_path}/still.csv", f"out={tmp_path}/other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_check_says_what_a_reader_would_refuse(tmp_path, line):
+    emulators.write_sionna_rk(tmp_path / "a", line, 1e-4, 14)
+    emulators.write_vrtsim(tmp_path / "b", line, 1e-3, "rx", 10.0)
+    rows = np.fromfile(tmp_path / "a" / "cirs.bin", emulators.entry(7))
+    rows["index"][3, 6], rows["taps"][5, 0] = 256, np.nan
+    rows[:-3].tofile(tmp_path / "a" / "cirs.bin")
+    about = json.loads((tmp_path / "a" / "config.json").read_text())
+    about["channel_emulation"]["num_cirs"] -= 3
+    (tmp_path / "a" / "config.json").write_text(json.dumps(about))
+    said = " ".join(emulators.check(tmp_path / "a", 14).refused)
+    assert "no whole slots of 14" in said and "delays of 256 samples" in said and "no number" in said
+    with (tmp_path / "a" / "cirs.bin").open("ab") as file:
+        file.write(b"1234")
+    assert "bytes" in emulators.check(tmp_path / "a", 14).refused[0]
+    text = (tmp_path / "b" / "vrtsim.yaml").read_text()
+    (tmp_path / "b" / "vrtsim.yaml").write_text(
+        text.replace("L: 7", "L: 12", 1).replace("n_rx: 2", "n_rx: 16")
+    )
+    said = " ".join(emulators.check(tmp_path / "b", 14).refused)
+    assert "in cir_db.bin" in said and "the first 8 are played" in said and "at most 8 an end" in said
+    with pytest.raises(ValueError, match=r"no cirs\.bin"):
+        emulators.check(tmp_path, 14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("receives", [False, True])
+def test_sionna_hears_the_models_channel(tmp_path, receives):
+    """Through Sionna's own way from a channel model to a grid of tones and symbols."""
+    pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
+    from sionna.phy.channel import cir_to_ofdm_channel
+
+    from gsparc.prediction.along.link import TrajectoryChannel
+
+    ray, way = Rays(TONES), drive()
+    line = fitted(ray, way, 64, antennas=2)
+    delay = (line.first + np.arange(64)) / line.rate_hz
+    end = "tx_position" if receives else "rx_position"
+    held = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay, end: way.at(line.time_s)}
+    write_raw(tmp_path / "cir.npz", Raw(held))
+    model = TrajectoryChannel(tmp_path / "cir.npz", seed=3)
+    gain, tau = model(5, 14, 28e3)
+    assert gain.shape == ((5, 1, 2, 1, 1, 64, 14) if receives else (5, 1, 1, 1, 2, 64, 14))
+    assert tau.shape == (5, 1, 1, 64)
+    middle = slice(20, -20)  # at the band's ends taps at whole samples fit worst
+    tones = torch.from_numpy((TONES - TONES.mean())[middle].astype(np.float32))
+    heard = cir_to_ofdm_channel(tones, gain, tau).numpy().reshape(5, 2, 14, -1)
+    begin = np.random.default_rng(3).uniform(0, 1, 5) * (0.5 - 13 / 28e3)
+    for one, start in zip(heard, begin, strict=True):
+        expected = ray.csi(rx=way.at(start + np.arange(14) / 28e3))[:, :2, middle].transpose(1, 0, 2)
+        assert np.mean(np.abs(one - expected) ** 2) < 1e-3 * np.mean(np.abs(expected) ** 2)
+    with pytest.raises(ValueError, match="from a trajectory of"):
+        model(1, 20, 10.0)
