@@ -1,0 +1,48 @@
+"""The loop of 1,000 places a second counts what it misses."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+PATH = Path(__file__).parents[2] / "examples" / "realtime" / "loop.py"
+
+
+@pytest.fixture
+def loop(monkeypatch):
+    spec = importlib.util.spec_from_file_location("loop", PATH)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "loop", module)  # where a dataclass looks its annotations up
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_each_tick_is_answered_or_missed(loop):
+    places = []
+
+    def slow(place):
+        places.append(place)
+        if len(places) == 3:
+            time.sleep(0.055)
+
+    run = loop.play(slow, np.array([1.0, 2, 3]), 0.2, 0.01)
+    assert len(run.latency_s) + run.missed == 20 and 5 <= run.missed < 18
+    assert run.latency_s[2] >= 0.055 and len(places) == len(run.latency_s)
+    np.testing.assert_allclose(np.linalg.norm(np.array(places) - [1, 2, 3], axis=1), loop.RADIUS)
+
+
+def test_the_histogram_holds_every_answer(loop):
+    text = loop.Run(np.array([1e-6, 3e-6, 4e-6, 900e-6]), 2).histogram()
+    assert [line.split()[:3] for line in text.splitlines()[:-1]] == [
+        ["1", "us", "1"], ["4", "us", "2"], ["1024", "us", "1"]
+    ]  # fmt: skip
+    assert "4 answered, 2 missed" in text and "worst 900 us" in text
+
+
+def test_without_a_field_it_says_how(loop, capsys):
+    assert loop.main([]) == 2 and "field.gsparc" in capsys.readouterr().err
