@@ -69,6 +69,7 @@ COMMANDS = {
         Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
         Command("link", "rates and block errors with predicted channels: ckpt=FILE", f"{ROOM}link.command"),
         Command("export", "the model for other programs: ckpt=FILE to=c, cir, deepmimo, sionna"),
+        Command("serve", "answers over HTTP: ckpt=FILE", f"{ROOM}serve.command"),
         Command("locate", "where rows were heard, by the field's likelihood: ckpt=FILE"),
         Command("map", "received power over an area with a promised error: ckpt=FILE"),
         Command("view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
