@@ -176,7 +176,9 @@ def _ray() -> Any:
 def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Results:
     ray, threads = _ray(), torch.get_num_threads()
     if not ray.is_initialized():
-        ray.init(_chosen.address, include_dashboard=False, logging_level="error", log_to_driver=False)
+        # "local": else ray.init joins any cluster that happens to run on this machine
+        where = _chosen.address or os.environ.get("RAY_ADDRESS", "local")
+        ray.init(where, include_dashboard=False, logging_level="error", log_to_driver=False)
     call = ray.remote(num_cpus=threads, max_retries=TRIES)(_piece)
     stored = ray.put(blob)
     running: list[Any] = []
