@@ -124,9 +124,14 @@ class Confidence(nn.Module):
             self.high.copy_(torch.maximum(g.max(), g.min() + 1e-6))
 
     def normalised(self, position: Tensor) -> Tensor:
-        """Confidence in [0, 1] (B,): C between the least and the largest C of the calibration data."""
+        """Confidence in [0, 1] (B,): C between the least and the largest C of the calibration data.
+
+        It decays outside the box of what was measured, where the network's lines run on unchecked.
+        """
         low, high, g = self.low.exp(), self.high.exp(), self.exponent(position).exp()
-        return ((g - low) / (high - low)).clamp(0, 1)
+        offset = (position - self.encoding.centre) / self.encoding.half_extent
+        outside = (offset.abs().amax(-1) - 1).clamp_min(0)
+        return ((g - low) / (high - low)).clamp(0, 1) * torch.exp(-outside)
 
 
 def weighted(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:

@@ -51,3 +51,12 @@ def test_one_calibration_position_gives_a_range():
     sure = confidence()
     sure.calibrate(torch.zeros(1, 3))
     assert torch.isfinite(sure.normalised(torch.randn(5, 3))).all()
+
+
+def test_far_from_what_was_measured_nothing_is_sure():
+    near, far = torch.rand(200, 3) * 2 - 1, torch.randn(500, 3) * 300
+    for seed in range(5):
+        torch.manual_seed(seed)
+        sure = Confidence(ConfidenceSettings(), PositionEncoding(EncodingSettings("raw"), BOX))
+        sure.calibrate(near)
+        assert sure.normalised(far).median() < 1e-6 < sure.normalised(near).median()
