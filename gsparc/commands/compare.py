@@ -11,10 +11,13 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
+from gsparc.commands.compare_places import Row as PlaceRow
+from gsparc.commands.compare_places import compare_places
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
+from gsparc.data.limits import choice
 from gsparc.evaluation.experiment.cells import Budget, contenders, plan, plugged
 from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
@@ -28,15 +31,19 @@ from gsparc.evaluation.summary import provenance, write_samples, write_summary
 log = logging.getLogger(__name__)
 
 
-def task(config: DictConfig) -> list[Row]:
-    """Fill the cells that are asked for and not there yet, time all methods, and report."""
+def task(config: DictConfig) -> list[Row] | list[PlaceRow]:
+    """Fill the cells that are asked for and not there yet, then time all methods, or locate; and report."""
     RunSettings.of(config)
     run_dir = run_directory()
     settings = plain(config)
+    choice("predict", "locate").check("task", settings["task"])
+    locating = settings["task"] == "locate"
     methods = plugged() | contenders(settings["methods"])
     folder = settings["cells"]
     kept = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
-    problems = problems_of(settings, kept)
+    paths = [(own or {}).get(key) for own in settings["datasets"].values() for key in ("root", "file")]
+    alone = locating and settings["locate"]["fingerprints"] and not any(paths)
+    problems = [] if alone else problems_of(settings, kept)
     budgets = [
         Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
@@ -48,6 +55,8 @@ def task(config: DictConfig) -> list[Row]:
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     with held(kept, "cells"):
         filled = fill_all(prepared, bool(settings["train"]), limit_s)
+        if locating:
+            return compare_places(filled, settings["locate"], kept, run_dir)
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each

@@ -51,13 +51,18 @@ DEVICES_DB = 6.0  # deviation of what receivers of one building add to all level
 
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    return locate(config, run_directory())
+
+
+def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
+    """Locate as conf/locate.yaml says, into a folder; returns the facts of its `summary.json`."""
     RunSettings.of(config)
     for name, limit in LIMITS.items():
         limit.check(name, config[name])
     for name in config.against:
         choice(*BASELINES).check("against", name)
     if config.dataset.name == "fingerprints":
-        return _fingerprints(config)
+        return _fingerprints(config, run_dir)
     run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
@@ -72,7 +77,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     found = Locator.of(method, data, learned, unknown, start, cells, share)
     count = 0
     if config.calibrate:
-        found, count = _calibrated(config, run, found, cells)
+        found, count = _calibrated(config, run, found, cells, run_dir)
         if config.store:
             checkpoint.amend(config.ckpt, locating.kept(found.trust, unknown, found.share))
     heard, known = _heard(config, run, data, fold)
@@ -83,15 +88,15 @@ def task(config: DictConfig) -> dict[str, Any]:
         located, promise = followed(alone, trained, heard, level), "of a track nothing is promised"
     answers = {method.name: located} | ({"alone": alone} if config.track else {})
     facts = {**run.facts(), "locate/calibrated_on": count}
-    return _report(config, facts, answers, heard, trained, data.site.origin, known, level, promise)
+    return _report(config, run_dir, facts, answers, heard, trained, data.site.origin, known, level, promise)
 
 
 def _report(
-    config: DictConfig, facts: dict[str, Any], answers: Mapping[str, list[Located]], heard: Snapshots,
-    trained: Snapshots, origin: np.ndarray, known: bool, level: float, promise: str,
+    config: DictConfig, run_dir: Path, facts: dict[str, Any], answers: Mapping[str, list[Located]],
+    heard: Snapshots, trained: Snapshots, origin: np.ndarray, known: bool, level: float, promise: str,
 ) -> dict[str, Any]:  # fmt: skip
     """Table, pictures and facts of answers, the first of which is ours; errors where places are known."""
-    run_dir, (ours, located) = run_directory(), next(iter(answers.items()))
+    ours, located = next(iter(answers.items()))
     inside = [one.posterior.level(p) <= level for one, p in zip(located, heard.place, strict=True)]
     write_samples(run_dir / "locate.csv", _columns(located, heard, origin, inside, known))
     facts |= {"locate/snapshots": len(heard), "locate/track": int(config.track)}
@@ -127,7 +132,7 @@ def _report(
     return finish(run_dir, facts, shown, lines=[said])
 
 
-def _fingerprints(config: DictConfig) -> dict[str, Any]:
+def _fingerprints(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     """A field of fingerprints is learned, and rows that it did not learn from are located."""
     chosen, seed, groups = config.dataset, int(config.seed), int(config.calibrate)
     if chosen.file is None or not OmegaConf.is_missing(config, "ckpt"):
@@ -162,7 +167,7 @@ def _fingerprints(config: DictConfig) -> dict[str, Any]:
     if config.track:
         answers["alone"] = replace(locator, speed=None, point=SHARED).locate(heard)
     both, placed = (as_snapshots(heard), as_snapshots(known)), bool(np.isfinite(heard.position).all())
-    return _report(config, facts, answers, *both, np.zeros(3), placed, locator.area.level, promise)
+    return _report(config, run_dir, facts, answers, *both, np.zeros(3), placed, locator.area.level, promise)
 
 
 def _drawn(config: DictConfig, count: int) -> np.ndarray:
@@ -173,14 +178,14 @@ def _drawn(config: DictConfig, count: int) -> np.ndarray:
 
 
 def _calibrated(
-    config: DictConfig, run: Opened, found: Locator, cells: Callable[[np.ndarray], Cells]
+    config: DictConfig, run: Opened, found: Locator, cells: Callable[[np.ndarray], Cells], run_dir: Path
 ) -> tuple[Locator, int]:
     settings = OmegaConf.create(run.stored[0].configuration)
     if "model" not in settings:
         raise ValueError(f"{config.ckpt} does not name its settings: calibrate=0 goes without")
     split = settings.get("split")
     context = FitContext(
-        run_dir=run_directory() / "left_out", seed=int(config.seed), budget_s=float(config.calibrate_s),
+        run_dir=run_dir / "left_out", seed=int(config.seed), budget_s=float(config.calibrate_s),
         split=None if split is None else split_settings(plain(split)),
         stations=settings.get("stations", "auto"),
     )  # fmt: skip
