@@ -17,6 +17,7 @@ CHOSEN_ON = 1_000  # rows that settings are chosen on: each look at them factors
 FEWEST = 150  # of them
 LOOKS = 80  # that a choice takes
 TIMED_ON = 300  # rows
+TRIES = 3  # the first makes room, and a busy machine makes one of them slow
 MAKING = 1.5  # times a factor: with making the covariance
 ONE = Kernel.of_one(1.0, 0.1)
 
@@ -47,9 +48,13 @@ def haste(budget: TimeBudget | None, share: float, count: int) -> Haste:
     began = budget.spent
     given = share * max(budget.seconds - began, 0.0)
     values, at = torch.arange(TIMED_ON, dtype=torch.float64)[:, None], torch.from_numpy(ONE.parameters())
-    gram = gram_of(at.requires_grad_(), torch.cdist(values, values))
-    LeftOutDensity.apply(gram, values, 1, True)[0].backward()  # type: ignore[no-untyped-call]
-    affordable = given / (LOOKS * max(budget.spent - began, 1e-6))
+    tried = []
+    for _ in range(TRIES):
+        watch = TimeBudget()
+        gram = gram_of(at.requires_grad_(), torch.cdist(values, values))
+        LeftOutDensity.apply(gram, values, 1, True)[0].backward()  # type: ignore[no-untyped-call]
+        tried.append(watch.spent)
+    affordable = given / (LOOKS * max(min(tried), 1e-6))
     rows = min(int(TIMED_ON * affordable ** (1 / 3)), CHOSEN_ON)
     budget.limited |= rows < min(count, CHOSEN_ON)
     return Haste(max(rows, FEWEST), lambda: budget.over((began + given) / max(budget.seconds, 1e-9)))
@@ -58,7 +63,7 @@ def haste(budget: TimeBudget | None, share: float, count: int) -> Haste:
 def factor_s(rows: int) -> float:
     """About how long a complex covariance of so many rows takes to make and to factor here, now [s]."""
     few, tried = max(min(rows, TIMED_ON), 1), []
-    for _ in range(3):  # the first makes room, and a busy machine makes one of them slow
+    for _ in range(TRIES):
         watch = TimeBudget()
         Factor.of(torch.eye(few, dtype=torch.complex128) + 0.5)
         tried.append(watch.spent)

@@ -39,6 +39,7 @@ from gsparc.training.time_budget import TimeBudget
 
 QUERIES = 512  # at a time: memory
 CHOOSING = 0.3  # of the seconds, for the settings of the process
+CHOOSING_ALONE = 0.8  # the same where no waves are sought after it
 
 
 class PowerField(ConditionalField):
@@ -217,7 +218,8 @@ def initialise(
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
-    pace = haste(budget, CHOOSING, len(rows))
+    waves = walls is None and fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength)
+    pace = haste(budget, CHOOSING if waves else CHOOSING_ALONE, len(rows))
     if walls is not None:
         law, notes = law_of(seen, data.site)
         trend = replace(trend_of_rows(seen, law), walls=walls)
@@ -226,7 +228,7 @@ def initialise(
         return PowerField(data.site, trend, kernel, seed), (said, *notes, *more)
     trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, pace)
     field = PowerField(data.site, trend, kernel, seed)
-    if fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength):
+    if waves:
         order = np.argsort(rows)
         assert data.site.wavelength is not None
         field.fringes, said = find_fringes(

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
-from gsparc.models.haste import UNHURRIED, Haste
+from gsparc.models.haste import CHOSEN_ON, UNHURRIED, Haste
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart, bounds_of
 from gsparc.processes.nearest import Values, settings_of
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw, trend_of_rows
+from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw, trend_of_rows
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 from gsparc.processes.worker import late, late_when
@@ -75,9 +75,11 @@ def _chosen(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
 ) -> tuple[Trend, Kernel, tuple[str, ...]]:
     """The best of `trends` with its kernel, and what must be said of the choice."""
+    many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     with late_when(haste.late):
-        trend, kernel, said = _settings(rows, trends, seed, haste)
-    if len(rows.places) > MOST_ROWS and not rows.silent.any():  # these tell of settings too
+        pace = replace(haste, rows=min(haste.rows, COMPARED_ON)) if many else haste
+        trend, kernel, said = _settings(rows, trends, seed, pace)
+    if many:  # given their nearest, all tell of settings
         values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
         kernel, how = settings_of(Prior(kernel, trend), values, seed)
         said = (*said, f"then {how}")
