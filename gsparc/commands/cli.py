@@ -7,8 +7,12 @@ import inspect
 import logging
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -51,8 +55,10 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
     logging.raiseExceptions = False  # a log that a full disk cannot take: results say so themselves
+    interrupts: list[int] = []
     try:
-        main()
+        with _noting(interrupts):
+            main()
     except KeyboardInterrupt as interrupt:
         _print_error(str(interrupt) or "interrupted")
         sys.exit(130)
@@ -68,14 +74,33 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
             sys.exit(130)
         if before == "1":
             raise error from error.__cause__
-        _print_error(_message_of(error))
-        sys.exit(1)
+        _print_error(f"interrupted: {_message_of(error)}" if interrupts else _message_of(error))
+        sys.exit(130 if interrupts else 1)
     finally:
         logging.raiseExceptions = True
         release()
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
+
+
+@contextmanager
+def _noting(interrupts: list[int]) -> Iterator[None]:
+    """Within, Ctrl-C also leaves its number: compiled code may swallow it and raise an error of its own."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield  # nothing arrives here, or Ctrl-C is ignored
+        return
+
+    def noted(signum: int, frame: FrameType | None) -> object:
+        interrupts.append(signum)
+        return before(signum, frame)
+
+    signal.signal(signal.SIGINT, noted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _began_as_interrupt(error: BaseException | None) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import subprocess
 import sys
 
@@ -101,6 +103,22 @@ def test_ctrl_c_while_a_library_cleans_up_was_its_error_and_status_1(monkeypatch
     words = ("train", "dataset=rfid", "model=gsparc", f"hydra.run.dir={tmp_path}")
     status, _, err = gsparc(monkeypatch, capsys, *words)
     assert status == 130 and err.splitlines()[-1] == "error: interrupted"
+
+
+def test_ctrl_c_in_compiled_code_came_out_as_an_error_of_its_own(monkeypatch, capsys, tmp_path):
+    """Of matplotlib: "Invalid bounding box", with nothing left of the interrupt."""
+
+    def task(config):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise ValueError("Invalid bounding box")
+
+    monkeypatch.setattr("gsparc.commands.train.task", task)
+    words = ("train", "dataset=rfid", "model=gsparc", f"hydra.run.dir={tmp_path}")
+    before = signal.getsignal(signal.SIGINT)
+    status, _, err = gsparc(monkeypatch, capsys, *words)
+    assert status == 130 and err.splitlines()[-1] == "error: interrupted: Invalid bounding box"
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch, capsys):
