@@ -237,3 +237,36 @@ def test_sionna_hears_the_models_channel(tmp_path, receives):
         assert np.mean(np.abs(one - expected) ** 2) < 1e-3 * np.mean(np.abs(expected) ** 2)
     with pytest.raises(ValueError, match="from a trajectory of"):
         model(1, 20, 10.0)
+
+
+@pytest.mark.slow
+def test_a_link_over_exported_taps_is_the_link_study(tmp_path):
+    """The same blocks in the same noise: over the model's channels, as `gsparc link`, and over its taps."""
+    sionna = pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
+    from sionna.phy.channel import cir_to_ofdm_channel
+
+    from gsparc.commands.link.pusch import Pusch
+    from gsparc.prediction.along.link import TrajectoryChannel
+
+    tones = CARRIER + 30e3 * (np.arange(48) - 23.5)
+    ray, way = Rays(tones, True), drive()
+    line = fitted(ray, way, 32, 30.72e6)
+    delay = (line.first + np.arange(32)) / line.rate_hz
+    held = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay, "rx_position": way.at(line.time_s)}
+    write_raw(tmp_path / "cir.npz", Raw(held))
+    gain, tau = TrajectoryChannel(tmp_path / "cir.npz", seed=3)(32, 1, 1.0)  # still while a slot lasts
+    offset = torch.from_numpy((tones - CARRIER).astype(np.float32))
+    exported = cir_to_ofdm_channel(offset, gain, tau).reshape(32, 48)
+    begin = np.random.default_rng(3).uniform(0, 1, 32) * 0.5
+    study = torch.from_numpy(ray.csi(rx=way.at(begin))[:, 0].astype(np.complex64))
+    assert (exported - study).abs().square().mean() < 1e-5 * study.abs().square().mean()
+    pusch = Pusch("qpsk", 4, 30, np.ones(48, complex), 8, ["perfect", "predicted"])
+    blocks = []
+    for heard in (study, exported):
+        torch.manual_seed(0)
+        sionna.config.seed = 0
+        blocks.append(pusch.run(heard, study, torch.full((32,), 1e-3), 3.0, np.arange(1024) % 32, 128))
+    for name in ("perfect", "predicted"):
+        there, here = (one.failed[name] for one in blocks)
+        assert 0.02 < there.mean() < 0.98 and (there != here).mean() < 0.01
+        assert abs(blocks[0].bit_errors[name] - blocks[1].bit_errors[name]).mean() < 1e-3
