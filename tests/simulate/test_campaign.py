@@ -484,12 +484,13 @@ def test_scenes_that_cannot_be_are_refused(tmp_path, changes, words):
 
 @dataclass
 class Counted(campaigns._Tracing):
-    """Writes beside the file which shards are begun; the process of the third ends, once."""
+    """Writes beside the file which shards are traced; the process of the third ends, once."""
 
     def __call__(self, shard):
         begun, killed = (self.shards.out.with_name(name) for name in ("begun", "killed"))
-        with begun.open("a") as file:
-            file.write(f"{shard[0]}\n")
+        if not self.shards.path(shard[0]).exists():
+            with begun.open("a") as file:
+                file.write(f"{shard[0]}\n")
         if shard[0] == 3 and not killed.exists():
             killed.touch()
             os.kill(os.getpid(), signal.SIGKILL)
