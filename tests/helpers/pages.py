@@ -182,8 +182,9 @@ class Tiny:
         if name == "compare":
             for key in [key for key in words if key.startswith("datasets.")] or ["datasets.rfid.root"]:
                 words[key] = self.data(ALIKE.get(key.split(".")[1], key.split(".")[1]))
+            methods = ("gp",) if words.get("task") == "locate" else ("mean", "nearest")
             only = [f"{key.split('.')[1]}/*/{method}/*" for key in words if key.startswith("datasets.")
-                    for method in (("gp",) if words.get("task") == "locate" else ("mean", "nearest"))]  # fmt: skip
+                    for method in methods]  # fmt: skip
             words |= {"only": f"[{','.join(only)}]", "cells": str(run.parent / "cells"), "latency": "false"}
             words |= {"splits.blocks_300m.choose": "['split=blocks','split.side_m=5']"}  # a small city
         words |= TINY.get(name, {})
