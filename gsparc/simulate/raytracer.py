@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
@@ -95,6 +96,9 @@ class RayTracer:
         antenna: Antenna = ISOTROPIC,
     ) -> None:
         llvm.prepare()
+        import drjit as dr
+
+        dr.set_thread_count(torch.get_num_threads())  # of one thread alone the bits come again
         self.sampling = sampling
         self.wavelength = LIGHT / carrier_hz
         self.scene = _load(source, carrier_hz, scattering)
