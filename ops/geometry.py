@@ -32,6 +32,9 @@ class Gaussians(NamedTuple):
 class Pose:
     """Receiver poses.
 
+    >>> Pose.identity(torch.zeros(3)).local(torch.tensor([[1.0, 2.0, 0.5]]))
+    tensor([[1.0000, 2.0000, 0.5000]])
+
     Attributes:
         position: (3,) or (P, 3) [m], world frame.
         rotation: (3, 3) or (P, 3, 3), local to world; columns are the local axes seen from the world.
@@ -91,6 +94,9 @@ class SphereGrid:
 
     Elevation is `atan2(z, hypot(x, y))` in [-pi/2, pi/2], azimuth `atan2(y, x)` in (-pi, pi],
     both in the receiver's local frame (boresight z).
+
+    >>> SphereGrid.hemisphere(2, 8).elevations().rad2deg()
+    tensor([ 0., 45.], dtype=torch.float64)
 
     Attributes:
         height, width: number of elevations and azimuths.

@@ -99,7 +99,8 @@ def plan_next(
     """Choose places to measure next, as a batch.
 
     >>> found = gsparc.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
-    >>> found.places, found.before_db, found.after_db
+    >>> found.places.shape, found.after_db < found.before_db
+    ((20, 3), True)
 
     Args:
         predictor: of powers; None before anything is measured, with `area` or `plan`.

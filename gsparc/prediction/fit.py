@@ -42,7 +42,8 @@ def fit(
     """A model of all rows, ready to be asked; checks and messages are those of a file of one's own.
 
     >>> predictor = gsparc.fit(rx=places, tx=[12.0, 30.0, 2.6], rssi=powers_dbm)
-    >>> predictor.rssi(rx=[[3.0, 4.0, 1.5]])
+    >>> predictor.rssi(rx=[[3.0, 4.0, 1.5]]).shape
+    (1, 1)
 
     Args:
         rx, tx: (n, 3) places of the receiver and of the transmitter [m], (3,) of the one that stands still.

@@ -111,6 +111,9 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
 def load(path: str | Path, budget_ms: float | None = None, confidence: str | None = None) -> Predictor:
     """The model in a checkpoint, ready to be asked.
 
+    >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5]).shape
+    (1,)
+
     Args:
         path: the file.
         budget_ms: what one query may take on this machine, end to end [ms]. The operating points that

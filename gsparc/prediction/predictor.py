@@ -44,6 +44,8 @@ class Predictor:
 
     >>> at = torch.tensor([2.0, 1.0, 1.5], dtype=torch.float64, requires_grad=True)
     >>> predictor.rssi(rx=at, grad=True).log10().sum().backward()
+    >>> at.grad.shape
+    torch.Size([3])
 
     Args:
         method: fitted or restored.
@@ -83,7 +85,8 @@ class Predictor:
     def at(self, station: str | int) -> Predictor:
         """The same model asked about one station alone, by name or number.
 
-        >>> gsparc.load("model.ckpt").at("roof-3").rssi(rx=[2.0, 1.0, 1.5])
+        >>> gsparc.load("city.ckpt").at("roof-3").rssi(rx=[2.0, 1.0, 1.5]).shape
+        (1,)
 
         Raises:
             ValueError: no station is called that.
@@ -104,7 +107,9 @@ class Predictor:
     def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
         """World positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
 
-        >>> predictor.rssi(rx=predictor.metres(40.7652, -111.8348))
+        >>> city = gsparc.load("city.ckpt")
+        >>> city.at("roof-3").rssi(rx=city.metres(40.7652, -111.8348)).shape
+        (1,)
 
         Args:
             latitude, longitude: [deg], longitude to the east.
@@ -250,7 +255,9 @@ class Predictor:
     ) -> list[Located]:  # fmt: skip
         """Where snapshots were heard, by this model's likelihood, in world coordinates.
 
-        >>> [one.place for one in predictor.locate(powers)]  # (n, stations) linear, as `rssi` answers
+        >>> city = gsparc.load("city.ckpt")
+        >>> [one.place.shape for one in city.locate([[1e-9, 3e-8]])]  # (n, stations), linear
+        [(3,)]
 
         Args:
             values: (n, ...) spectra, channels or powers; where there are stations (n, stations, ...), NaN
