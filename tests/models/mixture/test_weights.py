@@ -78,6 +78,16 @@ def test_every_row_counts_once_whichever_part_it_is_of():
     assert share_of_second([few, many]) < 0.1 < share_of_second([few])
 
 
+def test_few_rows_that_do_not_tell_two_apart_weigh_them_alike():
+    """Of 16 training spectra the process was left out by chance: 20.11 dB where it has 20.40."""
+    rng = np.random.default_rng(0)
+    target = rng.normal(size=(16, 50))
+    alike = [target + rng.normal(size=(16, 50)) for _ in range(2)]
+    assert share_of_second([Rows(*alike, target)]) == 0.5
+    assert share_of_second([Rows(target + 0.01, alike[1], target)]) == 0.0
+    assert share_of_second([Rows(alike[0], target + 0.01, target)]) == 1.0
+
+
 def gram_of(errors: np.ndarray) -> np.ndarray:
     """Products (n, K, K) of errors (n, K)."""
     return errors[:, :, None] * errors[:, None, :]
