@@ -24,6 +24,7 @@ STROKES = ("-", "--", ":", "-.")  # where there are more lines than colours
 GREY = "#6E6E6E"
 STYLE: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=PALETTE),
+    "axes.formatter.useoffset": False,  # 29.114 is read, 0.004 beside +2.911e1 is not
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.titlesize": "medium",

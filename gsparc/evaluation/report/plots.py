@@ -181,7 +181,6 @@ def learning(runs: Sequence[Run]) -> Figure:
 def costs(runs: Sequence[Run]) -> Figure:
     """Points measured, seconds simulated, seconds trained, milliseconds a query, and the accuracy."""
     groups = grouped(runs)
-    figure, (line,) = panels(WIDE + 2, 1.2 + 0.35 * len(groups), 1, 5, grid=False, sharey=True)
     name = runs[0].figure
     columns = {
         "points measured": lambda run: float(run.measured),
@@ -190,6 +189,11 @@ def costs(runs: Sequence[Run]) -> Figure:
         "ms a query": lambda run: run.latency[0],
         heading_of(name): lambda run: run.figure_of(name),
     }
+    columns = {
+        title: value for title, value in columns.items() if any(value(run) is not None for run in runs)
+    }
+    size = WIDE + 2, 1.2 + 0.35 * len(groups)
+    figure, (line,) = panels(*size, 1, len(columns), grid=False, sharey=True)
     for panel, (title, value) in zip(line, columns.items(), strict=True):
         for row, ((_, group), style) in enumerate(_styled(runs)):
             found = over_seeds([value(run) for run in group])
