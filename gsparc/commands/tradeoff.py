@@ -27,7 +27,7 @@ from gsparc.evaluation.experiment.tradeoff import (
     others_of,
     sweep,
 )
-from gsparc.evaluation.figures import DECIDING, score_of
+from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import provenance, table, write_samples, write_summary

@@ -29,8 +29,8 @@ from gsparc.data.splits import Split, write_split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment.fit import callbacks_of, context_of, fit_and_score
-from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.found_plan import draw_found
+from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions

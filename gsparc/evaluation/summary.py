@@ -17,7 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from gsparc.data.files import whole_file
-from gsparc.evaluation.figures import DECIDING, TABLES, form_of, score_of
+from gsparc.evaluation.metric_formats import DECIDING, TABLES, form_of, score_of
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines

@@ -18,7 +18,7 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
-from gsparc.evaluation.figures import DECIDING, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
 from gsparc.models.loading import module_of

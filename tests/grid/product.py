@@ -17,7 +17,7 @@ from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import Objects, train
 from gsparc.data.schema import Measurements
-from gsparc.evaluation.figures import DECIDING
+from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.models import loading
 
 FAR_M = 1e3  # from all that was measured

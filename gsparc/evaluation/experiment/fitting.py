@@ -24,7 +24,7 @@ from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.cells import Cell, Contender, key
 from gsparc.evaluation.experiment.fit import context_of, fit_and_score, in_folders
 from gsparc.evaluation.experiment.problem import RESULT, Problem, compose, facts_of
-from gsparc.evaluation.figures import DECIDING, score_of
+from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint
 from gsparc.models.method import Method

@@ -12,7 +12,7 @@ from matplotlib.artist import Artist
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
 from gsparc.evaluation.experiment.study import Row as StudyRow
 from gsparc.evaluation.experiment.table import SCORE, Row, mean_behind
-from gsparc.evaluation.figures import axis_of, lower_is_better
+from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
 LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches

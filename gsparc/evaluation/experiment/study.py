@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.fit import Outcome, fit_and_score, in_folders
-from gsparc.evaluation.figures import DECIDING
+from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.models.method import Method
 from gsparc.models.refined_places import displaced as elsewhere
 from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries

@@ -14,7 +14,7 @@ from gsparc.data.schema import Kind
 from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled, score_db
 from gsparc.evaluation.experiment.latency import Latency
-from gsparc.evaluation.figures import DECIDING, heading_of
+from gsparc.evaluation.metric_formats import DECIDING, heading_of
 from gsparc.evaluation.summary import BUSY, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}

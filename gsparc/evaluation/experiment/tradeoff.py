@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.evaluate import paired_differences
-from gsparc.evaluation.figures import DECIDING, axis_of, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
 from gsparc.evaluation.open_runs import Opened, trained_on
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.models import loading

@@ -17,7 +17,7 @@ from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
 from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
-from gsparc.evaluation.figures import PER_SAMPLE, heading_of, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
 from gsparc.evaluation.report.table import interval, over_seeds
 from gsparc.evaluation.report.tables import BASELINES, curve, grouped, validation_figure

@@ -16,7 +16,7 @@ import torch
 import yaml
 
 from gsparc.data.schema import Kind
-from gsparc.evaluation.figures import DECIDING
+from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.predictor import Predictor

@@ -9,7 +9,7 @@ from itertools import product
 
 import numpy as np
 
-from gsparc.evaluation.figures import PER_SAMPLE, TABLES, form_of, heading_of, score_of
+from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, heading_of, score_of
 from gsparc.evaluation.report.runs import Run, number, sizes
 from gsparc.evaluation.report.table import Column, Interval, Table, interval, over_seeds
 

@@ -108,7 +108,7 @@ def test_few_components_say_so(campaign, folds, tmp_path):
         GaussianProcess(components=0)
 
 
-def test_figures_on_the_real_subset(real_rfid, tmp_path):
+def test_metric_formats_on_the_real_subset(real_rfid, tmp_path):
     data = load({"name": "rfid", "root": str(real_rfid)})
     split = split_for({"name": "random"}, data)
     gp = GaussianProcess()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.evaluation.figures import DECIDING, FIGURES, PER_SAMPLE, TABLES, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import DECIDING, FIGURES, PER_SAMPLE, TABLES, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
 
 OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}  # quantiles of a figure with an entry
