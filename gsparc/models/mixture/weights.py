@@ -65,7 +65,7 @@ def share_of_second(parts: Sequence[Rows]) -> float:
 
     0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained, but not where the
     second alone is better than the first: a query may take longer rather than lose to it. Few rows that
-    do not tell the two apart weigh them alike (forecasts are combined so: J. M. Bates and C. W. J. Granger, 1969).
+    do not tell the two apart weigh them alike (J. M. Bates and C. W. J. Granger, 1969).
     """
     first, second = (np.concatenate([part.log_errors(share) for part in parts]) for share in (0.0, 1.0))
     gain, unsure = paired(first - second, np.arange(len(first)))
