@@ -20,7 +20,6 @@ import gsparc.conf
 from gsparc.evaluation.console import one_line
 from gsparc.models.method import Method
 from gsparc.models.registry import build
-from gsparc.models.splat.method import LearnedField
 from gsparc.training.fit import DEFAULTS
 
 CONF = Path(gsparc.conf.__path__[0])
@@ -90,15 +89,10 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
     }  # fmt: skip
 
 
-def test_defaults_in_code_are_those_of_the_configuration():
-    """A field made in Python was another one than `model=gsparc` with its effects off."""
-    config = compose()
-    composed, own = build(config.model), LearnedField()
-    for name in ("settings", "loss", "rates", "init", "refit", "keep_best", "guesses", "name"):
-        assert getattr(composed, name) == getattr(own, name), name
-    trainer = OmegaConf.to_container(config.trainer)
-    del trainer["_target_"], trainer["gradient_clip_val"]
-    assert DEFAULTS.keywords == trainer and config.trainer.gradient_clip_val is None
+def test_trainer_defaults_in_code_are_those_of_the_configuration():
+    trainer = OmegaConf.to_container(compose().trainer)
+    del trainer["_target_"]
+    assert trainer.pop("gradient_clip_val") is None and DEFAULTS.keywords == trainer
 
 
 def test_the_paper_leaves_nothing_to_auto():

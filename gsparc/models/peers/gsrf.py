@@ -125,10 +125,11 @@ class GSRF(GaussianPeer):
     makes = ComplexGaussians
     name: str = "gsrf"
     count: int = 500
-    degree: int = 3
-    order: int = 3
+    degree: int = 5
+    order: int = 5
     ssim_weight: float = 0.19
     fourier_weight: float = 0.05
+    rate: float = 8e-3
 
 
 def _magnitude(image: Tensor) -> Tensor:

@@ -44,6 +44,7 @@ class NGRF(TrainedPeer):
     }  # fmt: skip
     name: str = "ngrf"
     count: int = 30
+    rate: float = 5e-3
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`; `ValueError` without a frequency, or for spectra without an array."""

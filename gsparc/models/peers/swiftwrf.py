@@ -114,6 +114,7 @@ class SwiftWRF(DeformedPeer):
     makes = PlanarGaussians
     name: str = "swiftwrf"
     count: int = 300
+    rate: float = 5e-3
 
 
 def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:

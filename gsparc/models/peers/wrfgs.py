@@ -72,3 +72,4 @@ class WRFGSPlus(DeformedPeer):
     rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
     makes = DeformedGaussians
     name: str = "wrfgs"
+    batch_size: int = 4

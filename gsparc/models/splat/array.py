@@ -22,7 +22,7 @@ class ArrayField(LearnedField):
     resumable = False
 
     def __init__(
-        self, field: FieldSettings = FieldSettings(), refit: bool = True, name: str = "array"
+        self, field: FieldSettings = FieldSettings(count=128), refit: bool = True, name: str = "array"
     ) -> None:
         super().__init__(
             field=field,

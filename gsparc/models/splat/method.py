@@ -91,7 +91,7 @@ class LearnedField(Method):
         init: InitSettings | None = None,
         refit: bool = True,
         keep_best: bool = True,
-        steps: int | Literal["auto"] | None = None,
+        steps: int | Literal["auto"] | None = "auto",
         guesses: Sequence[str] = (),
     ) -> None:
         check_arguments(
