@@ -47,7 +47,7 @@ HEAD = (
 
 
 def make(name: str) -> Method:
-    """An unfitted method with what `conf/model` sets."""
+    """An unfitted method with what `model=` sets."""
     from hydra import compose, initialize_config_module
 
     from gsparc.models.registry import build

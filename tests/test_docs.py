@@ -94,7 +94,7 @@ def test_commands_compose():
 )
 def test_choices_are_there(page, group):
     chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", "\n".join(said(page)))
-    offered = ("help", *shipped()) if group == "scene" else ()
+    offered = {"scene": ("help", *shipped()), "model": METHODS}.get(group, ())
     written = [name for name in chosen if name not in offered]
     assert not [name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()]
 

@@ -9,7 +9,8 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
 
-from gsparc.data.instantiate import GROUPS, plugins, settings_of
+from gsparc.data.instantiate import GROUPS, node_of, plugins
+from gsparc.models.registry import method_node
 from gsparc.simulate.scenes.shipped import settings, shipped
 
 
@@ -21,12 +22,12 @@ def offer() -> None:
     for group in GROUPS:
         for name, path in plugins(group).items():
             try:
-                own = settings_of(get_class(path))
+                own = method_node(path) if group == "model" else node_of(get_class(path))
             except Exception as error:  # whatever another package does when it is imported
                 warnings.warn(f"plugin {name} ({path}) is left out: {error}", stacklevel=1)
                 continue
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
-            node = {"_target_": path, **own, **shared}
+            node = {**own, **shared}
             ConfigStore.instance().store(name=name, group=group, node=node, provider="plugin")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
@@ -74,13 +74,39 @@ def plugins(group: str) -> dict[str, str]:
     return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=GROUPS[group])}
 
 
-def settings_of(kind: type) -> dict[str, Any]:
-    """What `kind.__init__` takes, with its defaults; `???` where there is none, classes left out."""
-    taken = inspect.signature(kind).parameters.values()
-    named = [p for p in taken if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-    found = {p.name: "???" if p.default is p.empty else p.default for p in named}
-    return {
-        name: list(v) if isinstance(v, tuple) else v
-        for name, v in found.items()
-        if isinstance(v, (*PLAIN, tuple))
-    }
+def node_of(kind: type, linked: Mapping[str, str] = {}) -> dict[str, Any]:
+    """The node of a configuration that builds a class: what it takes with defaults; `???` without one.
+
+    Dataclasses of settings are nodes of their own; `**names` stands for what the base class takes. Left
+    out are defaults that no configuration can hold.
+
+    Args:
+        kind: a class.
+        linked: settings, where the class has them, that follow others: `{"seed": "${seed}"}`.
+    """
+    shown = {name: v for name, default in _defaults(kind).items() if (v := _plain(default)) is not _OTHER}
+    links = {name: link for name, link in linked.items() if name in shown}
+    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **shown, **links}
+
+
+_OTHER = object()
+
+
+def _defaults(kind: type) -> dict[str, Any]:
+    if kind is object:
+        return {}
+    own = list(inspect.signature(kind.__init__).parameters.values())[1:]  # type: ignore[misc]
+    base = _defaults(kind.__mro__[1]) if any(p.kind is p.VAR_KEYWORD for p in own) else {}
+    named = {p.name: p.default for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    return {**named, **{name: default for name, default in base.items() if name not in named}}
+
+
+def _plain(value: Any) -> Any:
+    if value is inspect.Parameter.empty:
+        return "???"
+    if is_dataclass(value) and not isinstance(value, type):
+        shown = [f.name for f in fields(value) if not f.metadata.get("internal")]
+        path = f"{type(value).__module__}.{type(value).__qualname__}"
+        return {"_target_": path, **{name: _plain(getattr(value, name)) for name in shown}}
+    value = list(value) if isinstance(value, tuple) else value
+    return value if isinstance(value, PLAIN) else _OTHER

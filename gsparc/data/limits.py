@@ -103,6 +103,11 @@ def setting(default: Any, limit: Limit) -> Any:
     return dataclasses.field(default=default, metadata={"limit": limit})
 
 
+def internal(default: Any) -> Any:
+    """A field of a dataclass of settings that configurations leave out."""
+    return dataclasses.field(default=default, metadata={"internal": True})
+
+
 class Checked:
     """A dataclass that refuses, with `SettingError`, what its fields' limits do not allow."""
 

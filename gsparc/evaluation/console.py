@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from hydra import errors
+from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.data.instantiate import GROUPS, plugins, suggest
+from gsparc.data.instantiate import suggest
 from gsparc.data.limits import SettingError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -82,7 +83,8 @@ def _choices(group: str) -> list[str]:
     """Every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
     folder = config_folder() / group
     own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
-    return sorted(own.union(plugins(group) if group in GROUPS else ()))
+    stored = ConfigStore.instance().repo.get(group, {})
+    return sorted(own.union(name.removesuffix(".yaml") for name in stored))
 
 
 def _argument(text: str) -> str | None:

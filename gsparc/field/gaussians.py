@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.limits import POSITIVE, SHARE, Checked, number, or_null, setting, whole
+from gsparc.data.limits import POSITIVE, SHARE, Checked, internal, number, or_null, setting, whole
 from gsparc.data.site_objects import GaussianCloud
 
 FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
@@ -32,7 +32,7 @@ class FieldSettings(Checked):
     """
 
     count: int = setting(500, whole(0))
-    placement: Literal["auto", "uniform", "sphere"] = "auto"
+    placement: Literal["auto", "uniform", "sphere"] = internal("auto")
     margin: float = setting(2.0, number(0))
     near: float = setting(1.0, number(0))
     far: float = setting(6.0, POSITIVE)

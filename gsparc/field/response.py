@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, number, setting
+from gsparc.data.limits import Checked, internal, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
 from gsparc.ops.channels import channels
@@ -36,7 +36,7 @@ class ResponseSettings(Checked):
         pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
     """
 
-    array: bool = False
+    array: bool = internal(False)
     pattern: float = setting(0.0, number(0))
 
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -55,6 +55,7 @@ class Method(ABC):
 
     name: str
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
+    linked: ClassVar[Mapping[str, str]] = {"seed": "${seed}"}  # settings that follow those of the run
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)

@@ -12,7 +12,7 @@ import logging
 from abc import abstractmethod
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -76,18 +76,19 @@ class PlannedField(LearnedField):
     """
 
     both_ends = True
+    linked: ClassVar[dict[str, str]] = {"init": "${oc.select:init,null}"}  # the group `init`
 
     @abstractmethod
     def planned(self, data: Measurements) -> Plan:
         """What is trained for these measurements."""
 
     def __init__(
-        self, effects: EffectSettings | None = None, position_std: float | None = None, **field: Any
+        self, effects: EffectSettings = EffectSettings(), position_std: float | None = None, **field: Any
     ) -> None:
         check_arguments(locals(), position_std=or_null(number(0)))
         super().__init__(**field)
         self.position_std = position_std
-        self.switches = effects or EffectSettings()
+        self.switches = effects
         self.field: ConditionalField | None = None
         self.plan: Plan | None = None
         self.explained: float | None = None

@@ -1,15 +1,18 @@
-"""Methods by name, imported when asked for, and methods built from `conf/model/*.yaml`."""
+"""Methods by name: choices of `model=` with the settings of their classes, which are imported when chosen."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.instantiate import plugins, refuse_foreign, suggest, targets
-from gsparc.models.method import Method
+from gsparc.data.instantiate import node_of, plugins, refuse_foreign, suggest, targets
+
+if TYPE_CHECKING:  # brings torch, which a list of choices does not need
+    from gsparc.models.method import Method
 
 METHODS = {
     "zero": "gsparc.models.baselines.zero.Zero",
@@ -36,6 +39,31 @@ METHODS = {
     "moving_array": "gsparc.models.moving_array.method.MovingArrayField",
     "gsparc": "gsparc.models.gsparc.Gsparc",
 }
+
+
+class _Chosen(ConfigNode):
+    """A choice of `model=` that reads its class when it is chosen: to import all of them takes a second."""
+
+    def __init__(self, name: str, path: str) -> None:
+        self.name, self.path = f"{name}.yaml", path
+        self.group, self.package, self.provider = "model", None, "gsparc"
+
+    def __getattr__(self, attribute: str) -> DictConfig:
+        if attribute != "node":
+            raise AttributeError(attribute)
+        return OmegaConf.create(method_node(self.path))
+
+
+def method_node(path: str) -> dict[str, Any]:
+    """What `model=` holds of the class that an import path names; some of it follows the run's settings."""
+    kind = get_class(path)
+    return node_of(kind, kind.linked)
+
+
+def offer() -> None:
+    """Make every method a choice of Hydra's group `model`."""
+    models = ConfigStore.instance().repo.setdefault("model", {})
+    models |= {f"{name}.yaml": _Chosen(name, path) for name, path in METHODS.items()}
 
 
 def known() -> dict[str, str]:
@@ -70,6 +98,8 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
     if not trusted:
         for path in targets(OmegaConf.to_container(node, resolve=False)):
             refuse_foreign(path)
+    from gsparc.models.method import Method
+
     method = instantiate(node)
     if not isinstance(method, Method):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")

@@ -9,7 +9,7 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
-from gsparc.data.limits import Checked, number, setting, whole
+from gsparc.data.limits import Checked, internal, number, setting, whole
 from gsparc.training.conditional import ConditionalField
 from gsparc.training.pace import Pace
 
@@ -38,7 +38,7 @@ class OptimizerSettings(Checked):
     gain: float = setting(0.005, RATE)
     decay: float = setting(0.05, RATE)
     warmup: int = setting(0, whole(0))
-    eps: float = setting(1e-15, RATE)
+    eps: float = internal(1e-15)
 
 
 KINDS = {

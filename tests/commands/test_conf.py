@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 import gsparc.conf
 from gsparc.evaluation.console import one_line
 from gsparc.models.method import Method
-from gsparc.models.registry import build
+from gsparc.models.registry import METHODS, build
 from gsparc.training.fit import DEFAULTS
 
 CONF = Path(gsparc.conf.__path__[0])
@@ -27,7 +27,6 @@ ROOT = Path(__file__).parents[2]
 GROUPS = (
     "dataset",
     "split",
-    "model",
     "trainer",
     "callbacks",
     "logger",
@@ -35,6 +34,7 @@ GROUPS = (
     "experiment",
 )  # of train.yaml
 CHOICES = sorted(f"{group}={file.stem}" for group in GROUPS for file in (CONF / group).glob("*.yaml"))
+CHOICES += [f"model={name}" for name in METHODS]
 NEEDED = {
     "dataset=own": ["dataset.file=x.npz"],
     "dataset=newrf": ["dataset.file=x.npz"],
@@ -111,7 +111,7 @@ def run_directory(monkeypatch, *overrides: str) -> str:
     return config.hydra.run.dir
 
 
-@pytest.mark.parametrize("model", sorted(file.stem for file in (CONF / "model").glob("*.yaml")))
+@pytest.mark.parametrize("model", METHODS)
 def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
     """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
     named = run_directory(monkeypatch, f"model={model}", "dataset=own")

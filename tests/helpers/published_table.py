@@ -1,6 +1,6 @@
 """The table of docs/peers.md: settings of the peers beside the published ones.
 
-Ours are in conf/model, the published ones in conf/paper; what was left out is in the modules' docstrings.
+Ours are defaults of their classes, the published ones in conf/paper; docstrings say what was left out.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from gsparc.models.registry import METHODS
+from gsparc.models.registry import METHODS, method_node
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "peers.md"
@@ -29,7 +29,7 @@ def table() -> str:
     for peer in PEERS:
         ours, paper = settings("model", peer), settings("paper", peer)
         if unknown := set(paper) - set(ours):
-            raise ValueError(f"conf/paper/{peer}.yaml: {unknown} are no settings of conf/model/{peer}.yaml")
+            raise ValueError(f"conf/paper/{peer}.yaml: {unknown} are no settings of model={peer}")
         same = [f"{key} {value}" for key, value in paper.items() if ours[key] == value]
         other = [f"{key} {ours[key]} ({value})" for key, value in paper.items() if ours[key] != value]
         alone = [f"{key} {value}" for key, value in ours.items() if key not in paper and value is not None]
@@ -40,11 +40,11 @@ def table() -> str:
 
 
 def settings(group: str, peer: str) -> dict[str, Any]:
-    """Settings of a peer in conf/`group`: `model` or `paper`."""
-    file = ROOT / "conf" / group / f"{peer}.yaml"
-    told = yaml.safe_load(file.read_text(encoding="utf-8")) if file.exists() else {}
-    told = told if group == "model" else told.get("model", {})
-    return {key: value for key, value in told.items() if key not in NO_SETTING}
+    """Settings of a peer: ours (`model`), or those of conf/paper."""
+    file = ROOT / "conf" / "paper" / f"{peer}.yaml"
+    paper = yaml.safe_load(file.read_text(encoding="utf-8")).get("model", {}) if file.exists() else {}
+    chosen = method_node(METHODS[peer]) if group == "model" else paper
+    return {key: value for key, value in chosen.items() if key not in NO_SETTING}
 
 
 def written(text: str) -> str:

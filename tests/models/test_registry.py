@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
-from pathlib import Path
+from dataclasses import is_dataclass
 
 import pytest
-import yaml
-from hydra.utils import get_class
-from hydra.utils import instantiate as construct
+from campaigns import compose
 
 from gsparc.data import instantiate
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method
 from gsparc.models.registry import METHODS, build, method_class
-
-MODELS = Path(__file__).parents[2] / "conf" / "model"
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -23,35 +18,13 @@ def test_every_name_is_a_method(name):
     assert issubclass(method_class(name), Method)
 
 
-def test_every_model_of_the_configuration_has_a_name():
-    """`model=directional_gp` could be trained, but was no baseline, nor read from a bare checkpoint."""
-    targets = {file.stem: yaml.safe_load(file.read_text())["_target_"] for file in MODELS.glob("*.yaml")}
-    assert targets == METHODS
-
-
-def defaults(kind: type) -> dict[str, object]:
-    """Defaults of a class's arguments, also of those that a base class takes."""
-    taken = [inspect.signature(base.__init__).parameters for base in reversed(kind.__mro__)]
-    return {name: p.default for of in taken for name, p in of.items() if p.kind is not p.VAR_KEYWORD}
-
-
-def assert_same(node: dict, kind: type) -> None:
-    for key, value in node.items():
-        if key == "_target_" or (isinstance(value, str) and value.startswith("${")):
-            continue  # of the run
-        default = defaults(kind)[key]
-        if isinstance(value, dict):
-            made = construct(value)
-            assert made == (type(made)() if default is None else default), key
-        else:
-            assert value == (list(default) if isinstance(default, tuple) else default), key
-
-
-@pytest.mark.parametrize("file", sorted(MODELS.glob("*.yaml")), ids=lambda file: file.stem)
-def test_defaults_of_a_class_are_those_of_its_configuration(file):
+@pytest.mark.parametrize("name", METHODS)
+def test_choices_hold_defaults_of_their_class(name):
     """`baselines=[gsrf]` trained other settings than `model=gsrf`."""
-    node = yaml.safe_load(file.read_text())
-    assert_same(node, get_class(node["_target_"]))
+    chosen, own = build(compose(f"model={name}").model), method_class(name)()
+    for key, value in vars(own).items():
+        if isinstance(value, (int, float, str, tuple)) or is_dataclass(value):
+            assert getattr(chosen, key) == value, key
 
 
 def test_a_typo_gets_the_nearest_name():

@@ -99,8 +99,8 @@ class MovingArrayField(Differentiable):
 
     def __init__(
         self,
-        search: SearchSettings | None = None,
-        trend: TrendSettings | None = None,
+        search: SearchSettings = SearchSettings(),
+        trend: TrendSettings = TrendSettings(),
         searches: int = 1,
         rest_rows: int = 1500,
         components: int = 512,
@@ -113,7 +113,7 @@ class MovingArrayField(Differentiable):
             raise ValueError(
                 f"{name}: model.searches={searches}, model.rest_rows={rest_rows}: expected at least 1 and 3"
             )
-        self.search, self.trend = search or SearchSettings(), trend or TrendSettings()
+        self.search, self.trend = search, trend
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
         self.seed, self.name, self.most_searches = seed, name, most_searches
         self.trends: list[Trend] = []

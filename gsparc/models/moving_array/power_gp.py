@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import internal
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out
 from gsparc.processes.posterior import Exact
@@ -26,7 +27,7 @@ class TrendSettings:
         rows: training rows that the length is chosen on, by leave-one-out error.
     """
 
-    lengths: tuple[float, ...] = (0.06, 0.12, 0.25)
+    lengths: tuple[float, ...] = internal((0.06, 0.12, 0.25))
     noise: float = 1.0
     rows: int = 600
 

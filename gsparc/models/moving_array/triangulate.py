@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import internal
 from gsparc.data.schema import Measurements
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
@@ -41,15 +42,15 @@ class SearchSettings:
     """
 
     sources: int = 48
-    per_round: int = 8
+    per_round: int = internal(8)
     rows: int = 100
     candidates: int = 12000
     reach: float = 0.65
-    apart: float = 0.08
-    least_gain: float = 0.02
-    ridge: float = 0.01
+    apart: float = internal(0.08)
+    least_gain: float = internal(0.02)
+    ridge: float = internal(0.01)
     steps: int = 150
-    rate: float = 0.05
+    rate: float = internal(0.05)
 
 
 def bearings(sources: Tensor, receivers: Tensor, rotation: Tensor) -> Tensor:

@@ -86,7 +86,7 @@ class LearnedField(Method):
         confidence: ConfidenceSettings = ConfidenceSettings(),
         loss: LossSettings = LossSettings(),
         optimizer: OptimizerSettings = OptimizerSettings(),
-        response: ResponseSettings | None = None,
+        response: ResponseSettings = ResponseSettings(),
         name: str = "gsparc",
         init: InitSettings | None = None,
         refit: bool = True,
@@ -97,7 +97,6 @@ class LearnedField(Method):
         check_arguments(
             locals(), refit=switch(), keep_best=switch(), steps=or_null(or_word(whole(0), "auto"))
         )
-        response = response or ResponseSettings()
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)

@@ -48,11 +48,15 @@ class UplinkField(UplinkMethod):
     name = "uplink"
 
     def __init__(
-        self, search: SearchSettings | None = None, teachers: int = 1200, shrink: bool = True, seed: int = 0
+        self,
+        search: SearchSettings = SearchSettings(),
+        teachers: int = 1200,
+        shrink: bool = True,
+        seed: int = 0,
     ) -> None:
         if teachers < 50:
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
-        self.settings, self.teachers = search or SearchSettings(), teachers
+        self.settings, self.teachers = search, teachers
         self.shrink, self.seed = shrink, seed
         self.error_model: ErrorModel | None = None
 

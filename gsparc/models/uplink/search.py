@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import internal
 from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
 from gsparc.processes.factor import Factor
 
@@ -92,7 +93,7 @@ class SearchSettings:
     refinements: int = 1
     final: int = 2
     oversampling: float = 1.5
-    delay_window: tuple[float, float] = (-0.12, 0.30)
+    delay_window: tuple[float, float] = internal((-0.12, 0.30))
     leakage: float = 3e-4
 
 
