@@ -123,6 +123,13 @@ def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
     assert np.corrcoef(chosen.unknown, np.log(chosen.error))[0, 1] > 0.5
 
 
+def test_fit_without_a_run_folder_writes_nothing(known_campaign, tmp_path, monkeypatch):
+    """`gsparc.fit` left array_recovery.csv where it was called."""
+    monkeypatch.chdir(tmp_path)
+    ArrayField(SMALL).fit(known_campaign[0], _split(160).folds[0], FitContext())
+    assert not list(tmp_path.iterdir())
+
+
 def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
     data, _ = known_campaign
     split = _split(160)
