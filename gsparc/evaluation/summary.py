@@ -100,9 +100,17 @@ def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterab
     return found
 
 
+def markdown_table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers: bool = False) -> list[str]:
+    """Lines of a table in Markdown; `numbers`: all columns but the first are aligned right."""
+    heads = list(heads)
+    rule = "|---" + ("|---:" if numbers else "|---") * (len(heads) - 1) + "|"
+    lines = [f"| {' | '.join(cells)} |" for cells in (heads, *rows)]
+    return [lines[0], rule, *lines[1:]]
+
+
 def shown(value: float | None, form: str) -> str:
-    """A number in a format, or a dash where there is none."""
-    return "-" if value is None else format(value, form)
+    """A number in a format, or a dash where there is none or NaN."""
+    return "-" if value is None or math.isnan(value) else format(value, form)
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:

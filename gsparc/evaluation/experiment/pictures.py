@@ -2,47 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.artist import Artist
 
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
 from gsparc.evaluation.experiment.study import Row as StudyRow
-from gsparc.evaluation.experiment.table import SCORE, Row, mean_behind
+from gsparc.evaluation.experiment.table import SCORE, by_mean_behind
 from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
 LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches
 
 
-def draw_budgets(rows: Sequence[Row], path: Path, ours: str) -> None:
+def draw_budgets(rows: pd.DataFrame, path: Path, ours: str) -> None:
     """A method looks the same in all panels; a line joins its budgets.
 
     Args:
-        rows: of the splits that are not drawn several times.
+        rows: as of `rows_of`, of the splits that are not drawn several times.
         path: PNG file.
         ours: the method with the largest mark.
     """
-    datasets = list(dict.fromkeys(row.dataset for row in rows))
-    splits = {name: list(dict.fromkeys(r.split for r in rows if r.dataset == name)) for name in datasets}
-    columns = max(map(len, splits.values())) + any(row.query_ms for row in rows)
-    size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(datasets) + 0.9)
-    figure, grid = panels(*size, len(datasets), columns, sharey="row")
-    for line, dataset in zip(grid, datasets, strict=True):
-        here = [row for row in rows if row.dataset == dataset]
-        for axis, split in zip(line, splits[dataset], strict=False):
-            _panel(axis, [row for row in here if row.split == split], "train_cpu_s", ours)
-            axis.set(title=f"{dataset}, {split}", xlabel="training, CPU [s]")
-        line[0].set_ylabel(SCORE[here[0].figure])
-        free = line[len(splits[dataset]) :]
-        timed = [row for row in here if row.split == splits[dataset][0] and row.query_ms is not None]
-        if timed:
-            _panel(free[0], timed, "query_ms", ours)
-            free[0].set(title=f"{dataset}, {splits[dataset][0]}", xlabel="one query [ms]")
-        for axis in free[1 if timed else 0 :]:
+    groups = [here for _, here in rows.groupby("dataset", sort=False)]
+    columns = max(here.split.nunique() for here in groups) + bool(rows.query_ms.any())
+    size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
+    figure, grid = panels(*size, len(groups), columns, sharey="row")
+    for line, here in zip(grid, groups, strict=True):
+        free = list(line)
+        first = here[here.split == here.split.iloc[0]]
+        wanted = [(own, "train_cpu_s", "training, CPU [s]") for _, own in here.groupby("split", sort=False)]
+        if first.query_ms.notna().any():
+            wanted.append((first, "query_ms", "one query [ms]"))
+        for own, horizontal, label in wanted:
+            axis = free.pop(0)
+            _panel(axis, own, horizontal, ours)
+            axis.set(title=f"{own.dataset.iloc[0]}, {own.split.iloc[0]}", xlabel=label)
+        line[0].set_ylabel(SCORE[here.figure.iloc[0]])
+        for axis in free:
             axis.set_visible(False)
     handles: dict[str, Artist] = {}
     for axis in grid.flat:
@@ -53,58 +53,51 @@ def draw_budgets(rows: Sequence[Row], path: Path, ours: str) -> None:
     save(figure, path)
 
 
-def _panel(axis: Any, rows: Sequence[Row], horizontal: str, ours: str) -> None:
-    for name in dict.fromkeys(row.method for row in rows):
-        own: Iterable[Row] = sorted((r for r in rows if r.method == name), key=lambda r: r.budget_s or 0)
-        known = [(getattr(r, horizontal), r.score_db, r.spread_db or 0.0) for r in own]
-        points = [(max(x, LEAST_S), *rest) for x, *rest in known if x is not None]
-        if points:
-            style = look(name).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
-            axis.errorbar(*zip(*points, strict=True), label=name, **style)
+def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
+    for name, own in rows.dropna(subset=horizontal).groupby("method", sort=False):
+        own = own.sort_values("budget_s", na_position="first")
+        style = look(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
+        x, spread = own[horizontal].clip(lower=LEAST_S), own.spread_db.fillna(0.0)
+        axis.errorbar(x, own.score_db, spread, label=name, **style)
     logarithmic(axis, fine=False)
 
 
 LINE = 0.34  # height of a method [inch]
 
 
-def draw_splits(rows: Sequence[Row], path: Path) -> None:
+def draw_splits(rows: pd.DataFrame, path: Path) -> None:
     """A panel per split of one dataset: mean and standard error over draws, training and query beside it.
 
     Args:
-        rows: of one dataset, all of drawn splits.
+        rows: as of `rows_of`, of one dataset, all of drawn splits.
         path: PNG file.
     """
-    splits = list(dict.fromkeys(row.split for row in rows))
-    names = sorted(dict.fromkeys(row.method for row in rows), key=lambda name: mean_behind(rows, name))
+    splits, names = list(rows.split.unique()), list(by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
-        here = {row.method: row for row in rows if row.split == split}
-        most = max(row.value + (row.value_error or 0.0) for row in here.values())
-        best = min(here.values(), key=lambda row: -row.score_db)
+        here = rows[rows.split == split].drop_duplicates("method", keep="last")  # the longest budget
+        here = here.fillna({"value_error": 0.0}).set_index("method")
+        most = (here.value + here.value_error).max()
+        best = here.score_db.idxmax()
         for number, name in enumerate(names):
-            if name not in here:
+            if name not in here.index:
                 axis.text(0.02 * most, number, "not possible", va="center", fontsize=8, color="0.5")
                 continue
-            row = here[name]
-            axis.barh(
-                number,
-                row.value,
-                xerr=row.value_error or 0.0,
-                color=look(name).colour,
-                alpha=1.0 if row is best else 0.45,
-                capsize=2.5,
-            )
+            row = here.loc[name]
+            bar = {"color": look(name).colour, "alpha": 1.0 if name == best else 0.45, "capsize": 2.5}
+            axis.barh(number, row.value, xerr=row.value_error, **bar)
             axis.text(
-                min(row.value + (row.value_error or 0.0) + 0.02 * most, 1.02 * most), number,
+                min(row.value + row.value_error + 0.02 * most, 1.02 * most), number,
                 f"{row.value:.3g}, fit {_seconds(row.train_s)}", va="center", fontsize=7.5,
             )  # fmt: skip
-        draws = max(row.seeds for row in here.values())
+        draws = int(here.seeds.max())
         axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
-        axis.set_xlabel(axis_of(best.figure))
+        axis.set_xlabel(axis_of(here.figure.iloc[0]))
         axis.set_yticks(np.arange(len(names)), names)
         axis.grid(axis="y", visible=False)
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
-    figure.suptitle(f"{rows[0].dataset}: mean and standard error over draws of the split; the best is dark")
+    name = rows.dataset.iloc[0]
+    figure.suptitle(f"{name}: mean and standard error over draws of the split; the best is dark")
     save(figure, path)
 
 
