@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import pandas as pd
 from matplotlib.artist import Artist
 
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
-from gsparc.evaluation.experiment.study import Row as StudyRow
 from gsparc.evaluation.experiment.table import SCORE, by_mean_behind
 from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
@@ -109,41 +107,40 @@ def _seconds(value: float) -> str:
 
 TRAINING = "training of one model [s]"
 ACCURACY = "value"
-# Condition whose rows are drawn, label of the horizontal axis, horizontal and vertical coordinate of a row.
-PANELS: tuple[tuple[str, str, Callable[[StudyRow], float], str], ...] = (
-    ("query", "position error in queries [cm]", lambda row: 100 * row.amount, ACCURACY),
-    ("train", "position error in training [cm]", lambda row: 100 * row.amount, ACCURACY),
-    ("train_known", "the same, its size known [cm]", lambda row: 100 * row.amount, ACCURACY),
-    ("directions", "error of directions of arrival [degrees]", lambda row: row.amount, ACCURACY),
-    ("keep", "measurements learned from", lambda row: row.rows, ACCURACY),
-    ("keep", "measurements learned from", lambda row: row.rows, "train_s"),
-    ("none", TRAINING, lambda row: row.train_s, ACCURACY),
-    ("none", "one query, median [ms]", lambda row: row.query_ms, ACCURACY),
+# Condition whose rows are drawn, label of the horizontal axis, its column and factor, column of the vertical.
+PANELS = (
+    ("query", "position error in queries [cm]", "amount", 100, ACCURACY),
+    ("train", "position error in training [cm]", "amount", 100, ACCURACY),
+    ("train_known", "the same, its size known [cm]", "amount", 100, ACCURACY),
+    ("directions", "error of directions of arrival [degrees]", "amount", 1, ACCURACY),
+    ("keep", "measurements learned from", "rows", 1, ACCURACY),
+    ("keep", "measurements learned from", "rows", 1, "train_s"),
+    ("none", TRAINING, "train_s", 1, ACCURACY),
+    ("none", "one query, median [ms]", "query_ms", 1, ACCURACY),
 )
 
 
-def draw_study(rows: Sequence[StudyRow], title: str, path: Path) -> None:
-    """Save the figure as PNG; a dotted line is the variant's accuracy on undisturbed data."""
-    drawn = {row.what for row in rows} - {"none"} or {"none"}  # costs alone where nothing was changed
+def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
+    """Save rows of a `Study` as PNG; a dotted line is the variant's accuracy on undisturbed data."""
+    drawn = set(rows.what) - {"none"} or {"none"}  # costs alone where nothing was changed
     wanted = [panel for panel in PANELS if panel[0] in drawn]
     figure, grid = panels(5 * len(wanted), 4, 1, len(wanted))
     figure.suptitle(title, fontsize=11)
-    for axes, (what, label, x_of, y_of) in zip(grid[0], wanted, strict=True):
-        for name in dict.fromkeys(row.variant for row in rows):
-            own = [row for row in rows if row.variant == name and row.what == what]
-            if not own:
+    name = rows.figure.iloc[0]
+    for axes, (what, label, x, factor, y) in zip(grid[0], wanted, strict=True):
+        for variant, own in rows.groupby("variant", sort=False):
+            clean, own = own[own.what == "none"], own[own.what == what]
+            if own.empty:
                 continue
-            x, y = [x_of(row) for row in own], [getattr(row, y_of) for row in own]
-            spread = [row.spread or 0.0 for row in own] if y_of == ACCURACY else None
-            (line, *_) = axes.errorbar(x, y, spread, marker="o", capsize=2, label=name)
-            clean = [row.value for row in rows if row.variant == name and row.what == "none"]
-            if clean and what != "none" and y_of == ACCURACY:
-                axes.axhline(clean[0], color=line.get_color(), linestyle=":", linewidth=1)
+            spread = own.spread.fillna(0.0) if y == ACCURACY else None
+            line, *_ = axes.errorbar(factor * own[x], own[y], spread, marker="o", capsize=2, label=variant)
+            if len(clean) and what != "none" and y == ACCURACY:
+                axes.axhline(clean.value.iloc[0], color=line.get_color(), linestyle=":", linewidth=1)
         logarithmic(axes)
-        axes.set(xlabel=label, ylabel=rows[0].figure if y_of == ACCURACY else TRAINING)
-        if y_of != ACCURACY:
+        axes.set(xlabel=label, ylabel=name if y == ACCURACY else TRAINING)
+        if y != ACCURACY:
             axes.set_yscale("log")
-        elif lower_is_better(rows[0].figure):
+        elif lower_is_better(name):
             axes.invert_yaxis()
     grid[0, 0].legend(fontsize=8)
     save(figure, path)
