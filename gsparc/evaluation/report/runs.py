@@ -65,6 +65,11 @@ class Run:
         return " ".join([str(self.facts.get("model/name", "?")), *short])
 
     @property
+    def effects(self) -> str:
+        """Propagation effects that the model computes; `none` where it has none."""
+        return self.facts.get("model/effects") or "none"
+
+    @property
     def study(self) -> tuple[str, str]:
         """What makes figures comparable: dataset and split by name."""
         return str(self.facts.get("dataset/name")), str(self.facts.get("split/name"))
@@ -178,19 +183,19 @@ def read_run(folder: Path) -> Run:
 
 
 def columns(path: Path) -> dict[str, np.ndarray]:
-    """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file."""
+    """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file or rows."""
     if not path.is_file():
         return {}
     with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return {name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+        heads, *rows = csv.reader(file)
+    return {name: _column(cells) for name, cells in zip(heads, zip(*rows, strict=True), strict=False)}
 
 
-def _column(cells: Sequence[str | None]) -> np.ndarray:
+def _column(cells: Sequence[str]) -> np.ndarray:
     try:
         return np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
-        return np.array([cell or "" for cell in cells])
+        return np.array(cells)
 
 
 def _overrides(path: Path) -> tuple[str, ...]:
