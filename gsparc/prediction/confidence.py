@@ -18,7 +18,7 @@ from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_kernel, principal_components
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import training_targets
-from gsparc.prediction.risk_threshold import Promise, Threshold
+from gsparc.prediction.risk_threshold import Guarantee, Threshold
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 
@@ -133,7 +133,7 @@ class Trusted:
 
     kind: str | None = None
     threshold: float = float("inf")
-    promise: Promise | None = None
+    promise: Guarantee | None = None
     known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     kernel: Kernel | None = None
 
@@ -192,7 +192,7 @@ def kept(extra: Mapping[str, Any]) -> Trusted:
     found = extra.get(KEY)
     if found is None:
         return Trusted()
-    promise = None if found["promise"] is None else Promise(**found["promise"])
+    promise = None if found["promise"] is None else Guarantee(**found["promise"])
     kernel = None if found["kernel"] is None else Kernel(**found["kernel"])
     known = np.asarray(found["known"], np.float64)
     return Trusted(found["kind"], float(found["threshold"]), promise, known, kernel)

@@ -20,7 +20,7 @@ SURE_OF_EFFECT = 0.8
 
 
 @dataclass(frozen=True)
-class Promise:
+class Guarantee:
     """What is promised.
 
     Attributes:
@@ -82,7 +82,11 @@ def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
 
 
 def choose(
-    score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Promise, group: np.ndarray | None = None
+    score: np.ndarray,
+    bad: np.ndarray,
+    levels: np.ndarray,
+    promise: Guarantee,
+    group: np.ndarray | None = None,
 ) -> Threshold:
     """The laxest threshold that the calibration set (n,) supports.
 
