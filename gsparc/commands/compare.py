@@ -20,11 +20,11 @@ from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.limits import choice
-from gsparc.evaluation.experiment.cells import Budget, contenders, plan, plugged
+from gsparc.evaluation.experiment.cells import Budget, Contender, plan, plugged
 from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
-from gsparc.evaluation.experiment.problem import problems_of
+from gsparc.evaluation.experiment.problem import named, problems_of
 from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, overview, rows_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
@@ -38,7 +38,7 @@ def task(config: DictConfig) -> pd.DataFrame | list[PlaceRow]:
     settings = plain(config)
     choice("predict", "locate").check("task", settings["task"])
     locating = settings["task"] == "locate"
-    methods = plugged() | contenders(settings["methods"])
+    methods = plugged() | named("methods", Contender, settings["methods"])
     folder = settings["cells"]
     kept = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     paths = [(own or {}).get(key) for own in settings["datasets"].values() for key in ("root", "file")]

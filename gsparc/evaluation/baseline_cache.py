@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import time
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+import gsparc
 from gsparc.data.assemble import identity
 from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements
@@ -24,7 +26,6 @@ from gsparc.training.context import FitContext
 log = logging.getLogger(__name__)
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-CACHE_VERSION = 6  # raise it when a baseline or a metric changes its results
 STORE_ABOVE_S = 3.0  # processor time; cheaper fits are repeated, so that their times are current
 
 
@@ -58,6 +59,16 @@ class Fitted:
     train_s: tuple[float, ...]
 
 
+@functools.cache
+def program() -> str:
+    """Hash of the program text that baselines and their figures come from."""
+    folder = Path(gsparc.__file__).parent
+    parts = ("models", "processes", "physics", "evaluation/metrics.py", "evaluation/scores.py")
+    paths = (folder / part for part in parts)
+    files = (file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path]))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
 def baseline(
     name: str, data: Measurements, split: Split, eval_on: str = "test", cache: Path | None = None
 ) -> Fitted:
@@ -73,7 +84,7 @@ def baseline(
     unseen = eval_on == "val"
     # The same data may be in another model's local coordinates and units, and count its stations.
     key = hashlib.sha256(f"{identity(data)} {split.sha256}".encode()).hexdigest()[:24]
-    folder = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key
+    folder = None if cache is None else Path(cache) / f"baselines-{program()}" / key
     folder = folder and folder / (f"{name}-train" if unseen else name)
     methods, seconds = [], []
     for number, fold in enumerate(split.folds):

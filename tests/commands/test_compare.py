@@ -22,7 +22,6 @@ from gsparc.evaluation.experiment.problem import (
     Problem,
     SplitChoice,
     _may_match,
-    split_choices,
     stored_problems,
 )
 from gsparc.models.checkpoint import CheckpointError
@@ -90,11 +89,6 @@ def test_kept_results_of_draws_are_a_problem_each(tmp_path):
         (tmp_path / f"toy-drawn-gp-{draw}" / "cell.json").write_text(json.dumps(facts))
     found = stored_problems(tmp_path, "toy", [SplitChoice("drawn", draws=3)])
     assert [(p.draw, p.hashes[1]) for p in found] == [(0, "s0"), (1, "s1")]
-
-
-def test_an_unknown_setting_of_a_split_is_named():
-    with pytest.raises(ValueError, match=r"splits\.far: unknown 'draw'"):
-        split_choices({"far": {"draw": 3}})
 
 
 @pytest.mark.parametrize("model", ["gsparc", "moving_array"])

@@ -33,7 +33,6 @@ class Contender:
         kinds: of data it serves; empty for all.
         stations: takes part only where there are several stations, some rows of each being learned from.
         scene: takes part only where the measurements name the scene that they were made in.
-        reserve_s: part of the budget that its own `budget_s` does not count [s].
         only_longest: too slow for any but the longest budget.
         timed_only: too slow to be scored at all: fitted for its latency.
     """
@@ -44,14 +43,12 @@ class Contender:
     kinds: tuple[str, ...] = ()
     stations: bool = False
     scene: bool = False
-    reserve_s: float = 0.0
     only_longest: bool = False
     timed_only: bool = False
 
     def overrides(self, budget_s: float | None) -> list[str]:
         """Overrides of train.yaml, but for the seed."""
-        left = None if budget_s is None else max(budget_s - self.reserve_s, 1.0)
-        timed = [] if left is None else [text.format(budget_s=f"{left:g}") for text in self.budget]
+        timed = [] if budget_s is None else [text.format(budget_s=f"{budget_s:g}") for text in self.budget]
         return [*self.choose, *timed]
 
 
@@ -74,24 +71,6 @@ class Cell:
     def __str__(self) -> str:
         budget = ANY if self.budget_s is None else f"{self.budget_s:g}"
         return f"{self.dataset}/{self.split}/{self.method}/{budget}/{ANY if self.seed is None else self.seed}"
-
-
-def contenders(config: Mapping[str, Any]) -> dict[str, Contender]:
-    """The group `methods` of conf/compare.yaml.
-
-    Raises:
-        ValueError: an entry with an unknown setting, or without `choose`.
-    """
-    found = {}
-    for name, entry in config.items():
-        try:
-            lists: dict[str, Any] = {
-                k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()
-            }
-            found[str(name)] = Contender(str(name), **lists)
-        except TypeError as error:
-            raise ValueError(f"methods.{name}: {str(error).partition('() ')[2]}") from None
-    return found
 
 
 def plugged() -> dict[str, Contender]:

@@ -127,20 +127,11 @@ def prepare(
     overrides = [*chosen, *contender.overrides(cell.budget_s)]
     config = compose(settings, overrides, problem.draw, cell.seed)
     whole = plain(config)
-    trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
-    # cells from before there was a choice keep their names
-    if whole["trainer"].get("strategy") == "auto":
-        trainer["trainer"] = {name: v for name, v in whole["trainer"].items() if name != "strategy"}
-    if whole["stations"] == "together" or (whole["stations"] == "auto" and problem.stations):
-        trainer["stations"] = whole["stations"]
-    beside = {**whole, "batch_size": whole["dataset"].get("batch_size", 16)}
-    clock = "wall" if whole["budget_s"] is None else "processor"  # as cells without this in their name had
-    for setting, usual in (("budget_clock", clock), ("init_from", None), ("batch_size", 16)):
-        if beside[setting] != usual:
-            trainer[setting] = beside[setting]
-    for named in ((whole["model"].get("init") or {}).get("file"), whole["init_from"]):
-        if named and Path(named).is_file():  # walls, and a start, may change under their names
-            trainer[Path(named).name] = sha256(Path(named).read_bytes()).hexdigest()
+    beside = ("trainer", "callbacks", "budget_s", "budget_clock", "init_from", "stations")
+    trainer = {name: whole[name] for name in beside} | {"batch_size": whole["dataset"].get("batch_size")}
+    for file in ((whole["model"].get("init") or {}).get("file"), whole["init_from"]):
+        if file and Path(file).is_file():  # walls, and a start, may change under their names
+            trainer[Path(file).name] = sha256(Path(file).read_bytes()).hexdigest()
     if problem.draw is None and cell.seed and "seed" not in whole["model"]:
         trainer["seed"] = cell.seed  # of a draw, the split's own hash tells
     name = key(whole["model"], trainer, *problem.hashes)

@@ -9,8 +9,8 @@ from campaigns import compose
 from omegaconf import OmegaConf
 
 import gsparc.models.peers
-from gsparc.evaluation.experiment.cells import Budget, Contender, code_version, contenders, key, plan
-from gsparc.evaluation.experiment.problem import Problem, split_choices
+from gsparc.evaluation.experiment.cells import Budget, Contender, code_version, key, plan
+from gsparc.evaluation.experiment.problem import Problem, SplitChoice, named
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
@@ -76,22 +76,32 @@ def test_only_filters_and_a_pattern_of_nothing_is_an_error():
         names("rfid/rndom/*")
 
 
-def test_budgets_leave_room_for_what_they_do_not_count():
-    contender = Contender("x", ("model=gsparc",), ("model.b={budget_s}",), reserve_s=10)
-    assert contender.overrides(60) == ["model=gsparc", "model.b=50"]
-    assert contender.overrides(None) == ["model=gsparc"]
-
-
 def test_every_method_of_the_default_comparison_composes():
     config = OmegaConf.to_container(compose(config="compare"), resolve=True)
-    for contender in contenders(config["methods"]).values():
+    for contender in named("methods", Contender, config["methods"]).values():
         assert compose(*contender.overrides(60)).model
     assert config["ours"] in config["methods"]
-    for split in split_choices(config["splits"]).values():
+    for split in named("splits", SplitChoice, config["splits"]).values():
         assert set(split.datasets) <= set(config["datasets"])
         assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
-    with pytest.raises(ValueError, match=r"methods\.x: .*chose"):
-        contenders({"x": {"chose": ["model=gp"]}})
+
+
+@pytest.mark.parametrize(
+    ("group", "of", "entry", "message"),
+    [
+        (
+            "methods",
+            Contender,
+            {"chose": ["model=gp"]},
+            r"methods\.x: unknown 'chose'; there are choose",
+        ),
+        ("methods", Contender, {}, r"methods\.x: missing 1 required positional argument: 'choose'"),
+        ("splits", SplitChoice, {"draw": 3}, r"splits\.x: unknown 'draw'; there are choose, datasets, draws"),
+    ],
+)
+def test_a_wrong_entry_is_named(group, of, entry, message):
+    with pytest.raises(ValueError, match=message):
+        named(group, of, {"x": entry})
 
 
 MODULE = '''"""{doc}"""
