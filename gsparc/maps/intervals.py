@@ -20,6 +20,7 @@ from sklearn.isotonic import IsotonicRegression
 LEAST_ROWS = 40  # held out, for any promise
 ROWS_OF_A_BIN, BLOCKS_OF_A_BIN = 150, 8
 MOST_BINS = 8
+PARTS = 5  # of blocks, that are calibrated without by turns
 ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
 REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
 TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.995, 0.998, 0.999]])
@@ -208,12 +209,12 @@ class Coverage:
     own_width_db: float
 
 
-def cross_validated(evidence: Evidence, share: float, parts: int = 5, seed: int = 0) -> Coverage:
+def cross_validated(evidence: Evidence, share: float) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
-    part = np.random.default_rng(seed).permutation(len(blocks))[number.reshape(-1)] % parts
+    part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
     inside, width = np.zeros(len(evidence), bool), np.full(len(evidence), np.nan)
-    for turn in range(min(parts, len(blocks))):
+    for turn in range(min(PARTS, len(blocks))):
         rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
         inside[tried], width[tried] = held(calibrate(evidence.at(rest), share), evidence.at(tried))
     said = np.isfinite(width)

@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -20,7 +21,7 @@ from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
 from gsparc.evaluation.report.table import interval, over_seeds
-from gsparc.evaluation.report.tables import BASELINES, curve, grouped, validation_figure
+from gsparc.evaluation.report.tables import baselines_of, curve, grouped, validation_figure
 from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8
@@ -58,14 +59,13 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
                 label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, found.value))
-    for base in _shared_baselines(runs):
-        value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
+    for base in _rivals(runs):
+        value, (ms, _), look_of = base.figure_of(name), base.latency, look(base.setting)
         if value is not None and ms is not None:
-            axes.plot([ms], [value], **look(base).marked, ms=4)
-            axes.annotate(
-                base, (ms, value), (4, -3), textcoords="offset points", fontsize=7, color=look(base).colour
-            )
-            points.append((float(ms), float(value)))
+            axes.plot([ms], [value], **look_of.marked, ms=4)
+            how = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
+            axes.annotate(base.setting, (ms, value), (4, -3), **how)
+            points.append((ms, value))
     for columns in fronts:
         if name in columns:
             x, y = (columns[key][columns["front"] == 1] for key in ("render_ms_p50", name))
@@ -91,7 +91,7 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
         if values:
             pooled = np.concatenate(values)
             _cdf(axes, pooled[np.isfinite(pooled)], setting, style, samples=len(values[0]))
-    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in _shared_baselines(runs) else None
+    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in (r.setting for r in _rivals(runs)) else None
     if rival is not None:
         share = np.arange(1, len(rival) + 1) / len(rival)
         axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
@@ -189,9 +189,7 @@ def costs(runs: Sequence[Run]) -> Figure:
         "ms a query": lambda run: run.latency[0],
         heading_of(name): lambda run: run.figure_of(name),
     }
-    columns = {
-        title: value for title, value in columns.items() if any(value(run) is not None for run in runs)
-    }
+    columns = {title: of for title, of in columns.items() if any(of(run) is not None for run in runs)}
     size = WIDE + 2, 1.2 + 0.35 * len(groups)
     figure, (line,) = panels(*size, 1, len(columns), grid=False, sharey=True)
     for panel, (title, value) in zip(line, columns.items(), strict=True):
@@ -219,18 +217,15 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
     if len({run.measured for run in runs}) < 2:
         return None
     name, axes = runs[0].figure, _axes()
-    series: dict[str, dict[int, list[float]]] = {}
-    for run in runs:
-        found = {str(run.facts.get("model/name")): run.figure_of(name)}
-        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in _shared_baselines(runs)}
-        for method, value in found.items():
-            if value is not None:
-                series.setdefault(method, {}).setdefault(run.measured, []).append(float(value))
-    for method, by_count in series.items():
-        counts, style = sorted(by_count), look(method)
-        mean, low, high = ([float(of(by_count[n])) for n in counts] for of in (np.mean, min, max))
-        axes.plot(counts, mean, ms=4, lw=1, label=method, **style.marked)
-        axes.fill_between(counts, low, high, color=style.colour, alpha=0.15, lw=0)
+    rows = [
+        (str(one.facts.get("model/name")), run.measured, one.figure_of(name))
+        for run in runs
+        for one in (run, *_rivals(runs, run))
+    ]
+    for method, own in pd.DataFrame(rows, columns=["method", "count", "value"]).groupby("method", sort=False):
+        found, style = own.dropna().groupby("count").value.agg(["mean", "min", "max"]), look(str(method))
+        axes.plot(found.index, found["mean"], ms=4, lw=1, label=method, **style.marked)
+        axes.fill_between(found.index, found["min"], found["max"], color=style.colour, alpha=0.15, lw=0)
     logarithmic(axes)
     _accuracy_axis(axes, name)
     title = "Accuracy against the number of measurements (band: seeds)"
@@ -267,9 +262,10 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     return figure
 
 
-def _shared_baselines(runs: Sequence[Run]) -> list[str]:
-    """Baselines that no run is of."""
-    return [base for base in BASELINES if base not in {run.facts.get("model/name") for run in runs}]
+def _rivals(runs: Sequence[Run], beside: Run | None = None) -> list[Run]:
+    """Baselines beside a run (the first) that no run is of."""
+    methods = {run.facts.get("model/name") for run in runs}
+    return [base for base in baselines_of(beside or runs[0]) if base.setting not in methods]
 
 
 def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:

@@ -14,7 +14,7 @@ from gsparc.evaluation.report.runs import Run, number, sizes
 from gsparc.evaluation.report.table import Column, Interval, Table, interval, over_seeds
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-WORST = 3
+WORST, LEVELS = 3, 3
 SETTING = Column("method and setting", of=lambda run: run.setting)
 SEED = Column("seed", "d", of="seed")
 TRAIN = Column("train s", ".3g", of="time/train_s")
@@ -165,7 +165,7 @@ def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
     return np.array([end]), np.array([value])
 
 
-def levels(runs: Sequence[Run], count: int = 3) -> list[float]:
+def levels(runs: Sequence[Run]) -> list[float]:
     """Round figures between what the worst and the best run reach, the worst first."""
     score = partial(score_of, validation_figure(runs[0]))
     ends = [max(curve(run)[1], key=score) for run in runs if len(curve(run)[0])]
@@ -174,8 +174,8 @@ def levels(runs: Sequence[Run], count: int = 3) -> list[float]:
     worst, best = min(ends, key=score), max(ends, key=score)
     if abs(best - worst) < 1e-9 * max(abs(best), 1e-9):
         return [float(f"{worst:.3g}")]
-    between = {float(f"{v:.3g}") for v in np.linspace(worst, best, count + 2)[:-1]}
-    return sorted(between, key=score)[:count]
+    between = {float(f"{v:.3g}") for v in np.linspace(worst, best, LEVELS + 2)[:-1]}
+    return sorted(between, key=score)[:LEVELS]
 
 
 def effects(runs: Sequence[Run]) -> Table:
