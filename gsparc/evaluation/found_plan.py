@@ -24,13 +24,9 @@ AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them wit
 
 
 def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None) -> None:
-    """Save a map of mirror planes, boxes and Gaussians over the measured places.
+    """Save a map of mirror planes, boxes and Gaussians over the measured places as PNG.
 
-    Args:
-        data: measurements of the site.
-        objects: of it, local coordinates.
-        path: PNG file.
-        known: walls and boxes, in the coordinates of the measurements.
+    `objects` are in local coordinates, `known` walls and boxes in those of the measurements.
     """
     origin = data.site.origin
     places = np.unique(data.moving[:, -3:], axis=0) + origin

@@ -22,10 +22,6 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
     of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
     perfect, and `outage/brier_rate` what always saying the rate gives.
-
-    Args:
-        scores: of powers (kind rssi).
-        data: whose rows they are.
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
     known = np.isfinite(variance) & (variance > 0) & (mean > 0)
@@ -74,12 +70,7 @@ def levels(data: Measurements) -> np.ndarray | None:
 
 
 def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies, of powers how honest variances are; `rmse_db_after_constant` where stations are held out.
-
-    Args:
-        scores: of rows of `data`.
-        data, split: what was learned from.
-    """
+    """Accuracies, and of powers `power_intervals` and, of stations held out, `rmse_db_after_constant`."""
     found = scores.figures()
     if data.site.kind == "rssi":
         found |= power_intervals(scores, data)

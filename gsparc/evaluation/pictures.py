@@ -16,14 +16,7 @@ SPECTRA = 4  # test rows drawn
 
 
 def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str, path: Path) -> None:
-    """Draw test rows: `SPECTRA` spectra, or all channels or powers as points.
-
-    Args:
-        method: fitted on `fold`.
-        data, fold: where the test rows come from.
-        title: above everything.
-        path: PNG file.
-    """
+    """Draw test rows of a fold, which the method was fitted on: `SPECTRA` spectra, else points."""
     spectra = data.site.kind == "spectrum"
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
@@ -40,13 +33,9 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
 
 
 def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB") -> None:
-    """Save a figure of predicted against measured strength, and of the error of the phase where there is one.
+    """Save predicted against measured strength as PNG, and the error of the phase where there is one.
 
-    Args:
-        target, predicted: (B, ...) complex channels or real powers, in physical units.
-        title: above everything.
-        path: PNG file.
-        unit: of their levels.
+    `target` and `predicted`: (B, ...) complex channels or real powers, in physical units; `unit` of levels.
     """
     channels = np.iscomplexobj(target)
     figure, (axes,) = panels(8 if channels else 4.6, 4.2, 1, 2 if channels else 1)
@@ -80,13 +69,12 @@ def draw_spectra(
     confidence: np.ndarray | None = None,
     edges: tuple[float, float, float, float] = (0.0, 360.0, 0.0, 90.0),
 ) -> None:
-    """Save a figure: a line per sample, with measured, predicted and difference beside each other.
+    """Save a line per sample as PNG: measured, predicted and difference beside each other.
 
     Args:
         target, predicted: (B, H, W) in [0, 1].
         rows: (B,) dataset rows, for the labels.
-        title: above everything.
-        path: PNG file.
+        title, path: of the figure.
         confidence: (B,) in [0, 1], written into the predictions.
         edges: least and largest azimuth, least and largest elevation [degrees].
     """

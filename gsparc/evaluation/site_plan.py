@@ -97,13 +97,9 @@ def draw_site(
     levels: LinkLevels | None = None,
     steps: Sequence[tuple[int, LevelStep]] = (),
 ) -> None:
-    """Save a map of places and stations and, beside it, the levels of stations that jump.
+    """Save a map of places and stations as PNG and, beside it, the levels of stations that jump.
 
-    Args:
-        data: measurements of any kind.
-        path: PNG file.
-        levels: `link_levels` of powers.
-        steps: `plausibility.steps_of` the levels.
+    `levels` are the `link_levels` of powers, `steps` their `plausibility.steps_of`.
     """
     found = spots(data, levels)
     shown = [found.place[~found.far], still_ends(data)]  # but those far outside

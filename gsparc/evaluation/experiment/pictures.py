@@ -18,13 +18,7 @@ PANEL = 2.4  # inches
 
 
 def draw_budgets(rows: pd.DataFrame, path: Path, ours: str) -> None:
-    """A method looks the same in all panels; a line joins its budgets.
-
-    Args:
-        rows: as of `rows_of`, of the splits that are not drawn several times.
-        path: PNG file.
-        ours: the method with the largest mark.
-    """
+    """Accuracy against costs, of rows as of `rows_of`: a line joins the budgets; `ours` has a large mark."""
     groups = [here for _, here in rows.groupby("dataset", sort=False)]
     columns = max(here.split.nunique() for here in groups) + bool(rows.query_ms.any())
     size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
@@ -64,12 +58,7 @@ LINE = 0.34  # height of a method [inch]
 
 
 def draw_splits(rows: pd.DataFrame, path: Path) -> None:
-    """A panel per split of one dataset: mean and standard error over draws, training and query beside it.
-
-    Args:
-        rows: as of `rows_of`, of one dataset, all of drawn splits.
-        path: PNG file.
-    """
+    """A panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
     splits, names = list(rows.split.unique()), list(by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):

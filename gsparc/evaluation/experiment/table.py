@@ -238,10 +238,7 @@ def overview(rows: pd.DataFrame) -> str:
     """Markdown: the figure ± its standard error of the mean, (how far behind the best of the same draws).
 
     The best of a split is bold, and so is whatever is within two standard errors of it. Seconds of one fit
-    and milliseconds of one query are those of the first split.
-
-    Args:
-        rows: of one dataset, all of drawn splits.
+    and milliseconds of one query are those of the first split. Rows are of one dataset and of drawn splits.
     """
     splits = list(rows.split.unique())
     lines = []

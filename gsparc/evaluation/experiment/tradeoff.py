@@ -136,16 +136,7 @@ def draw_front(
     method: str,
     title: str,
 ) -> Figure:
-    """The picture.
-
-    Args:
-        points: all of them.
-        on_front: indices of the front, fastest first.
-        others: baselines and peers by name.
-        figure_name: key of the accuracy.
-        method: whose points they are.
-        title: what was measured.
-    """
+    """The points of a method beside others by name; `on_front` are indices of the front, fastest first."""
     lines = 0.16 * (len(on_front) + 1)  # inches of the legend
     figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))
     value = [p.value(figure_name) for p in points]

@@ -44,12 +44,7 @@ class Study:
 
 
 def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()) -> list[Study]:
-    """Everything there is to show, study by study.
-
-    Args:
-        runs: of any datasets.
-        fronts: `tradeoff.csv` by column, each with the name of its dataset.
-    """
+    """Everything there is to show, study by study; `fronts`: names of datasets, `tradeoff.csv` by column."""
     return [
         _study(f"{dataset}, split {split}", group, [columns for name, columns in fronts if name == dataset])
         for (dataset, split), group in by_study(runs).items()
@@ -110,13 +105,7 @@ def _png(path: Path) -> str:
 
 
 def html(title: str, made: str, shown: Sequence[Study]) -> str:
-    """The page.
-
-    Args:
-        title: above everything.
-        made: where it comes from.
-        shown: what is on it.
-    """
+    """The page; `made` says where it comes from."""
     text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
     return Environment(autoescape=True).from_string(text).render(title=title, made=made, studies=shown)
 

@@ -58,16 +58,11 @@ def test_a_draw_of_a_split_is_the_seed_of_every_method():
     ]  # fmt: skip
 
 
-def test_all_stations_together_are_learned_where_there_are_several():
-    methods = {"one": Contender("one", ("model=gp",), stations=True)}
-    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", stations=True)], methods, [])]
-    assert found == ["b"]
-
-
-def test_a_ray_tracer_takes_part_where_a_scene_is_known():
-    methods = {"one": Contender("one", ("model=calibrated_raytracer",), scene=True)}
-    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", scene=True)], methods, [])]
-    assert found == ["b"]
+@pytest.mark.parametrize("needed", ["stations", "scene"])
+def test_a_method_takes_part_where_what_it_needs_is_there(needed):
+    methods = {"one": Contender("one", ("model=gp",), **{needed: True})}
+    problems = [problem("a"), problem("b", **{needed: True})]
+    assert [cell.dataset for _, cell in plan(problems, methods, [])] == ["b"]
 
 
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():

@@ -31,17 +31,21 @@ def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
     assert list(tables.grouped(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
 
 
-@pytest.mark.parametrize("wrong", ["absent", "empty"])
-def test_a_directory_without_runs_is_named(wrong, tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=wrong):
-        find_runs([tmp_path / wrong])
-
-
-def test_a_damaged_summary_is_named(tmp_path):
-    (tmp_path / "summary.json").write_text("{")
-    with pytest.raises(ValueError, match=r"summary.json: cannot be read as a summary"):
-        find_runs([tmp_path])
+@pytest.mark.parametrize(
+    ("folder", "text", "message"),
+    [
+        ("absent", None, "absent: no such directory"),
+        ("empty", None, "empty: no run in it"),
+        ("damaged", "{", "summary.json: cannot be read as a summary"),
+    ],
+)
+def test_a_directory_without_a_run_is_named(folder, text, message, tmp_path):
+    if folder != "absent":
+        (tmp_path / folder).mkdir()
+    if text is not None:
+        (tmp_path / folder / "summary.json").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        find_runs([tmp_path / folder])
 
 
 def test_results_have_accuracy_beside_time_memory_and_origin(three):
