@@ -88,8 +88,8 @@ def baseline(
     folder = folder and folder / (f"{name}-train" if unseen else name)
     methods, seconds = [], []
     for number, fold in enumerate(split.folds):
-        found = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
-        if found is None:
+        fit = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
+        if fit is None:
             method = for_links(method_class(name), data)
             known = replace(fold, val=fold.val[:0]) if unseen else fold
             spent = time.process_time()
@@ -97,11 +97,11 @@ def baseline(
             spent = time.process_time() - spent  # wall time on a busy machine would mislead
             for note in report.notes:
                 log.info("fold %d: %s", number, note)
-            found = (method, report.seconds)
+            fit = (method, report.seconds)
             if folder is not None and spent > STORE_ABOVE_S:
                 checkpoint.save(folder / f"fold{number}.ckpt", method, extra={"train_s": report.seconds})
-        methods.append(found[0])
-        seconds.append(found[1])
+        methods.append(fit[0])
+        seconds.append(fit[1])
     scores = None if folder is None else _stored_scores(folder / f"{eval_on}.npz")
     if scores is None:
         scores = score(methods, data, split, eval_on)

@@ -98,14 +98,14 @@ class Trial:
         least that chance allows for). Delta bounds the share of *all* draws, `broken_of_all`: where most
         accept nobody, those that do are the ones that chance flattered. `silent` is the share that did not.
         """
-        spoke = self.realised[~np.isnan(self.realised)]
-        bad = spoke > self.alpha
-        low, high = binomial_interval(int(bad.sum()), len(spoke)) if len(spoke) else (None, None)
+        accepting = self.realised[~np.isnan(self.realised)]
+        bad = accepting > self.alpha
+        low, high = binomial_interval(int(bad.sum()), len(accepting)) if len(accepting) else (None, None)
         return {
-            "kind": self.kind, "broken": float(bad.mean()) if len(spoke) else None, "broken_low": low,
+            "kind": self.kind, "broken": float(bad.mean()) if len(accepting) else None, "broken_low": low,
             "broken_high": high, "broken_of_all": float(bad.sum() / len(self.realised)),
             "silent": float(np.isnan(self.realised).mean()),
-            "realised": float(spoke.mean()) if len(spoke) else None,
+            "realised": float(accepting.mean()) if len(accepting) else None,
             "coverage": float(self.coverage.mean()), "draws": len(self.realised),
         }  # fmt: skip
 
@@ -190,8 +190,8 @@ def accept(
     score, bad = evidence.scores[used], promise.bad(evidence.error)
     calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
     patch = cells(evidence.position)[calibrate] if spatial else None
-    found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
-    return used, found, test, choose_on
+    threshold = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
+    return used, threshold, test, choose_on
 
 
 def trials(
@@ -212,11 +212,11 @@ def trials(
     realised, coverage, kinds = [], [], []
     bad = promise.bad(evidence.error)
     for draw in range(draws):
-        used, found, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
-        taken = test[evidence.scores[used][test] >= found.value]
+        used, threshold, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
+        accepted = test[evidence.scores[used][test] >= threshold.value]
         kinds.append(used)
-        realised.append(bad[taken].mean() if len(taken) else np.nan)
-        coverage.append(len(taken) / max(len(test), 1))
+        realised.append(bad[accepted].mean() if len(accepted) else np.nan)
+        coverage.append(len(accepted) / max(len(test), 1))
     most = max(set(kinds), key=kinds.count)
     return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha)
 
@@ -288,9 +288,9 @@ def store(
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     evidence = gather(method, data, fold, rows_of(fold, "test"))
-    used, found, _, _ = accept(evidence, promise, kind, spatial, seed)
-    threshold = threshold_of(used, found)
-    stored = Trusted(used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
+    kind_used, choice, _, _ = accept(evidence, promise, kind, spatial, seed)
+    threshold = threshold_of(kind_used, choice)
+    stored = Trusted(kind_used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
     keep(path, stored)
     if np.isfinite(threshold):
         return stored, f"accepted from {threshold:.4g}"
@@ -324,8 +324,8 @@ def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, floa
     predicted = np.concatenate([method.answer(batch).mean.numpy() for batch in batches])
     target = data.target[fold.test]
     both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
-    found = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
-    return {f"{room}/{name}": value for room, one in found.items() for name, value in one.items()}
+    results = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
+    return {f"{room}/{name}": value for room, one in results.items() for name, value in one.items()}
 
 
 def figures(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:

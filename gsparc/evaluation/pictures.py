@@ -21,14 +21,14 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     batch = data.batch(rows)
-    found = method.answer(batch)
-    true, predicted = batch.target.numpy(), found.mean.numpy()
+    prediction = method.answer(batch)
+    true, predicted = batch.target.numpy(), prediction.mean.numpy()
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         return draw_points(true * scale, predicted * scale, title, path, unit)
     assert data.site.grid is not None
-    confidence = None if found.confidence is None else found.confidence.numpy()
+    confidence = None if prediction.confidence is None else prediction.confidence.numpy()
     return draw_spectra(true, predicted, rows, title, path, confidence, data.site.grid.edges())
 
 
@@ -89,8 +89,8 @@ def draw_spectra(
         line[0].set_ylabel(f"row {row}\nelevation [°]")
         corner = {"x": 0.99, "y": 0.95, "ha": "right", "va": "top", "fontsize": "small"}
         if confidence is not None:
-            said = f"confidence {confidence[number]:.2f}"
-            line[1].text(s=said, color="white", transform=line[1].transAxes, **corner)
+            note = f"confidence {confidence[number]:.2f}"
+            line[1].text(s=note, color="white", transform=line[1].transAxes, **corner)
         rms = np.sqrt(np.mean((guess - true) ** 2))
         line[2].text(s=f"rms {rms:.3f}", transform=line[2].transAxes, **corner)
     for axis, name in zip(axes[0], ("measured", "predicted", "predicted - measured"), strict=True):

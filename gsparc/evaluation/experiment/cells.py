@@ -75,13 +75,13 @@ class Cell:
 
 def plugged() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
-    offered, found = ConfigStore.instance().repo.get("model", {}), {}
+    offered, methods = ConfigStore.instance().repo.get("model", {}), {}
     for name, path in plugins("model").items():
         if name not in METHODS and f"{name}.yaml" in offered:
             kind = find(path)
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
-            found[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
-    return found
+            methods[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
+    return methods
 
 
 @dataclass(frozen=True)

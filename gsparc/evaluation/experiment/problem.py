@@ -101,16 +101,16 @@ def named(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, E
     Raises:
         ValueError: an entry with an unknown setting, or without one that is needed.
     """
-    known, found = [field.name for field in fields(of) if field.name != "name"], {}
+    known, entries = [field.name for field in fields(of) if field.name != "name"], {}
     for name, entry in config.items():
         own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry or {}).items()}
         if unknown := sorted(set(own) - set(known)):
             raise ValueError(f"{group}.{name}: unknown {unknown[0]!r}; there are {', '.join(known)}")
         try:
-            found[str(name)] = of(name=str(name), **own)
+            entries[str(name)] = of(name=str(name), **own)
         except TypeError as error:
             raise ValueError(f"{group}.{name}: {str(error).partition('() ')[2]}") from None
-    return found
+    return entries
 
 
 def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[SplitChoice]) -> list[Problem]:
@@ -135,15 +135,15 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
 def facts_of(result: Path) -> dict[str, Any] | None:
     """What a kept result says; None where there is none, or no whole one."""
     try:
-        found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
+        facts: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return found
+    return facts
 
 
 def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> list[Problem]:
     """The problems of a dataset that most kept results are of, one per draw of a split."""
-    found = []
+    problems = []
     for split in splits:
         files = sorted(kept.glob(f"{dataset}-{split.name}-*/{RESULT}"))
         facts = [one for file in files if (one := facts_of(file)) is not None]
@@ -159,8 +159,8 @@ def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> 
             )
             if known:
                 kind, hashes, several, scene = known.most_common(1)[0][0]
-                found.append(Problem(dataset, split.name, kind, hashes, draw, several, scene))
-    return found
+                problems.append(Problem(dataset, split.name, kind, hashes, draw, several, scene))
+    return problems
 
 
 def compose(

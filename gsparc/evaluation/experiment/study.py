@@ -131,14 +131,14 @@ class Study:
         for turn in range(self.rounds):
             for variant in list(allowed):
                 try:
-                    found = self._outcomes(variant, data, split, context, turn)
+                    by_condition = self._outcomes(variant, data, split, context, turn)
                 except ValueError as refused:
                     if variant == self.base or REFUSED not in str(refused) or len(allowed) == 1:
                         raise
                     log.info("%s is left out: %s", variant, refused)
                     allowed.remove(variant)
                     continue
-                for condition, outcome in found.items():
+                for condition, outcome in by_condition.items():
                     outcomes.setdefault((variant, condition), []).append(outcome)
         return self._rows(outcomes, data, split)
 
@@ -146,7 +146,7 @@ class Study:
         self, variant: str, data: Measurements, split: Split, context: FitContext, turn: int
     ) -> dict[Condition, Outcome]:
         """One training per condition that changes what is learned from."""
-        found: dict[Condition, Outcome] = {}
+        by_condition: dict[Condition, Outcome] = {}
         seed, plain = self.seed + turn, None
         for condition in self.conditions:
             outcome = plain
@@ -158,14 +158,14 @@ class Study:
                 plain = plain if condition.trained else outcome
             if condition.what == "query":
                 outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)
-            found[condition] = outcome
+            by_condition[condition] = outcome
             figure = DECIDING[data.site.kind]
             log.info(
                 "%s, %s, round %d of %d: %s %.4g after %.3g s of training",
                 variant, condition, turn + 1, self.rounds, figure, _value(outcome, figure),
                 sum(outcome.train_s),
             )  # fmt: skip
-        return found
+        return by_condition
 
     def _rows(
         self, outcomes: Mapping[tuple[str, Condition], list[Outcome]], data: Measurements, split: Split
@@ -177,17 +177,17 @@ class Study:
         query = {key: percentiles(times[str(id(o[-1].methods[0]))]) for key, o in outcomes.items()}
         train = {key: np.array([np.mean(one.train_s) for one in o]) for key, o in outcomes.items()}
         rows = []
-        for key, found in outcomes.items():
+        for key, rounds in outcomes.items():
             variant, condition = key
-            values = np.array([_value(one, figure) for one in found])
+            values = np.array([_value(one, figure) for one in rounds])
             base = (self.base or "", condition)
             compared = base in outcomes
             folds = [condition.learned_from(data, fold, self.seed)[1] for fold in split.folds]
             rows.append((
-                variant, condition.what, condition.amount, str(found[-1].methods[0].effects or "none"),
+                variant, condition.what, condition.amount, str(rounds[-1].methods[0].effects or "none"),
                 float(np.mean([len(fold.train) + len(fold.val) for fold in folds])), figure, values.mean(),
                 values.std(ddof=1) if len(values) > 1 else np.nan, np.median(train[key]),
-                np.median([np.mean(one.train_cpu_s) for one in found]),
+                np.median([np.mean(one.train_cpu_s) for one in rounds]),
                 np.median(train[key] / train[base]) if compared else np.nan, *query[key],
                 query[key][0] / query[base][0] if compared else np.nan,
             ))  # fmt: skip

@@ -32,14 +32,14 @@ ROW = [
 
 def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
     """Every scored cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
-    found = []
+    rows = []
     for one in filled:
         if not one.scored():
             continue
         facts, kind = one.facts, one.facts["dataset/kind"]
         figure, second = DECIDING[kind], SECOND[kind]
         label = str(facts.get("model/label") or "")
-        found.append({
+        rows.append({
             **asdict(one.cell), "figure": figure, "value": float(facts[f"test/{figure}"]),
             "train_s": facts["time/train_s"], "train_cpu_s": facts["time/train_cpu_s"],
             "load": facts.get("machine/load"), "score_db": score_db(kind, facts), "draws": one.drawn,
@@ -48,9 +48,9 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
             "second_value": facts.get(f"test/{second}"), "earlier": one.earlier or "",
             "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
-    seeds = pd.Series([row["seed"] for row in found], dtype=object)  # whole numbers beside None
+    seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
     numbers = ["budget_s", "load", "coverage", "outage", "after_constant", "second_value"]
-    return pd.DataFrame(found).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
+    return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
 def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
@@ -83,50 +83,50 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
         "score_db", "value", "behind_db", "coverage", "outage", "after_constant", "second_value", "train_s",
         "train_cpu_s", "load",
     ]  # fmt: skip
-    found = groups[means].mean()
-    found[["figure", "second"]] = groups[["figure", "second"]].first()
-    found["seeds"], drawn = groups.size(), groups["draws"].any()
-    found["draws"] = drawn
-    found["spread_db"] = groups["score_db"].std().where(~drawn, groups["score_db"].sem())
-    found["value_error"] = groups["value"].sem().where(drawn)
-    found["behind_error_db"] = groups["behind_db"].sem()
-    found["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
-    found["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
-    found = found.reset_index()
-    problems = list(dict.fromkeys(zip(found.dataset, found.split, strict=True)))
+    rows = groups[means].mean()
+    rows[["figure", "second"]] = groups[["figure", "second"]].first()
+    rows["seeds"], drawn = groups.size(), groups["draws"].any()
+    rows["draws"] = drawn
+    rows["spread_db"] = groups["score_db"].std().where(~drawn, groups["score_db"].sem())
+    rows["value_error"] = groups["value"].sem().where(drawn)
+    rows["behind_error_db"] = groups["behind_db"].sem()
+    rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
+    rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
+    rows = rows.reset_index()
+    problems = list(dict.fromkeys(zip(rows.dataset, rows.split, strict=True)))
     first = dict(reversed(problems))  # split of each dataset
     times = [
         timed.get(row.dataset, {}).get(row.method) if row.split == first[row.dataset] else None
-        for row in found.itertuples()
+        for row in rows.itertuples()
     ]
     for name, field in (("query_ms", "p50_ms"), ("query_p95_ms", "p95_ms"), ("to_copy", "to_copy")):
-        found[name] = [getattr(one, field, np.nan) for one in times]
-    order = [problems.index((row.dataset, row.split)) for row in found.itertuples()]
-    found = found.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
-    return found[ROW].reset_index(drop=True)
+        rows[name] = [getattr(one, field, np.nan) for one in times]
+    order = [problems.index((row.dataset, row.split)) for row in rows.itertuples()]
+    rows = rows.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
+    return rows[ROW].reset_index(drop=True)
 
 
 def _behind(cells: pd.DataFrame) -> pd.Series:
     """How much the problem's best of the methods with most draws has more on the same draw [dB]."""
-    found = pd.Series(np.nan, cells.index)
+    behind = pd.Series(np.nan, cells.index)
     for _, here in cells[cells.draws].groupby(PROBLEM):
         groups = here.groupby(["budget_s", "method"], dropna=False, sort=False).score_db
         count = groups.transform("count")
         best = groups.transform("mean")[count == count.max()].idxmax()
         same = here[groups.ngroup() == groups.ngroup()[best]].set_index("seed").score_db
-        found[here.index] = here.seed.map(same) - here.score_db
-    return found
+        behind[here.index] = here.seed.map(same) - here.score_db
+    return behind
 
 
 def blocks_of(rows: pd.DataFrame) -> list[pd.DataFrame]:
     """A table per dataset, split and budget, best first; methods without a budget stand in each."""
-    found = []
+    blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
         without = here.budget_s.isna()
         for budget in sorted(here.budget_s.dropna().unique()) or [None]:
             members = here[without | (here.budget_s == budget)]
-            found.append(members.sort_values("score_db", ascending=False, kind="stable"))
-    return found
+            blocks.append(members.sort_values("score_db", ascending=False, kind="stable"))
+    return blocks
 
 
 def title_of(block: pd.DataFrame) -> str:
@@ -142,36 +142,36 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     """What the table shows about simple baselines and about our own default, favourable or not."""
     rows = list(block.itertuples())
     first = rows[0]
-    found = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
+    lines = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
     if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
-        found.append(f"a simple baseline wins: take {first.method} for this data and split")
+        lines.append(f"a simple baseline wins: take {first.method} for this data and split")
     own = next((row for row in rows if row.method == ours), None)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
         spread = float(np.hypot(*np.nan_to_num([own.spread_db, first.spread_db])))  # of both over seeds
         level = own.score_db >= first.score_db - spread
-        found.append(gap + (", within the seeds' spread" if level else ""))
+        lines.append(gap + (", within the seeds' spread" if level else ""))
     if own is not None and first.outage > own.outage:
         both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
-        found.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
+        lines.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
     for row in rows[1:]:
         if own is not None and row.method in SIMPLE and row.score_db > own.score_db:
-            found.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
+            lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
-        found.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
+        lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
     old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
     if old:
-        found.append(f"measured before the program or its settings were last changed (at commit): {old}")
+        lines.append(f"measured before the program or its settings were last changed (at commit): {old}")
     load = block.load[block.budget_s.notna()].max()
     if load > BUSY:
-        found.append(
+        lines.append(
             f"the machine was busy (load up to {load:.1f} per core): train s is inflated, "
             "cpu s is what was spent"
         )
-    return found
+    return lines
 
 
 def markdown(
@@ -210,28 +210,28 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
 
         return write
 
-    found: dict[str, Callable[[Any], str]] = {
+    columns: dict[str, Callable[[Any], str]] = {
         "method": lambda row: row.method + row.label,
         SCORE[figure]: column("score_db", ".2f", "spread_db"),
     }
     if drawn:
-        found["behind the best, dB"] = column("behind_db", ".2f", "behind_error_db")
+        columns["behind the best, dB"] = column("behind_db", ".2f", "behind_error_db")
     if figure == "nmse" or (figure == "rmse_db" and not drawn):  # else it is the score but for its sign
-        found[figure] = column("value", ".3g" if drawn else ".4g", "value_error")
-    found[block.second.iloc[0]] = column("second_value", ".4g")
+        columns[figure] = column("value", ".3g" if drawn else ".4g", "value_error")
+    columns[block.second.iloc[0]] = column("second_value", ".4g")
     for name, head, form in (
         ("after_constant", "after a constant, dB", ".2f"), ("coverage", "in 90 % interval", ".2f"),
         ("outage", "outage, Brier score", ".4f"),
     ):  # fmt: skip
         if block[name].notna().any():
-            found[head] = column(name, form)
+            columns[head] = column(name, form)
     if not drawn:
-        found["seeds"] = column("seeds", "d")
+        columns["seeds"] = column("seeds", "d")
     costs = (
         ("train_s", "train s", ".3g"), ("train_cpu_s", "cpu s", ".3g"), ("query_ms", "query ms p50", ".3g"),
         ("query_p95_ms", "p95", ".3g"), ("to_copy", "x copy", ".2g"),
     )  # fmt: skip
-    return found | {head: column(name, form) for name, head, form in costs}
+    return columns | {head: column(name, form) for name, head, form in costs}
 
 
 def overview(rows: pd.DataFrame) -> str:

@@ -161,6 +161,6 @@ def _short(title: str, runs: Sequence[Run]) -> str:
     load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
     machine = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s)"
     note = f"{machine}, load {load:.1f} per core; queries in turns."
-    kept = [i for i, column in enumerate(table.columns) if column.name not in OMITTED_COLUMNS]
-    short = [[row[i] for i in kept] for row in rows]
-    return Table(title, [table.columns[i] for i in kept], short, note).markdown()
+    columns = [i for i, column in enumerate(table.columns) if column.name not in OMITTED_COLUMNS]
+    short = [[row[i] for i in columns] for row in rows]
+    return Table(title, [table.columns[i] for i in columns], short, note).markdown()

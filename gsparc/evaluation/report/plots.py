@@ -48,17 +48,17 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     for (setting, group), style in _styled(runs):
         for run in group:
             p50, p95 = run.latency
-            found = interval(run, name)
-            if p50 is None or found is None:
+            estimate = interval(run, name)
+            if p50 is None or estimate is None:
                 continue
-            low, high = (found.low or found.value), (found.high or found.value)
+            low, high = (estimate.low or estimate.value), (estimate.high or estimate.value)
             axes.errorbar(
-                [p50], [found.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
-                yerr=[[max(found.value - low, 0.0)], [max(high - found.value, 0.0)]],
+                [p50], [estimate.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
+                yerr=[[max(estimate.value - low, 0.0)], [max(high - estimate.value, 0.0)]],
                 fmt="o", ms=4, lw=0.7, color=style["color"],
                 label=setting if run is group[0] else None,
             )  # fmt: skip
-            points.append((p50, found.value))
+            points.append((p50, estimate.value))
     for base in _rivals(runs):
         value, (ms, _), look_of = base.figure_of(name), base.latency, look(base.setting)
         if value is not None and ms is not None:
@@ -194,15 +194,15 @@ def costs(runs: Sequence[Run]) -> Figure:
     figure, (line,) = panels(*size, 1, len(columns), grid=False, sharey=True)
     for panel, (title, value) in zip(line, columns.items(), strict=True):
         for row, ((_, group), style) in enumerate(_styled(runs)):
-            found = over_seeds([value(run) for run in group])
-            if found is None:
+            spread = over_seeds([value(run) for run in group])
+            if spread is None:
                 panel.text(0, row, " none", va="center", fontsize=7, color="0.5")
                 continue
-            low, high = found.low or found.value, found.high or found.value
-            reach = [[found.value - low], [high - found.value]]
-            panel.barh(row, found.value, color=style["color"], alpha=0.8)
-            panel.errorbar([found.value], [row], xerr=reach, c="k", lw=0.8)
-            panel.text(found.value, row, f" {found.value:.3g}", va="center", fontsize=7)
+            low, high = spread.low or spread.value, spread.high or spread.value
+            reach = [[spread.value - low], [high - spread.value]]
+            panel.barh(row, spread.value, color=style["color"], alpha=0.8)
+            panel.errorbar([spread.value], [row], xerr=reach, c="k", lw=0.8)
+            panel.text(spread.value, row, f" {spread.value:.3g}", va="center", fontsize=7)
         panel.set_title(title, fontsize=8)
         panel.tick_params(labelsize=7)
         panel.margins(x=0.3)
@@ -223,9 +223,9 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
         for one in (run, *_rivals(runs, run))
     ]
     for method, own in pd.DataFrame(rows, columns=["method", "count", "value"]).groupby("method", sort=False):
-        found, style = own.dropna().groupby("count").value.agg(["mean", "min", "max"]), look(str(method))
-        axes.plot(found.index, found["mean"], ms=4, lw=1, label=method, **style.marked)
-        axes.fill_between(found.index, found["min"], found["max"], color=style.colour, alpha=0.15, lw=0)
+        band, style = own.dropna().groupby("count").value.agg(["mean", "min", "max"]), look(str(method))
+        axes.plot(band.index, band["mean"], ms=4, lw=1, label=method, **style.marked)
+        axes.fill_between(band.index, band["min"], band["max"], color=style.colour, alpha=0.15, lw=0)
     logarithmic(axes)
     _accuracy_axis(axes, name)
     title = "Accuracy against the number of measurements (band: seeds)"
@@ -235,11 +235,13 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
 def confidence(runs: Sequence[Run]) -> Figure | None:
     """Error against confidence, and the error of the most confident share of answers; None without any."""
     name = PER_SAMPLE[runs[0].kind]
-    sure = [r for r in runs if name in r.samples and np.isfinite(r.samples.get("confidence", [np.nan])).any()]
-    if not sure:
+    stating = [
+        r for r in runs if name in r.samples and np.isfinite(r.samples.get("confidence", [np.nan])).any()
+    ]
+    if not stating:
         return None
-    figure, ((points, kept),) = panels(WIDE, TALL, 1, 2)
-    shown = [(run, style) for (_, group), style in _styled(sure) for run in group]
+    figure, ((points, risk),) = panels(WIDE, TALL, 1, 2)
+    shown = [(run, style) for (_, group), style in _styled(stating) for run in group]
     for run, style in shown[:MOST_CONFIDENCES]:
         value, stated = sizes(run, name), run.samples["confidence"]
         known = np.isfinite(value) & np.isfinite(stated)
@@ -252,11 +254,11 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
         error = value.std(ddof=1) / np.sqrt(count)
         color = style["color"]
         points.scatter(stated, value, s=8, color=color, label=f"{short(run.setting)}: rank {rank:+.2f}")
-        kept.plot(share, mean, lw=1, **style)
-        kept.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
+        risk.plot(share, mean, lw=1, **style)
+        risk.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
     points.set(xlabel="confidence", ylabel=heading_of(name))
-    kept.set_xlabel("share of answers used, most confident first")
-    kept.set_title("mean over the answers used (95 % band)", fontsize=8)
+    risk.set_xlabel("share of answers used, most confident first")
+    risk.set_title("mean over the answers used (95 % band)", fontsize=8)
     figure.set_label("Error against confidence")
     _legend(points)
     return figure
@@ -272,8 +274,8 @@ def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, 
     """Settings, their runs, colour and line: a method's own where each has one setting, else one by one."""
     groups = grouped(runs)
     names = [str(group[0].facts.get("model/name")) for group in groups.values()]
-    alone = len(set(names)) == len(names)
-    styles = [look(name).line if alone else numbered(i) for i, name in enumerate(names)]
+    unique = len(set(names)) == len(names)
+    styles = [look(name).line if unique else numbered(i) for i, name in enumerate(names)]
     return list(zip(groups.items(), styles, strict=True))
 
 

@@ -94,8 +94,8 @@ class Run:
     @property
     def checkpoints(self) -> list[Path]:
         """Its models, one per fold."""
-        found = self.folder / "model.ckpt"
-        return [found] if found.exists() else sorted(self.folder.glob("fold*/model.ckpt"))
+        path = self.folder / "model.ckpt"
+        return [path] if path.exists() else sorted(self.folder.glob("fold*/model.ckpt"))
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Run]:
@@ -104,7 +104,7 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     Raises:
         ValueError: a directory that does not exist or holds no run; it is named.
     """
-    found: dict[Path, Run] = {}
+    runs: dict[Path, Run] = {}
     simulated: dict[str, float] = {}
     for path in map(Path, paths):
         if not path.is_dir():
@@ -113,17 +113,17 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
             [path / "summary.json"] if _is_run(path / "summary.json") else sorted(path.rglob("summary.json"))
         )
         here = {file.parent.resolve(): file for file in files if _is_run(file)}
-        made = _simulated(files)
-        simulated |= made
-        if not here and not made and not any(path.rglob("tradeoff.csv")):
+        seconds = _simulated(files)
+        simulated |= seconds
+        if not here and not seconds and not any(path.rglob("tradeoff.csv")):
             raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
-        found |= {folder: read_run(folder) for folder in here if folder not in found}
-    if not found:
+        runs |= {folder: read_run(folder) for folder in here if folder not in runs}
+    if not runs:
         raise ValueError("a swept front or a simulation is no report: give the directory of a run too")
-    for run in found.values():
+    for run in runs.values():
         if run.facts.get("dataset/simulate_s") is None:
             run.facts["dataset/simulate_s"] = simulated.get(str(run.facts.get("dataset/sha256")))
-    return list(found.values())
+    return list(runs.values())
 
 
 def _simulated(files: Iterable[Path]) -> dict[str, float]:

@@ -98,9 +98,9 @@ def _on_screen(table: Table) -> Shown:
     columns = [i for i, column in enumerate(table.columns) if column.name not in WIDE]
     first, *others = (table.columns[i].name for i in columns)
     rows = ([_spread(row[i], table.columns[i]) for i in columns] for row in table.rows)
-    found = summary.table(table.title, [first], others, rows)
-    found.caption = "least to largest over seeds; sweep.csv has more"
-    return found
+    screen = summary.table(table.title, [first], others, rows)
+    screen.caption = "least to largest over seeds; sweep.csv has more"
+    return screen
 
 
 def _spread(value: Any, column: Column) -> str:

@@ -63,11 +63,11 @@ def _parts(run: Run, figure: str) -> tuple[np.ndarray, np.ndarray | None] | None
     if figure == "nmse" and "error_power" in own and "target_power" in own:
         known = np.isfinite(own["error_power"])
         return own["error_power"][known], own["target_power"][known]
-    found = own.get(figure)
-    if found is None or found.dtype.kind != "f":
+    values = own.get(figure)
+    if values is None or values.dtype.kind != "f":
         return None
-    found = found[np.isfinite(found)]
-    return (found, None) if len(found) > 1 else None
+    values = values[np.isfinite(values)]
+    return (values, None) if len(values) > 1 else None
 
 
 def over_seeds(values: Sequence[float | None]) -> Interval | None:

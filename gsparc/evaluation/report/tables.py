@@ -38,7 +38,7 @@ def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 def baselines_of(run: Run) -> list[Run]:
     """The baselines beside a run, as runs without files."""
-    figure, found = run.figure, []
+    figure, baselines = run.figure, []
     for name in BASELINES:
         stem = f"baseline/{name}/"
         if stem + figure in run.facts:
@@ -46,8 +46,8 @@ def baselines_of(run: Run) -> list[Run]:
             facts = {key: run.facts.get(key) for key in ("machine/load", "dataset/sha256", "git")}
             facts |= {f"{room}/{key}": value for key, value in own.items() for room in ("test", "time")}
             facts |= {"model/name": name, "dataset/kind": run.kind}
-            found.append(Run(run.folder, facts))
-    return found
+            baselines.append(Run(run.folder, facts))
+    return baselines
 
 
 def results(runs: Sequence[Run]) -> Table:
@@ -155,10 +155,10 @@ def validation_figure(run: Run) -> str:
 def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """Seconds (n,) and validation figures (n,); one point for a method that trains in one piece."""
     figure = validation_figure(run)
-    found = run.curve.get(f"val/{figure}")
-    if found is not None and np.isfinite(found).any():
-        known = np.isfinite(found)
-        return run.curve["train_s"][known], found[known]
+    values = run.curve.get(f"val/{figure}")
+    if values is not None and np.isfinite(values).any():
+        known = np.isfinite(values)
+        return run.curve["train_s"][known], values[known]
     end, value = number(run.facts.get("time/train_s")), run.figure_of(figure)
     if end is None or value is None:
         return np.zeros(0), np.zeros(0)
