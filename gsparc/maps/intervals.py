@@ -178,7 +178,7 @@ def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.n
     return IsotonicRegression().fit_transform(np.arange(len(distance)), width, sample_weight=weight)
 
 
-def held(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+def covered(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     """Rows (n,) bool whose measurement lies in the interval, and widths (n,) [dB], NaN where nothing is said.
 
     A silent row is in an interval that reaches below its level.
@@ -216,21 +216,13 @@ def cross_validated(evidence: Evidence, share: float) -> Coverage:
     inside, width = np.zeros(len(evidence), bool), np.full(len(evidence), np.nan)
     for turn in range(min(PARTS, len(blocks))):
         rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
-        inside[tried], width[tried] = held(calibrate(evidence.at(rest), share), evidence.at(tried))
-    said = np.isfinite(width)
-    return coverage_of(evidence, inside, width, said, len(blocks), share)
-
-
-def coverage_of(
-    evidence: Evidence, inside: np.ndarray, width: np.ndarray, said: np.ndarray, blocks: int, share: float
-) -> Coverage:
-    """Shares and means over the rows (n,) that something is said of."""
+        inside[tried], width[tried] = covered(calibrate(evidence.at(rest), share), evidence.at(tried))
+    known = np.isfinite(width)
     half = float(norm.ppf((1 + share) / 2))
     own = np.abs(evidence.error) <= half
-    spread = evidence.spread_db[said]
     return Coverage(
-        float(inside[said].mean()), float(width[said].mean()), float(said.mean()), int(said.sum()), blocks,
-        float(own[said].mean()), float(2 * half * spread.mean()),
+        float(inside[known].mean()), float(width[known].mean()), float(known.mean()), int(known.sum()),
+        len(blocks), float(own[known].mean()), float(2 * half * evidence.spread_db[known].mean()),
     )  # fmt: skip
 
 
