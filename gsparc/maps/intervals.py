@@ -162,14 +162,14 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
     """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
     size = np.abs(used.error)
     whole = float(np.quantile(size, level))
-    found = np.ones(int(used.station.max()) + 1)
-    for number in np.unique(used.station) if len(found) > 1 and whole > 0 else ():
+    factors = np.ones(int(used.station.max()) + 1)
+    for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
         own = used.station == number
         if own.sum() >= LEAST_ROWS:
             blocks = len(np.unique(used.block[own]))
             ratio = max(float(np.quantile(size[own], level)), 1e-3 * whole) / whole
-            found[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
-    return found
+            factors[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
+    return factors
 
 
 def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -230,9 +230,9 @@ def distances(
     known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
 ) -> np.ndarray:
     """From places (n, D) to the nearest of `known` (m, D) of their station, of any where it has none [m]."""
-    found = np.full(len(places), np.inf)
+    distance = np.full(len(places), np.inf)
     for number in np.unique(station):
         own = known[known_station == number]
         chosen = station == number
-        found[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
-    return found
+        distance[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
+    return distance

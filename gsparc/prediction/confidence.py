@@ -55,8 +55,8 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
         some = rows[start : start + CHUNK]
         batch = data.batch(some)
         parts.append(Evidence(some, data.moving[some], *judged(method.answer(batch), batch.target)))
-    found = joined(parts)
-    return replace(found, scores=found.scores | rivals(data, fold, rows))
+    evidence = joined(parts)
+    return replace(evidence, scores=evidence.scores | rivals(data, fold, rows))
 
 
 def judged(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
