@@ -6,10 +6,11 @@ import functools
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from inspect import signature
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -95,13 +96,13 @@ class Problem:
         return self.data, self.folds
 
 
-def named(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
+def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
     """A group of named settings of conf/compare.yaml: `methods` or `splits`; an empty entry has defaults.
 
     Raises:
         ValueError: an entry with an unknown setting, or without one that is needed.
     """
-    known, entries = [field.name for field in fields(of) if field.name != "name"], {}
+    known, entries = [name for name in signature(of).parameters if name != "name"], {}
     for name, entry in config.items():
         own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry or {}).items()}
         if unknown := sorted(set(own) - set(known)):
