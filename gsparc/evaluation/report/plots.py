@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from gsparc.models.pareto import front
 WIDE, TALL = 7.0, 3.8
 MOST_CONFIDENCES = 8
 BAND = 0.95
+TIMES = "render_ms"  # of single queries, beside the figures of samples
 CDFS: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"), "rssi": ("error_db",)
 }  # fmt: skip
@@ -63,7 +64,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
         value, (ms, _), look_of = base.figure_of(name), base.latency, look(base.setting)
         if value is not None and ms is not None:
             axes.plot([ms], [value], **look_of.marked, ms=4)
-            how = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
+            how: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
             axes.annotate(base.setting, (ms, value), (4, -3), **how)
             points.append((ms, value))
     for columns in fronts:
@@ -86,18 +87,26 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
 def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
     name, axes = PER_SAMPLE[runs[0].kind], _axes()
-    for (setting, group), style in _styled(runs):
-        values = [sizes(run, name) for run in group if name in run.samples]
-        if values:
-            pooled = np.concatenate(values)
-            _cdf(axes, pooled[np.isfinite(pooled)], setting, style, samples=len(values[0]))
-    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in (r.setting for r in _rivals(runs)) else None
-    if rival is not None:
+    _cdfs(axes, runs, name)
+    rival = runs[0].samples.get(f"baseline/gp/{name}")
+    if rival is not None and any(base.setting == "gp" for base in _rivals(runs)):
         share = np.arange(1, len(rival) + 1) / len(rival)
         axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
     axes.set_ylabel("share of samples")
     title = "How the accuracy is distributed (95 % bands)"
     return _finished(axes, title, f"{heading_of(name)} of a test sample")
+
+
+def latency_cdf(runs: Sequence[Run]) -> Figure | None:
+    """Share of single queries that take at most so long; None where none were timed one by one."""
+    if not any(len(run.render_ms) for run in runs):
+        return None
+    axes = _axes()
+    _cdfs(axes, runs, TIMES)
+    logarithmic(axes)
+    axes.set_ylabel("share of queries")
+    title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
+    return _finished(axes, title, "one query, end to end [ms]")
 
 
 def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
@@ -106,22 +115,18 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
     names = [name for name in CDFS[runs[0].kind] if name in runs[0].samples]
-    timed = any(len(run.render_ms) for run in runs)
-    figure, ((*line,),) = panels(4.2 * (len(names) + timed), 3.9, 1, len(names) + timed)
-    for (setting, group), style in _styled(runs):
+    names += [TIMES] if any(len(run.render_ms) for run in runs) else []
+    labels = {}
+    for setting, group in grouped(runs).items():
         seconds = np.mean([float(run.facts["time/train_s"]) for run in group])
-        ms = [p50 for p50, _ in (run.latency for run in group) if p50 is not None]
-        label = f"{short(setting, 40)}: {seconds:.3g} s, {np.mean(ms):.3g} ms"
-        for axes, name in zip(line, names, strict=False):
-            values = np.abs(np.concatenate([run.samples[name] for run in group]))
-            _cdf(axes, values[np.isfinite(values)], label, style, samples=len(group[0].samples[name]))
-            axes.set_xlabel(heading_of(name))
-        if timed:
-            every = [run.render_ms for run in group if len(run.render_ms)]
-            _cdf(line[-1], np.concatenate(every), label, style)
-            line[-1].set_xlabel("one query, alone [ms]")
-            logarithmic(line[-1], fine=True)
-    for axes, name in zip(line, names, strict=False):
+        ms = np.mean([p50 for p50, _ in (run.latency for run in group) if p50 is not None])
+        labels[setting] = f"{short(setting, 40)}: {seconds:.3g} s, {ms:.3g} ms"
+    figure, ((*line,),) = panels(4.2 * len(names), 3.9, 1, len(names))
+    for axes, name in zip(line, names, strict=True):
+        _cdfs(axes, runs, name, labels)
+        axes.set_xlabel("one query, alone [ms]" if name == TIMES else heading_of(name))
+        if name == TIMES:
+            logarithmic(axes, fine=True)
         if name in ("mse", "error_power"):
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap
@@ -132,29 +137,24 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     save(figure, path, 100)
 
 
-def latency_cdf(runs: Sequence[Run]) -> Figure | None:
-    """Share of single queries that take at most so long; None where none were timed one by one."""
-    timed = [run for run in runs if len(run.render_ms)]
-    if not timed:
-        return None
-    axes = _axes()
-    for (setting, group), style in _styled(timed):
-        _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, style)
-    logarithmic(axes)
-    axes.set_ylabel("share of queries")
-    title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
-    return _finished(axes, title, "one query, end to end [ms]")
+def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] | None = None) -> None:
+    """Distributions of a figure of samples, or of `TIMES`, over all seeds of each setting.
 
-
-def _cdf(
-    axes: Axes, values: np.ndarray, label: str, style: dict[str, Any], samples: int | None = None
-) -> None:
-    """With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart)."""
-    share = np.arange(1, len(values) + 1) / len(values)
-    half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * (samples or len(values))))
-    axes.step(np.sort(values), share, where="post", lw=1.2, label=label, **style)
-    low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
-    axes.fill_between(np.sort(values), low, high, step="post", color=style["color"], alpha=0.08, lw=0)
+    With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart): seeds
+    share their test samples, whose number counts once.
+    """
+    for (setting, group), style in _styled(runs):
+        every = [run.render_ms if name == TIMES else sizes(run, name) for run in group]
+        every = [values[np.isfinite(values)] for values in every]
+        values = np.sort(np.concatenate(every))
+        if not len(values):
+            continue
+        share = np.arange(1, len(values) + 1) / len(values)
+        count = len(values) if name == TIMES else max(map(len, every))
+        half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * count))
+        axes.step(values, share, where="post", lw=1.2, label=(labels or {}).get(setting, setting), **style)
+        low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
+        axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
 
 
 def learning(runs: Sequence[Run]) -> Figure:

@@ -210,8 +210,9 @@ def number(value: object) -> float | None:
 
 
 def sizes(run: Run, name: str) -> np.ndarray:
-    """A per-sample figure (n,) of a run; an error by its size."""
-    return np.abs(run.samples[name]) if name == "error_db" else run.samples[name]
+    """A per-sample figure (n,) of a run, empty where it has none; an error by its size."""
+    values = run.samples.get(name, np.zeros(0))
+    return np.abs(values) if name == "error_db" else values
 
 
 log = logging.getLogger(__name__)
