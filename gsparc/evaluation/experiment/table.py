@@ -42,12 +42,15 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
         rows.append({
             **asdict(one.cell), "figure": figure, "value": float(facts[f"test/{figure}"]),
             "train_s": facts["time/train_s"], "train_cpu_s": facts["time/train_cpu_s"],
-            "load": facts.get("machine/load"), "score_db": score_db(kind, facts), "draws": one.drawn,
+            "load": facts.get("machine/load"), "draws": one.drawn,
+            "score_db": score_db(kind, facts) + 0.0,  # -0.0 would be shown as such
             "coverage": facts.get("test/interval/coverage_90"), "outage": facts.get("test/outage/brier"),
             "after_constant": facts.get("test/rmse_db_after_constant"), "second": second,
             "second_value": facts.get(f"test/{second}"), "earlier": one.earlier or "",
             "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
+    if not rows:
+        return pd.DataFrame(columns=CELL)
     seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
     numbers = ["budget_s", "load", "coverage", "outage", "after_constant", "second_value"]
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
@@ -77,6 +80,8 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
     """
     cells = cells_of(filled)
+    if cells.empty:
+        return pd.DataFrame(columns=ROW).astype({"draws": bool})
     cells["behind_db"] = _behind(cells)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
     means = [
