@@ -52,12 +52,9 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
             estimate = interval(run, name)
             if p50 is None or estimate is None:
                 continue
-            low, high = (estimate.low or estimate.value), (estimate.high or estimate.value)
             axes.errorbar(
-                [p50], [estimate.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
-                yerr=[[max(estimate.value - low, 0.0)], [max(high - estimate.value, 0.0)]],
-                fmt="o", ms=4, lw=0.7, color=style["color"],
-                label=setting if run is group[0] else None,
+                [p50], [estimate.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]], yerr=estimate.bars,
+                fmt="o", ms=4, lw=0.7, color=style["color"], label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, estimate.value))
     for base in _rivals(runs):
@@ -198,10 +195,8 @@ def costs(runs: Sequence[Run]) -> Figure:
             if spread is None:
                 panel.text(0, row, " none", va="center", fontsize=7, color="0.5")
                 continue
-            low, high = spread.low or spread.value, spread.high or spread.value
-            reach = [[spread.value - low], [high - spread.value]]
             panel.barh(row, spread.value, color=style["color"], alpha=0.8)
-            panel.errorbar([spread.value], [row], xerr=reach, c="k", lw=0.8)
+            panel.errorbar([spread.value], [row], xerr=spread.bars, c="k", lw=0.8)
             panel.text(spread.value, row, f" {spread.value:.3g}", va="center", fontsize=7)
         panel.set_title(title, fontsize=8)
         panel.tick_params(labelsize=7)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -105,18 +105,18 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
         ValueError: a directory that does not exist or holds no run; it is named.
     """
     runs: dict[Path, Run] = {}
-    simulated: dict[str, float] = {}
+    simulated: dict[str, float] = {}  # seconds by the content hash of what was made
     for path in map(Path, paths):
         if not path.is_dir():
             raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
-        files = (
-            [path / "summary.json"] if _is_run(path / "summary.json") else sorted(path.rglob("summary.json"))
-        )
-        here = {file.parent.resolve(): file for file in files if _is_run(file)}
-        seconds = _simulated(files)
-        simulated |= seconds
-        if not here and not seconds and not any(path.rglob("tradeoff.csv")):
+        own = path / "summary.json"
+        files = [own] if own.is_file() and _is_run(_facts(own)) else sorted(path.rglob(own.name))
+        every = {file.parent.resolve(): _facts(file) for file in files}
+        here = [folder for folder, facts in every.items() if _is_run(facts)]
+        made = [facts for facts in every.values() if "time/total_s" in facts and "dataset/receivers" in facts]
+        if not here and not made and not any(path.rglob("tradeoff.csv")):
             raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
+        simulated |= {str(facts["dataset/sha256"]): float(facts["time/total_s"]) for facts in made}
         runs |= {folder: read_run(folder) for folder in here if folder not in runs}
     if not runs:
         raise ValueError("a swept front or a simulation is no report: give the directory of a run too")
@@ -124,16 +124,6 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
         if run.facts.get("dataset/simulate_s") is None:
             run.facts["dataset/simulate_s"] = simulated.get(str(run.facts.get("dataset/sha256")))
     return list(runs.values())
-
-
-def _simulated(files: Iterable[Path]) -> dict[str, float]:
-    """Seconds that `gsparc.simulate` took [s], by the content hash of what it made."""
-    every = [_facts(file) for file in files if file.is_file()]
-    return {
-        str(facts["dataset/sha256"]): float(facts["time/total_s"])
-        for facts in every
-        if "time/total_s" in facts and "dataset/receivers" in facts
-    }
 
 
 def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
@@ -152,10 +142,7 @@ def distinct_overrides(runs: Sequence[Run]) -> list[Run]:
     return [replace(run, overrides=tuple(o for o in run.overrides if o not in shared)) for run in runs]
 
 
-def _is_run(file: Path) -> bool:
-    if not file.is_file():
-        return False
-    facts = _facts(file)
+def _is_run(facts: Mapping[str, Any]) -> bool:
     return "split/sha256" in facts and "time/train_s" in facts and "tradeoff/points" not in facts
 
 

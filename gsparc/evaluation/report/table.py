@@ -31,6 +31,12 @@ class Interval:
     low: float | None = None
     high: float | None = None
 
+    @property
+    def bars(self) -> list[list[float]]:
+        """Lengths of error bars below and above, (2, 1)."""
+        ends = (self.value if end is None else end for end in (self.low, self.high))
+        return [[max(sign * (end - self.value), 0.0)] for sign, end in zip((-1, 1), ends, strict=True)]
+
     def shown(self, form: str = ".2f") -> str:
         """`29.08 [27.4, 30.6]`."""
         ends = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
