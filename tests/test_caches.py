@@ -85,3 +85,18 @@ def test_facts_are_the_same_after_a_checkpoint(campaign):
     whole = replace(data.site, **{**FACTS, "target_scale": np.float64(3.0)})
     again = _site_from(_as_numpy(_plain(asdict(whole), "site")))
     assert identity(replace(data, site=again)) == identity(replace(data, site=whole))
+
+
+def test_baselines_of_another_program_text_are_fitted_again(monkeypatch, tmp_path):
+    """A change of the shared processes or metrics left kept baselines as they were."""
+    files = [tmp_path / name for name in ("models/gp.py", "processes/kernel.py", "evaluation/metrics.py")]
+    for file in (*files, tmp_path / "evaluation/scores.py"):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("a = 1\n")
+    (tmp_path / "physics").mkdir()
+    monkeypatch.setattr("gsparc.__file__", str(tmp_path / "__init__.py"))
+    found = {baseline_cache.program.__wrapped__()}
+    for file in files:
+        file.write_text("a = 2\n")
+        found.add(baseline_cache.program.__wrapped__())
+    assert len(found) == 4

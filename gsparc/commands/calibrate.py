@@ -12,10 +12,8 @@ from rich.table import Table
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.calibration import (
-    How,
-    Trial,
+    NAMES,
     collect,
-    divisible,
     draw_calibration,
     figures,
     store,
@@ -23,8 +21,7 @@ from gsparc.evaluation.calibration import (
     trials,
 )
 from gsparc.evaluation.summary import provenance, shown, table, write_summary
-from gsparc.prediction.confidence import Evidence
-from gsparc.prediction.risk_threshold import Promise
+from gsparc.prediction.risk_threshold import Guarantee
 from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
@@ -39,18 +36,18 @@ def task(config: DictConfig) -> dict[str, Any]:
     evidence, known = collect(paths, settings["dataset"], settings["split"])
     if config.confidence != "auto" and config.confidence not in evidence.scores:
         raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
-    promise = Promise(float(config.limit_db), float(config.alpha), float(config.delta))
-    if not divisible(evidence, "spatial"):
-        log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
-    ways: tuple[How, ...] = ("random", "spatial") if divisible(evidence, "spatial") else ("random",)
+    promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
-    found = [trials(evidence, promise, how, *draws) for how in ways]
+    found = [trials(evidence, promise, "random", *draws)]
+    try:
+        found.append(trials(evidence, promise, "spatial", *draws))
+    except ValueError:
+        log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
     facts = known | figures(evidence, found, promise) | machine_facts() | provenance()
     facts["seed"] = config.seed
     write_summary(run_dir / "summary.json", facts)
-    draw_calibration(
-        evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png"
-    )
+    title = f"{known['dataset/name']}, {known['model/name']}"
+    draw_calibration(evidence, found, promise, title, run_dir / "confidence.png")
     few = too_few(len(evidence), promise)
     stored_lines = [] if few is None else [few]
     if config.store:
@@ -61,11 +58,11 @@ def task(config: DictConfig) -> dict[str, Any]:
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
             stored_lines.append(f"{path}: confidence={stored.kind}, {bound}")
         write_summary(run_dir / "summary.json", facts)
-    show(run_dir, *tables(facts, evidence, found), lines=stored_lines)
+    show(run_dir, *tables(facts), lines=stored_lines)
     return facts
 
 
-def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> list[Table]:
+def tables(facts: dict[str, Any]) -> list[Table]:
     """Confidences side by side; bounds beside what came of them."""
     wanted = {
         "area under risk-coverage": ("area", ".4g"), "below distance": ("area_below_distance", ".0%"),
@@ -73,18 +70,22 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
     }  # fmt: skip
     curves = [
         [kind, *(shown(facts[f"confidence/{kind}/{key}"], form) for key, form in wanted.values())]
-        for kind in evidence.scores
+        for kind in NAMES
+        if f"confidence/{kind}/area" in facts
     ]
     draws = []
-    for trial in found:
-        low, high = trial.interval or (0.0, 0.0)
-        broken = "-" if trial.broken is None else f"{trial.broken:.1%}, {low:.0%} to {high:.0%}"
+    for how in ("random", "spatial"):
+        if f"trial/{how}/kind" not in facts:
+            continue
+        own = {key.rpartition("/")[2]: value for key, value in facts.items() if f"trial/{how}/" in key}
+        ends = f"{own['broken_low'] or 0:.0%} to {own['broken_high'] or 0:.0%}"
+        broken = "-" if own["broken"] is None else f"{own['broken']:.1%}, {ends}"
         draws.append([
-            trial.how, trial.kind, f"{trial.coverage.mean():.0%}", shown(trial.mean_realised, ".1%"),
-            broken, f"{trial.broken_of_all:.1%}", f"{trial.delta:.0%}", f"{trial.silent:.0%}",
+            how, own["kind"], f"{own['coverage']:.0%}", shown(own["realised"], ".1%"), broken,
+            f"{own['broken_of_all']:.1%}", f"{facts['promise/delta']:.0%}", f"{own['silent']:.0%}",
         ])  # fmt: skip
     numbers = ["accepted", "bad among them", "broken", "of all draws", "promised", "accepted nobody"]
-    heading = f"{facts['dataset/name']}: {len(evidence)} positions of {facts['model/name']}"
+    heading = f"{facts['dataset/name']}: {facts['positions']} positions of {facts['model/name']}"
     promise = f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB"
     return [
         table(heading, ["confidence"], list(wanted), curves),

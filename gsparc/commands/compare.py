@@ -3,42 +3,42 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsparc.commands.compare_places import Row as PlaceRow
 from gsparc.commands.compare_places import compare_places
-from gsparc.commands.output import columns, run_directory, show
+from gsparc.commands.output import run_directory, show
 from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.limits import choice
-from gsparc.evaluation.experiment.cells import Budget, contenders, plan, plugged
+from gsparc.evaluation.experiment.cells import Budget, Contender, plan, plugged
 from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
-from gsparc.evaluation.experiment.problem import problems_of
-from gsparc.evaluation.experiment.table import Result, Row, markdown, overview, results
-from gsparc.evaluation.experiment.table import blocks as blocks_of
-from gsparc.evaluation.experiment.table import rows as rows_of
+from gsparc.evaluation.experiment.problem import named, problems_of
+from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, overview, rows_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)
 
 
-def task(config: DictConfig) -> list[Row] | list[PlaceRow]:
+def task(config: DictConfig) -> pd.DataFrame | list[PlaceRow]:
     """Fill the cells that are asked for and not there yet, then time all methods, or locate; and report."""
     RunSettings.of(config)
     run_dir = run_directory()
     settings = plain(config)
     choice("predict", "locate").check("task", settings["task"])
     locating = settings["task"] == "locate"
-    methods = plugged() | contenders(settings["methods"])
+    methods = plugged() | named("methods", Contender, settings["methods"])
     folder = settings["cells"]
     kept = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     paths = [(own or {}).get(key) for own in settings["datasets"].values() for key in ("root", "file")]
@@ -66,7 +66,7 @@ def task(config: DictConfig) -> list[Row] | list[PlaceRow]:
 
 def report(
     filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
-) -> list[Row]:
+) -> pd.DataFrame:
     """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
 
     Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`.
@@ -75,24 +75,25 @@ def report(
     blocks = blocks_of(rows)
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
-    drawn = [row for row in rows if row.draws]
-    by_set = [
-        [row for row in drawn if row.dataset == name] for name in dict.fromkeys(r.dataset for r in drawn)
-    ]
+    drawn = rows[rows.draws]
+    by_set = [here for _, here in drawn.groupby("dataset", sort=False)]
     page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours, only_timed)])
-    write_samples(run_dir / "compare.csv", columns(rows, Row))
-    write_samples(run_dir / "cells.csv", columns(results(filled), Result))
+    write_samples(run_dir / "compare.csv", rows.to_dict("list"))
+    write_samples(run_dir / "cells.csv", cells_of(filled)[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
-    for one in by_set:
-        draw_splits(one, run_dir / f"{one[0].dataset}.png")
-    if len(drawn) < len(rows):
-        draw_budgets([row for row in rows if not row.draws], run_dir / "compare.png", ours)
+    for here in by_set:
+        draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png")
+    if not rows.draws.all():
+        draw_budgets(rows[~rows.draws], run_dir / "compare.png", ours)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}
     for block in blocks:
-        stem = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"
-        facts[f"{stem}/first"] = block.rows[0].method
-        for row in block.rows:
-            own = {"score_db": row.score_db, "train_s": row.train_s, "query_ms_p50": row.query_ms}
+        budget = block.budget_s.max()
+        name = "any" if math.isnan(budget) else f"{budget:g}"
+        stem = f"{block.dataset.iloc[0]}/{block.split.iloc[0]}/{name}"
+        facts[f"{stem}/first"] = block.method.iloc[0]
+        for row in block.itertuples():
+            query_ms = None if math.isnan(row.query_ms) else row.query_ms
+            own = {"score_db": row.score_db, "train_s": row.train_s, "query_ms_p50": query_ms}
             facts |= {f"{stem}/{row.method}/{name}": value for name, value in own.items()}
     write_summary(run_dir / "summary.json", facts)
     show(run_dir, Markdown(page))

@@ -6,20 +6,21 @@ accuracy under its own name, seconds of training, milliseconds of a query and th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
+import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from gsparc.commands.output import columns, finish, run_directory
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.fit import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
-from gsparc.evaluation.experiment.study import Row, Study
+from gsparc.evaluation.experiment.study import Study, facts_of
 from gsparc.evaluation.summary import run_conditions, shown, table, write_samples
 from gsparc.models.method import Method
 from gsparc.models.registry import build, method_class
@@ -49,7 +50,7 @@ def study_of(config: DictConfig) -> Study:
     )
 
 
-def task(config: DictConfig) -> list[Row]:
+def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
     settings = RunSettings.of(config)
     run_dir = run_directory()
@@ -62,12 +63,10 @@ def task(config: DictConfig) -> list[Row]:
         raise KeyboardInterrupt("the study was interrupted; it keeps nothing to go on from") from None
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
-        "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base,
+        "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base, **facts_of(rows),
     }  # fmt: skip
-    for row in rows:
-        facts |= row.facts()
     title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
-    write_samples(run_dir / "study.csv", columns(rows, Row))
+    write_samples(run_dir / "study.csv", rows.to_dict("list"))
     draw_study(rows, title, run_dir / "study.png")
     ratios = "" if study.base is None else f"ratios to {study.base!r}; "
     finish(
@@ -76,19 +75,18 @@ def task(config: DictConfig) -> list[Row]:
     return rows
 
 
-def table_of(rows: Sequence[Row], title: str) -> Table:
+def table_of(rows: pd.DataFrame, title: str) -> Table:
     """A line per row; conditions and ratios where the study has any."""
-    changed = any(row.what != "none" for row in rows)
-    compared = any(row.train_ratio is not None for row in rows)
-    ratio = ["ratio"] if compared else []
+    changed, compared = (rows.what != "none").any(), rows.train_ratio.notna().any()
+    heads = {"train_s": "train s", "train_ratio": "ratio", "train_cpu_s": "cpu s", "query_ms": "query ms",
+             "query_p95_ms": "p95", "query_ratio": "ratio"}  # fmt: skip
+    costs = [name for name in heads if compared or not name.endswith("_ratio")]
     lines = []
-    for row in rows:
-        change = row.what if row.what == "none" else f"{row.what} {row.amount:g}"
-        value = f"{row.value:.4g}" + ("" if row.spread is None else f" ± {row.spread:.2g}")
-        train, query = ([row.train_ratio], [row.query_ratio]) if compared else ([], [])
-        numbers = (row.train_s, *train, row.train_cpu_s, row.query_ms, row.query_p95_ms, *query)
-        words = [row.variant, row.effects, *([change] if changed else [])]
-        lines.append([*words, f"{row.rows:g}", value, *(shown(number, ".3g") for number in numbers)])
+    for row in rows.to_dict("records"):
+        change = row["what"] if row["what"] == "none" else f"{row['what']} {row['amount']:g}"
+        value = f"{row['value']:.4g}" + ("" if pd.isna(row["spread"]) else f" ± {row['spread']:.2g}")
+        words = [row["variant"], row["effects"], *([change] if changed else [])]
+        lines.append([*words, f"{row['rows']:g}", value, *(shown(row[name], ".3g") for name in costs)])
     words = ["variant", "effects", *(["changed"] if changed else [])]
-    costs = ["train s", *ratio, "cpu s", "query ms", "p95", *ratio]
-    return table(title, words, ["rows", rows[0].figure, *costs], lines)
+    numbers = ["rows", rows.figure.iloc[0], *(heads[name] for name in costs)]
+    return table(title, words, numbers, lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import time
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+import gsparc
 from gsparc.data.assemble import identity
 from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements
@@ -24,7 +26,6 @@ from gsparc.training.context import FitContext
 log = logging.getLogger(__name__)
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-CACHE_VERSION = 6  # raise it when a baseline or a metric changes its results
 STORE_ABOVE_S = 3.0  # processor time; cheaper fits are repeated, so that their times are current
 
 
@@ -58,6 +59,16 @@ class Fitted:
     train_s: tuple[float, ...]
 
 
+@functools.cache
+def program() -> str:
+    """Hash of the program text that baselines and their figures come from."""
+    folder = Path(gsparc.__file__).parent
+    parts = ("models", "processes", "physics", "evaluation/metrics.py", "evaluation/scores.py")
+    paths = (folder / part for part in parts)
+    files = (file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path]))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
 def baseline(
     name: str, data: Measurements, split: Split, eval_on: str = "test", cache: Path | None = None
 ) -> Fitted:
@@ -73,12 +84,12 @@ def baseline(
     unseen = eval_on == "val"
     # The same data may be in another model's local coordinates and units, and count its stations.
     key = hashlib.sha256(f"{identity(data)} {split.sha256}".encode()).hexdigest()[:24]
-    folder = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key
+    folder = None if cache is None else Path(cache) / f"baselines-{program()}" / key
     folder = folder and folder / (f"{name}-train" if unseen else name)
     methods, seconds = [], []
     for number, fold in enumerate(split.folds):
-        found = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
-        if found is None:
+        fit = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
+        if fit is None:
             method = for_links(method_class(name), data)
             known = replace(fold, val=fold.val[:0]) if unseen else fold
             spent = time.process_time()
@@ -86,11 +97,11 @@ def baseline(
             spent = time.process_time() - spent  # wall time on a busy machine would mislead
             for note in report.notes:
                 log.info("fold %d: %s", number, note)
-            found = (method, report.seconds)
+            fit = (method, report.seconds)
             if folder is not None and spent > STORE_ABOVE_S:
                 checkpoint.save(folder / f"fold{number}.ckpt", method, extra={"train_s": report.seconds})
-        methods.append(found[0])
-        seconds.append(found[1])
+        methods.append(fit[0])
+        seconds.append(fit[1])
     scores = None if folder is None else _stored_scores(folder / f"{eval_on}.npz")
     if scores is None:
         scores = score(methods, data, split, eval_on)

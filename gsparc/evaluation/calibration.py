@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +29,7 @@ from gsparc.prediction.confidence import (
     threshold_of,
 )
 from gsparc.prediction.risk_threshold import (
-    Promise,
+    Guarantee,
     Threshold,
     binomial_interval,
     choose,
@@ -37,52 +38,25 @@ from gsparc.prediction.risk_threshold import (
 )
 
 
-@dataclass(frozen=True)
-class RiskCoverage:
-    """Mean loss of the surest share of predictions.
-
-    Attributes:
-        coverage: (n,) shares accepted, 1 / n to 1.
-        risk: (n,) mean loss among them.
-    """
-
-    coverage: np.ndarray
-    risk: np.ndarray
-
-    @property
-    def area(self) -> float:
-        """Mean risk over all coverages (Geifman, Uziel and El-Yaniv 2019)."""
-        return float(self.risk.mean())
-
-    def at(self, coverage: float) -> float:
-        """Risk of the surest `coverage` of all."""
-        return float(self.risk[max(round(coverage * len(self.risk)), 1) - 1])
-
-
 def bounded(relative_error: np.ndarray) -> np.ndarray:
     """Losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
     return np.minimum(relative_error, 1.0)
 
 
-def risk_coverage(score: np.ndarray, loss: np.ndarray) -> RiskCoverage:
-    """Accept by falling score (n,); equal scores share their mean loss (n,): their order cannot matter.
+def risk_coverage(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
+    """Mean loss of the 1, 2, ..., n surest of n predictions, (n,).
 
-    Raises:
-        ValueError: not as many scores as losses, or none.
+    Its mean is the area under risk against coverage (Geifman, Uziel and El-Yaniv 2019). Equal scores share
+    their mean loss: their order cannot matter.
+
+    Args:
+        score: (n,), larger is surer.
+        loss: (n,).
     """
-    if len(score) != len(loss) or not len(score):
-        raise ValueError(f"expected as many scores as losses, and some: got {len(score)} and {len(loss)}")
     order = np.argsort(-score, kind="stable")
-    sorted_score, sorted_loss = score[order], loss[order].astype(np.float64)
-    _, group = np.unique(-sorted_score, return_inverse=True)
-    shared = (np.bincount(group, sorted_loss) / np.bincount(group))[group]
-    count = np.arange(1, len(score) + 1)
-    return RiskCoverage(count / len(score), np.cumsum(shared) / count)
-
-
-def perfect_area(loss: np.ndarray) -> float:
-    """Area of a confidence that knows the losses (n,)."""
-    return risk_coverage(-loss, loss).area
+    _, group = np.unique(-score[order], return_inverse=True)
+    shared = (np.bincount(group, loss[order].astype(np.float64)) / np.bincount(group))[group]
+    return np.cumsum(shared) / np.arange(1, len(score) + 1)
 
 
 def rank_correlation(score: np.ndarray, loss: np.ndarray) -> float | None:
@@ -107,7 +81,7 @@ class Trial:
         how: how positions were divided.
         realised: (draws,) share of bad ones among accepted test positions; NaN where none was accepted.
         coverage: (draws,) share of test positions accepted.
-        alpha, delta: as promised.
+        alpha: largest share of bad ones that was guaranteed.
     """
 
     kind: str
@@ -115,44 +89,25 @@ class Trial:
     realised: np.ndarray
     coverage: np.ndarray
     alpha: float
-    delta: float
 
-    @property
-    def silent(self) -> float:
-        """Share of draws in which nobody was accepted: nothing was promised, so nothing was kept."""
-        return float(np.isnan(self.realised).mean())
+    def facts(self) -> dict[str, Any]:
+        """Figures over the draws; None of those that nothing was accepted in.
 
-    @property
-    def _spoke(self) -> np.ndarray:
-        return self.realised[~np.isnan(self.realised)]
-
-    @property
-    def broken(self) -> float | None:
-        """Share of draws in which more than alpha were bad, of those that accepted anybody; None of none.
-
-        The promise is delta of *all* draws (`broken_of_all`). Where most accept nobody, those that do are
-        the ones that chance flattered, and this share is larger.
+        `broken` is the share of draws with more than alpha bad ones, of the draws that accepted anybody, with
+        Clopper and Pearson's 95 % interval as if they were independent (they share their positions: it is the
+        least that chance allows for). Delta bounds the share of *all* draws, `broken_of_all`: where most
+        accept nobody, those that do are the ones that chance flattered. `silent` is the share that did not.
         """
-        return float((self._spoke > self.alpha).mean()) if len(self._spoke) else None
-
-    @property
-    def broken_of_all(self) -> float:
-        """Share of all draws in which more than alpha of the accepted were bad: what delta bounds."""
-        return float((self.realised > self.alpha).mean())  # NaN > alpha is False
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """Clopper and Pearson's 95 % interval of `broken`, as if the draws were independent.
-
-        They share their positions, so this is the least that chance allows for.
-        """
-        spoke = self._spoke
-        return binomial_interval(int((spoke > self.alpha).sum()), len(spoke)) if len(spoke) else None
-
-    @property
-    def mean_realised(self) -> float | None:
-        """Mean share of bad ones among accepted test positions."""
-        return None if np.isnan(self.realised).all() else float(np.nanmean(self.realised))
+        accepting = self.realised[~np.isnan(self.realised)]
+        bad = accepting > self.alpha
+        low, high = binomial_interval(int(bad.sum()), len(accepting)) if len(accepting) else (None, None)
+        return {
+            "kind": self.kind, "broken": float(bad.mean()) if len(accepting) else None, "broken_low": low,
+            "broken_high": high, "broken_of_all": float(bad.sum() / len(self.realised)),
+            "silent": float(np.isnan(self.realised).mean()),
+            "realised": float(accepting.mean()) if len(accepting) else None,
+            "coverage": float(self.coverage.mean()), "draws": len(self.realised),
+        }  # fmt: skip
 
 
 def divided(
@@ -180,16 +135,7 @@ def divided(
     return choose_on, calibrate, test
 
 
-def divisible(evidence: Evidence, how: How) -> bool:
-    """Whether `divided` has three parts to give."""
-    try:
-        divided(evidence, how, np.random.default_rng(0))
-    except ValueError:
-        return False
-    return True
-
-
-def too_few(count: int, promise: Promise) -> str | None:
+def too_few(count: int, promise: Guarantee) -> str | None:
     """What is missing for any promise on so many positions; None where there are enough."""
     needed = int(np.ceil(promise.least / SHARES[1]))
     if count >= needed:
@@ -200,7 +146,7 @@ def too_few(count: int, promise: Promise) -> str | None:
     )
 
 
-def laxer(evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int) -> Promise | None:
+def laxer(evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int) -> Guarantee | None:
     """The same promise with the least larger limit, in whole decibels, that these positions keep; or None."""
     for limit in range(int(np.floor(promise.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(promise, limit_db=float(limit))
@@ -220,11 +166,16 @@ def cells(position: np.ndarray) -> np.ndarray:
 def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
     """The confidence of the smallest area under risk-coverage on `rows`."""
     loss = bounded(evidence.error[rows])
-    return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).area)
+    return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).mean())
 
 
 def accept(
-    evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int | list[int], apart_m: float = 0
+    evidence: Evidence,
+    promise: Guarantee,
+    kind: str,
+    spatial: bool,
+    seed: int | list[int],
+    apart_m: float = 0,
 ) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
     """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
 
@@ -239,12 +190,12 @@ def accept(
     score, bad = evidence.scores[used], promise.bad(evidence.error)
     calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
     patch = cells(evidence.position)[calibrate] if spatial else None
-    found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
-    return used, found, test, choose_on
+    threshold = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
+    return used, threshold, test, choose_on
 
 
 def trials(
-    evidence: Evidence, promise: Promise, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
+    evidence: Evidence, promise: Guarantee, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
     seed: int = 0,
 ) -> Trial:  # fmt: skip
     """Resample `draws` calibration sets.
@@ -261,13 +212,13 @@ def trials(
     realised, coverage, kinds = [], [], []
     bad = promise.bad(evidence.error)
     for draw in range(draws):
-        used, found, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
-        taken = test[evidence.scores[used][test] >= found.value]
+        used, threshold, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
+        accepted = test[evidence.scores[used][test] >= threshold.value]
         kinds.append(used)
-        realised.append(bad[taken].mean() if len(taken) else np.nan)
-        coverage.append(len(taken) / max(len(test), 1))
+        realised.append(bad[accepted].mean() if len(accepted) else np.nan)
+        coverage.append(len(accepted) / max(len(test), 1))
     most = max(set(kinds), key=kinds.count)
-    return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha, promise.delta)
+    return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha)
 
 
 NAMES = {
@@ -276,34 +227,34 @@ NAMES = {
 }  # fmt: skip
 
 
-def draw_calibration(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> None:
-    """Save both halves of the story as one PNG."""
+def draw_calibration(
+    evidence: Evidence, trials: Sequence[Trial], promise: Guarantee, title: str, path: Path
+) -> None:
+    """Save risk against coverage, and what came of the draws, as one PNG."""
     figure, ((left, right),) = panels(11, 4.2, 1, 2)
     loss = bounded(evidence.error)
+    coverage = np.arange(1, len(loss) + 1) / len(loss)
     for kind, score in evidence.scores.items():
-        curve = risk_coverage(score, loss)
-        left.plot(curve.coverage, curve.risk, label=f"{NAMES[kind]}, area {curve.area:.3g}")
-    knowing = risk_coverage(-loss, loss)
-    left.plot(knowing.coverage, knowing.risk, "k:", label=f"knowing the errors, area {knowing.area:.3g}")
+        risk = risk_coverage(score, loss)
+        left.plot(coverage, risk, label=f"{NAMES[kind]}, area {risk.mean():.3g}")
+    risk = risk_coverage(-loss, loss)
+    left.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
     left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")
     left.set_title(title)
-    left.legend(fontsize=8)
     for trial, colour in zip(trials, ("tab:blue", "tab:orange"), strict=False):
-        right.scatter(
-            trial.coverage, trial.realised, s=9, alpha=0.4, color=colour,
-            label=f"{trial.how}: broken in {trial.broken_of_all:.0%} of {len(trial.realised)} draws",
-        )  # fmt: skip
-    if trials:
-        # a draw that accepts nobody has no share of bad ones: NaN
-        worst = max(trials[0].alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
-        right.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
-        if not any(trial.coverage.any() for trial in trials):
-            right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
-        right.axhline(trials[0].alpha, color="black", linewidth=1)
-        alpha, delta = trials[0].alpha, trials[0].delta
-        right.set_title(f"promise: at most {alpha:.0%} bad, broken in at most {delta:.0%}")
+        broken = trial.facts()["broken_of_all"]
+        label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
+        right.scatter(trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label)
+    # a draw that accepts nobody has no share of bad ones: NaN
+    worst = max(promise.alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
+    right.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
+    if not any(trial.coverage.any() for trial in trials):
+        right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
+    right.axhline(promise.alpha, color="black", linewidth=1)
+    right.set_title(f"promise: at most {promise.alpha:.0%} bad, broken in at most {promise.delta:.0%}")
     right.set(xlabel="share of test positions accepted", ylabel="realised share of bad ones among them")
-    right.legend(fontsize=8)
+    for axis in (left, right):
+        axis.legend(fontsize=8)
     save(figure, path)
 
 
@@ -328,7 +279,7 @@ def store(
     path: str,
     dataset: dict[str, Any],
     split: dict[str, Any],
-    promise: Promise,
+    promise: Guarantee,
     kind: str,
     spatial: bool,
     seed: int,
@@ -337,9 +288,9 @@ def store(
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     evidence = gather(method, data, fold, rows_of(fold, "test"))
-    used, found, _, _ = accept(evidence, promise, kind, spatial, seed)
-    threshold = threshold_of(used, found)
-    stored = Trusted(used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
+    kind_used, choice, _, _ = accept(evidence, promise, kind, spatial, seed)
+    threshold = threshold_of(kind_used, choice)
+    stored = Trusted(kind_used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
     keep(path, stored)
     if np.isfinite(threshold):
         return stored, f"accepted from {threshold:.4g}"
@@ -373,30 +324,26 @@ def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, floa
     predicted = np.concatenate([method.answer(batch).mean.numpy() for batch in batches])
     target = data.target[fold.test]
     both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
-    found = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
-    return {f"{room}/{name}": value for room, one in found.items() for name, value in one.items()}
+    results = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
+    return {f"{room}/{name}": value for room, one in results.items() for name, value in one.items()}
 
 
-def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[str, Any]:
+def figures(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:
     """Flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
     loss = bounded(evidence.error)
-    facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": perfect_area(loss)}
-    curves = {kind: risk_coverage(score, loss) for kind, score in evidence.scores.items()}
-    bar = curves["distance"].area
-    for kind, curve in curves.items():
+    perfect = risk_coverage(-loss, loss).mean()
+    facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": float(perfect)}
+    risks = {kind: risk_coverage(score, loss) for kind, score in evidence.scores.items()}
+    bar = float(risks["distance"].mean())
+    for kind, risk in risks.items():
+        area = float(risk.mean())
         own = {
-            "area": curve.area, "risk_at_70": curve.at(0.7),
+            "area": area, "risk_at_70": float(risk[max(round(0.7 * len(risk)), 1) - 1]),
             "rank_correlation": rank_correlation(evidence.scores[kind], loss),
-            "area_below_distance": 1 - curve.area / bar if bar > 0 else None,  # nothing to save
+            "area_below_distance": 1 - area / bar if bar > 0 else None,  # nothing to save
         }  # fmt: skip
         facts |= {f"confidence/{kind}/{name}": value for name, value in own.items()}
     facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
-    for trial in found:
-        low, high = trial.interval or (None, None)
-        came = {
-            "kind": trial.kind, "broken": trial.broken, "broken_low": low, "broken_high": high,
-            "broken_of_all": trial.broken_of_all, "silent": trial.silent, "realised": trial.mean_realised,
-            "coverage": float(trial.coverage.mean()), "draws": len(trial.realised),
-        }  # fmt: skip
-        facts |= {f"trial/{trial.how}/{name}": value for name, value in came.items()}
+    for trial in trials:
+        facts |= {f"trial/{trial.how}/{name}": value for name, value in trial.facts().items()}
     return facts

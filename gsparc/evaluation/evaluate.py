@@ -77,16 +77,16 @@ def evaluate(
     scores = score(methods, data, split, eval_on)
     names = fitting(data, split) if baselines is None else baselines
     others = {name: baseline(name, data, split, eval_on, cache) for name in names}
-    facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in pooled(scores, data, split).items()}
+    facts: dict[str, Any] = {}
+    every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
+    for stem, one in every.items():
+        own = {**pooled(one, data, split), "skill": _skill(one, others)}
+        facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
+    facts |= {f"baseline/{name}/train_s": float(np.mean(other.train_s)) for name, other in others.items()}
     decided = scores.decided_by()
     if decided and data.row_names:
         decided["decided_by/name"] = data.row_names[int(decided["decided_by/row"])]
     facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
-    facts[f"{eval_on}/skill"] = _skill(scores, others)
-    for name, other in others.items():
-        own = {**pooled(other.scores, data, split), "skill": _skill(other.scores, others)}
-        own["train_s"] = float(np.mean(other.train_s))
-        facts |= {f"baseline/{name}/{k}": v for k, v in own.items()}
     if REFERENCE in others:
         facts |= paired_differences(scores, others[REFERENCE].scores, REFERENCE)
     facts["time/train_s"] = None if seconds is None else float(np.mean(seconds))

@@ -24,13 +24,9 @@ AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them wit
 
 
 def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None) -> None:
-    """Save a map of mirror planes, boxes and Gaussians over the measured places.
+    """Save a map of mirror planes, boxes and Gaussians over the measured places as PNG.
 
-    Args:
-        data: measurements of the site.
-        objects: of it, local coordinates.
-        path: PNG file.
-        known: walls and boxes, in the coordinates of the measurements.
+    `objects` are in local coordinates, `known` walls and boxes in those of the measurements.
     """
     origin = data.site.origin
     places = np.unique(data.moving[:, -3:], axis=0) + origin
@@ -75,29 +71,29 @@ def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndar
         first = False
     lying = [n for n in range(len(planes)) if abs(planes[n, 2]) > 1 - UPRIGHT]
     heights = sorted((planes[n, 3] + planes[n, :3] @ origin) / planes[n, 2] for n in lying)
-    said = ", ".join(f"{height:.2f}" for height in heights)
-    return f"horizontal planes at z = {said} m" if said else ""
+    heights_text = ", ".join(f"{height:.2f}" for height in heights)
+    return f"horizontal planes at z = {heights_text} m" if heights_text else ""
 
 
 def _draw_gaussians(axis: Any, objects: SiteObjects, origin: np.ndarray) -> PatchCollection | None:
     """Ellipses at one standard deviation, coloured by what they take."""
-    kept = np.flatnonzero(np.abs(objects.losses) >= LEAST_DB)
-    if not len(kept):
+    rows = np.flatnonzero(np.abs(objects.losses) >= LEAST_DB)
+    if not len(rows):
         return None
-    kept = kept[np.argsort(np.abs(objects.losses[kept]))]  # the strongest above
+    rows = rows[np.argsort(np.abs(objects.losses[rows]))]  # the strongest above
     patches = [
         Ellipse(
             (objects.means[i] + origin)[:2], *(2 * objects.scales[i, :2]), angle=np.degrees(objects.turns[i])
         )
-        for i in kept
+        for i in rows
     ]
-    most = float(np.abs(objects.losses[kept]).max())
-    drawn = PatchCollection(
+    most = float(np.abs(objects.losses[rows]).max())
+    collection = PatchCollection(
         patches, cmap="PuOr_r", norm=TwoSlopeNorm(0.0, -most, most), alpha=0.6, edgecolor="0.3", linewidth=0.3
     )
-    drawn.set_array(objects.losses[kept])
-    axis.add_collection(drawn)
-    return drawn
+    collection.set_array(objects.losses[rows])
+    axis.add_collection(collection)
+    return collection
 
 
 def _draw_known(axis: Any, known: SceneWalls, height: float) -> None:

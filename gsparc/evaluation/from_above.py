@@ -53,8 +53,8 @@ def draw_walls(axis: Any, triangles: np.ndarray) -> None:
     ends = np.stack([upright, np.roll(upright, -1, axis=1)], axis=2)  # three sides of each
     length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
     longest = ends[np.arange(len(ends)), length.argmax(1)]
-    kept = np.argsort(-length.max(1, initial=0))[:MOST_WALLS]
-    axis.add_collection(LineCollection(longest[kept], colors="0.45", linewidths=0.5, zorder=0))
+    rows = np.argsort(-length.max(1, initial=0))[:MOST_WALLS]
+    axis.add_collection(LineCollection(longest[rows], colors="0.45", linewidths=0.5, zorder=0))
 
 
 def annotate(axis: Any, text: str, where: np.ndarray, colour: str = "black", above: bool = True) -> None:

@@ -22,10 +22,6 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
     of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
     perfect, and `outage/brier_rate` what always saying the rate gives.
-
-    Args:
-        scores: of powers (kind rssi).
-        data: whose rows they are.
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
     known = np.isfinite(variance) & (variance > 0) & (mean > 0)
@@ -36,23 +32,23 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     power = data.target[row, 0].astype(np.float64) * data.site.target_scale
     silent = np.zeros(len(row), bool) if data.censored is None else data.censored[row]
     heard = ~silent & (power > 0)
-    found: dict[str, float | None] = {}
+    figures: dict[str, float | None] = {}
     if heard.any():
         half = norm.ppf((1 + SHARE) / 2) * spread_db[heard]
         inside = np.abs(10 * np.log10(power[heard]) - mean_db[heard]) <= half
-        found |= {"interval/coverage_90": float(inside.mean()), "interval/width_db": float(2 * half.mean())}
+        figures |= {"interval/coverage_90": float(inside.mean()), "interval/width_db": float(2 * half.mean())}
     level_db = levels(data)
     if level_db is None:
-        return found
+        return figures
     of_row = level_db[0 if data.station is None else data.station[row]]
-    told = np.isfinite(of_row)
-    if not told.any():  # all of them are of stations that heard everything
-        return found
-    chance = norm.cdf((of_row[told] - mean_db[told]) / spread_db[told])
-    rate = float(silent[told].mean())
-    return found | {
+    limited = np.isfinite(of_row)
+    if not limited.any():  # all of them are of stations that heard everything
+        return figures
+    chance = norm.cdf((of_row[limited] - mean_db[limited]) / spread_db[limited])
+    rate = float(silent[limited].mean())
+    return figures | {
         "outage/rate": rate,
-        "outage/brier": float(np.mean((chance - silent[told]) ** 2)),
+        "outage/brier": float(np.mean((chance - silent[limited]) ** 2)),
         "outage/brier_rate": rate * (1 - rate),
     }
 
@@ -67,22 +63,17 @@ def levels(data: Measurements) -> np.ndarray | None:
     if data.censored is None or not data.censored.any():
         return None
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
-    found = np.full(1 if data.site.stations is None else len(data.site.stations), np.nan)
+    level = np.full(1 if data.site.stations is None else len(data.site.stations), np.nan)
     rows = np.flatnonzero(data.censored)
-    found[station[rows]] = 10 * np.log10(data.target[rows, 0].astype(np.float64) * data.site.target_scale)
-    return found
+    level[station[rows]] = 10 * np.log10(data.target[rows, 0].astype(np.float64) * data.site.target_scale)
+    return level
 
 
 def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies, of powers how honest variances are; `rmse_db_after_constant` where stations are held out.
-
-    Args:
-        scores: of rows of `data`.
-        data, split: what was learned from.
-    """
-    found = scores.figures()
+    """Accuracies, and of powers `power_intervals` and, of stations held out, `rmse_db_after_constant`."""
+    figures = scores.figures()
     if data.site.kind == "rssi":
-        found |= power_intervals(scores, data)
+        figures |= power_intervals(scores, data)
         if split.name == "stations" and data.station is not None:
-            found["rmse_db_after_constant"] = scores.after_constant(data.station)
-    return found
+            figures["rmse_db_after_constant"] = scores.after_constant(data.station)
+    return figures

@@ -20,11 +20,7 @@ def draw_posteriors(
 ) -> None:
     """Masses of the cells of a few snapshots from above, as one PNG.
 
-    Args:
-        located: of all snapshots.
-        true: (n, 3) [m], in the coordinates of `located`; None where nobody knows.
-        trained: (m, 3) places that the model learned from.
-        path: file.
+    `true` (n, 3) [m] in the coordinates of `located`, or None; `trained` (m, 3): places learned from.
     """
     some = np.unique(np.linspace(0, len(located) - 1, SHOWN).round().astype(int))
     columns = min(len(some), 3)

@@ -114,13 +114,13 @@ def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None
 
     A finished model has the hash of its whole split, an interrupted training that of its own rows.
     """
-    said = []
+    answers = []
     for one, fold in zip(stored, split.folds, strict=True):
         whole, rows = one.extra.get("split_sha256"), one.extra.get("origin", {}).get("rows")
         if whole is None and rows is None:
             return None
-        said.append(rows == indices_hash((fold,)) if whole is None else whole == split.sha256)
-    return all(said)
+        answers.append(rows == indices_hash((fold,)) if whole is None else whole == split.sha256)
+    return all(answers)
 
 
 def _foreign(

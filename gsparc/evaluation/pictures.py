@@ -16,37 +16,26 @@ SPECTRA = 4  # test rows drawn
 
 
 def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str, path: Path) -> None:
-    """Draw test rows: `SPECTRA` spectra, or all channels or powers as points.
-
-    Args:
-        method: fitted on `fold`.
-        data, fold: where the test rows come from.
-        title: above everything.
-        path: PNG file.
-    """
+    """Draw test rows of a fold, which the method was fitted on: `SPECTRA` spectra, else points."""
     spectra = data.site.kind == "spectrum"
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     batch = data.batch(rows)
-    found = method.answer(batch)
-    true, predicted = batch.target.numpy(), found.mean.numpy()
+    prediction = method.answer(batch)
+    true, predicted = batch.target.numpy(), prediction.mean.numpy()
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         return draw_points(true * scale, predicted * scale, title, path, unit)
     assert data.site.grid is not None
-    confidence = None if found.confidence is None else found.confidence.numpy()
+    confidence = None if prediction.confidence is None else prediction.confidence.numpy()
     return draw_spectra(true, predicted, rows, title, path, confidence, data.site.grid.edges())
 
 
 def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB") -> None:
-    """Save a figure of predicted against measured strength, and of the error of the phase where there is one.
+    """Save predicted against measured strength as PNG, and the error of the phase where there is one.
 
-    Args:
-        target, predicted: (B, ...) complex channels or real powers, in physical units.
-        title: above everything.
-        path: PNG file.
-        unit: of their levels.
+    `target` and `predicted`: (B, ...) complex channels or real powers, in physical units; `unit` of levels.
     """
     channels = np.iscomplexobj(target)
     figure, (axes,) = panels(8 if channels else 4.6, 4.2, 1, 2 if channels else 1)
@@ -80,13 +69,12 @@ def draw_spectra(
     confidence: np.ndarray | None = None,
     edges: tuple[float, float, float, float] = (0.0, 360.0, 0.0, 90.0),
 ) -> None:
-    """Save a figure: a line per sample, with measured, predicted and difference beside each other.
+    """Save a line per sample as PNG: measured, predicted and difference beside each other.
 
     Args:
         target, predicted: (B, H, W) in [0, 1].
         rows: (B,) dataset rows, for the labels.
-        title: above everything.
-        path: PNG file.
+        title, path: of the figure.
         confidence: (B,) in [0, 1], written into the predictions.
         edges: least and largest azimuth, least and largest elevation [degrees].
     """
@@ -101,8 +89,8 @@ def draw_spectra(
         line[0].set_ylabel(f"row {row}\nelevation [°]")
         corner = {"x": 0.99, "y": 0.95, "ha": "right", "va": "top", "fontsize": "small"}
         if confidence is not None:
-            said = f"confidence {confidence[number]:.2f}"
-            line[1].text(s=said, color="white", transform=line[1].transAxes, **corner)
+            note = f"confidence {confidence[number]:.2f}"
+            line[1].text(s=note, color="white", transform=line[1].transAxes, **corner)
         rms = np.sqrt(np.mean((guess - true) ** 2))
         line[2].text(s=f"rms {rms:.3f}", transform=line[2].transAxes, **corner)
     for axis, name in zip(axes[0], ("measured", "predicted", "predicted - measured"), strict=True):

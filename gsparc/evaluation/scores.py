@@ -59,8 +59,8 @@ class Scores:
         if shares[worst] <= 0.5:
             return {}
         median = float(np.median(error / power))
-        found = {"row": int(row[worst]), "share": float(shares[worst]), "nmse_median": median}
-        return {f"decided_by/{name}": value for name, value in found.items()}
+        facts = {"row": int(row[worst]), "share": float(shares[worst]), "nmse_median": median}
+        return {f"decided_by/{name}": value for name, value in facts.items()}
 
     def after_constant(self, station: np.ndarray) -> float | None:
         """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
@@ -155,20 +155,20 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
         order = (
             np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
         )
-        said: dict[str, list[np.ndarray]] = {"confidence": [], "variance": []}
+        outputs: dict[str, list[np.ndarray]] = {"confidence": [], "variance": []}
         for start in range(0, len(rows), CHUNK):
             chunk = order[start : start + CHUNK]
             batch = data.batch(rows[chunk])
             prediction = method.answer(batch)
             mean = prediction.mean if turn is None else prediction.mean * turn[chunk, None, None]
             metric.update(mean, batch.target, batch.mask)
-            for name, values in said.items():
+            for name, values in outputs.items():
                 given, none = getattr(prediction, name), np.full(len(batch), np.nan)
                 values.append(none if given is None else given.detach().cpu().double().numpy())
         back = np.argsort(order)
         samples.append({name: values[back] for name, values in metric.compute().items()})
-        confidence.append(np.concatenate(said["confidence"])[back])
-        variance.append(np.concatenate(said["variance"])[back])
+        confidence.append(np.concatenate(outputs["confidence"])[back])
+        variance.append(np.concatenate(outputs["variance"])[back])
     return Scores(
         kind=data.site.kind,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),

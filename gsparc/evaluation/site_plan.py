@@ -97,16 +97,12 @@ def draw_site(
     levels: LinkLevels | None = None,
     steps: Sequence[tuple[int, LevelStep]] = (),
 ) -> None:
-    """Save a map of places and stations and, beside it, the levels of stations that jump.
+    """Save a map of places and stations as PNG and, beside it, the levels of stations that jump.
 
-    Args:
-        data: measurements of any kind.
-        path: PNG file.
-        levels: `link_levels` of powers.
-        steps: `plausibility.steps_of` the levels.
+    `levels` are the `link_levels` of powers, `steps` their `plausibility.steps_of`.
     """
-    found = spots(data, levels)
-    shown = [found.place[~found.far], still_ends(data)]  # but those far outside
+    places = spots(data, levels)
+    shown = [places.place[~places.far], still_ends(data)]  # but those far outside
     if data.site.static_end is None:
         shown.append(data.tx[:, :2] + data.site.origin[:2])
     low, high = framed(np.concatenate(shown))
@@ -127,7 +123,7 @@ def draw_site(
         axis.grid(alpha=0.3)
         for one, t in zip(axes[:, 1], jumping, strict=True):
             _draw_level(one, levels, t, [step for u, step in steps if u == t], data.site.level_unit)
-    _draw_map(axis, data, found, low, high, jumping)
+    _draw_map(axis, data, places, low, high, jumping)
     legend = legend_below(figure, 4)
     mark: Any
     for mark, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
@@ -135,16 +131,16 @@ def draw_site(
             mark.set_array(None)
             mark.set_color("0.4")
             mark.set_sizes([25])
-    figure.suptitle(_title(data, found))
+    figure.suptitle(_title(data, places))
     save(figure, path)
 
 
-def _title(data: Measurements, found: Spots) -> str:
+def _title(data: Measurements, places: Spots) -> str:
     kind = {"spectrum": "spectra", "csi": "channels", "rssi": "powers"}[data.site.kind]
     stations = data.site.stations
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
     apart = neighbours(places_of(data), data.site.wavelength).partition(";")[0]
-    return f"{data.site.name}: {len(data)} {kind} at {len(found.place)} places{at}\n{apart}"
+    return f"{data.site.name}: {len(data)} {kind} at {len(places.place)} places{at}\n{apart}"
 
 
 def still_ends(data: Measurements) -> np.ndarray:
@@ -158,27 +154,27 @@ def still_ends(data: Measurements) -> np.ndarray:
 
 
 def _draw_map(
-    axis: Any, data: Measurements, found: Spots, low: np.ndarray, high: np.ndarray, jumping: Sequence[int]
+    axis: Any, data: Measurements, places: Spots, low: np.ndarray, high: np.ndarray, jumping: Sequence[int]
 ) -> None:
-    site, inside = data.site, ~found.far
-    size = _size(found.place[inside], float((high - low).max()))
+    site, inside = data.site, ~places.far
+    size = _size(places.place[inside], float((high - low).max()))
     if site.static_end is None:
         tx = np.unique(data.tx[:, :2], axis=0) + site.origin[:2]
         axis.scatter(*tx.T, s=10, c="0.55", marker="s", linewidths=0, label="transmitter")
     name = "receiver" if site.moving_end == "rx" else "transmitter"
-    if found.level_db is None or not np.isfinite(found.level_db[inside]).any():
-        axis.scatter(*found.place[inside].T, s=size, c="tab:blue", linewidths=0, label=name)
+    if places.level_db is None or not np.isfinite(places.level_db[inside]).any():
+        axis.scatter(*places.place[inside].T, s=size, c="tab:blue", linewidths=0, label=name)
     else:
-        known = inside & np.isfinite(found.level_db)
+        known = inside & np.isfinite(places.level_db)
         if (inside & ~known).any():
-            silent = found.place[inside & ~known]
+            silent = places.place[inside & ~known]
             axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
-        limits = dict(zip(("vmin", "vmax"), np.percentile(found.level_db[known], [1, 99]), strict=True))
+        limits = dict(zip(("vmin", "vmax"), np.percentile(places.level_db[known], [1, 99]), strict=True))
         drawn = axis.scatter(
-            *found.place[known].T, c=found.level_db[known], s=size, linewidths=0, label=name, **limits
+            *places.place[known].T, c=places.level_db[known], s=size, linewidths=0, label=name, **limits
         )
         assert axis.figure is not None
-        axis.figure.colorbar(drawn, ax=axis, label=found.label, extend="both", shrink=0.85, pad=0.02)
+        axis.figure.colorbar(drawn, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
     side = side_of_squares(data)
     test = np.zeros(0, np.int64) if side is None else held_out(data, side)
     if len(test):
@@ -187,7 +183,7 @@ def _draw_map(
         axis.scatter(*ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how)
     bounded(axis, low, high, **_labels(data))
     _draw_stations(axis, data, jumping)
-    _draw_suspicious(axis, found, low, high)
+    _draw_suspicious(axis, places, low, high)
 
 
 def _size(place: np.ndarray, extent: float) -> float:
@@ -212,24 +208,24 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
             annotate(axis, name, where, "red" if number in jumping else "black")
 
 
-def _draw_suspicious(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
-    near, far = np.flatnonzero(found.suspicious & ~found.far), np.flatnonzero(found.far)
+def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray) -> None:
+    near, far = np.flatnonzero(places.suspicious & ~places.far), np.flatnonzero(places.far)
     if len(near):
         marks = {"s": 90, "facecolors": "none", "edgecolors": "red", "linewidths": 1.5}
         label = f"suspicious level ({len(near)} place{'s' * (len(near) > 1)})"
-        axis.scatter(*found.place[near].T, label=label, zorder=3, **marks)
+        axis.scatter(*places.place[near].T, label=label, zorder=3, **marks)
     if len(far):
         edge = np.clip(
-            found.place[far], *(corner + s * 0.02 * (high - low) for corner, s in ((low, 1), (high, -1)))
+            places.place[far], *(corner + s * 0.02 * (high - low) for corner, s in ((low, 1), (high, -1)))
         )
         axis.scatter(
             *edge.T, c="red", marker="x", s=60, zorder=3, label=f"far outside, at the edge ({len(far)})"
         )
         for row, where in zip(far[:MOST_MARKS], edge, strict=False):
-            at = ", ".join(f"{v:.4g}" for v in found.place[row])
-            annotate(axis, f"{found.rows[row]} at ({at})", where, "red")
+            at = ", ".join(f"{v:.4g}" for v in places.place[row])
+            annotate(axis, f"{places.rows[row]} at ({at})", where, "red")
     for row in near[:MOST_MARKS]:
-        annotate(axis, found.rows[row], found.place[row], "red", above=False)
+        annotate(axis, places.rows[row], places.place[row], "red", above=False)
 
 
 def _labels(data: Measurements) -> dict[str, str]:
@@ -255,9 +251,9 @@ def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[Lev
         last, first = (int(np.searchsorted(rows, row)) for row in (step.last, step.first))
         axis.axvspan(last, max(first, last + 1), facecolor="red", alpha=0.2)
         axis.axvline(first, color="red", linewidth=1.2)
-        said = f" {step.change_db:+.0f} dB from {levels.rows[step.last]} to {levels.rows[step.first]} "
+        note = f" {step.change_db:+.0f} dB from {levels.rows[step.last]} to {levels.rows[step.first]} "
         axis.text(
-            first, 0.97 - 0.1 * k, said, color="red", fontsize="small", va="top",
+            first, 0.97 - 0.1 * k, note, color="red", fontsize="small", va="top",
             ha="left" if first < len(rows) / 2 else "right", transform=axis.get_xaxis_transform(),
             path_effects=OUTLINE,
         )  # fmt: skip

@@ -64,9 +64,9 @@ def program(origin: Mapping[str, str | None]) -> str:
 def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str = "test") -> Table:
     """`result_rows` as a table for a terminal; the last row is `method`'s."""
     heads, rows = result_rows(facts, method, prefix)
-    found = table(title, heads[:1], heads[1:], rows)
-    found.rows[-1].style = "bold"
-    return found
+    result = table(title, heads[:1], heads[1:], rows)
+    result.rows[-1].style = "bold"
+    return result
 
 
 def result_rows(
@@ -92,17 +92,25 @@ def result_rows(
 
 def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """A table with columns of `words`, aligned left, before columns of `numbers`, aligned right."""
-    found = Table(title=title)
+    result = Table(title=title)
     for column in (*words, *numbers):
-        found.add_column(column, justify="left" if column in words else "right")
+        result.add_column(column, justify="left" if column in words else "right")
     for row in rows:
-        found.add_row(*row)
-    return found
+        result.add_row(*row)
+    return result
+
+
+def markdown_table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers: bool = False) -> list[str]:
+    """Lines of a table in Markdown; `numbers`: all columns but the first are aligned right."""
+    heads = list(heads)
+    rule = "|---" + ("|---:" if numbers else "|---") * (len(heads) - 1) + "|"
+    lines = [f"| {' | '.join(cells)} |" for cells in (heads, *rows)]
+    return [lines[0], rule, *lines[1:]]
 
 
 def shown(value: float | None, form: str) -> str:
-    """A number in a format, or a dash where there is none."""
-    return "-" if value is None else format(value, form)
+    """A number in a format, or a dash where there is none or NaN."""
+    return "-" if value is None or math.isnan(value) else format(value, form)
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -120,24 +128,28 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     """Stand-ins, rows that were learned from, a training that seconds ended, and a busy machine."""
-    found = []
+    conditions = []
     if facts.get("split/foreign"):
-        found.append(f"the model was trained on {facts['split/foreign']}")
+        conditions.append(f"the model was trained on {facts['split/foreign']}")
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
-        found.append(f"SIMULATED stand-in: the {release} release was not found; no figure here is about it")
+        conditions.append(
+            f"SIMULATED stand-in: the {release} release was not found; no figure here is about it"
+        )
     if facts.get("split/unseen_runs"):
         count = facts["split/unseen_runs"]
-        found.append(f"{count} runs were not learned from: scored after the best common phase of each")
+        conditions.append(f"{count} runs were not learned from: scored after the best common phase of each")
     if facts.get("model/limited_by_clock"):
         repeat = "fixed steps or searches repeat exactly"
         if facts["model/limited_by_clock"] == "wall":
             repeat = f"budget_clock=processor does not count what others do, {repeat}"
-        found.append(f"seconds ended the training, so the result depends on this machine: {repeat}")
+        conditions.append(f"seconds ended the training, so the result depends on this machine: {repeat}")
     load = facts.get("machine/load")
     if load is not None and load > BUSY:
-        found.append(f"the machine was busy (load {load:.1f} per core): times are inflated, ratios less so")
-    return found
+        conditions.append(
+            f"the machine was busy (load {load:.1f} per core): times are inflated, ratios less so"
+        )
+    return conditions
 
 
 def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -206,8 +218,8 @@ def _git() -> str | None:
 
 
 def _versions() -> str:
-    found = [f"python {platform.python_version()}"]
+    versions = [f"python {platform.python_version()}"]
     for package in PACKAGES:
         with suppress(PackageNotFoundError):
-            found.append(f"{package} {version(package)}")
-    return ", ".join(found)
+            versions.append(f"{package} {version(package)}")
+    return ", ".join(versions)

@@ -17,7 +17,7 @@ LOOKS = 160
 
 
 def calibrated(
-    held: Sequence[Looked], places: np.ndarray, share: float, start: Trust, blurred: bool = True
+    snapshots: Sequence[Looked], places: np.ndarray, share: float, start: Trust, blurred: bool = True
 ) -> Trust:
     """The trust under which places that were held out are most likely, with an area that holds a share.
 
@@ -27,13 +27,13 @@ def calibrated(
     the share of places that are exchangeable with these.
 
     Args:
-        held: of each snapshot.
+        snapshots: with their likelihoods over cells.
         places: (n, 3), where they were heard [m, local].
         share: of places, to be held.
         start: of the search.
         blurred: whether errors of recorded places are learned too; without, cells stay as they are.
     """
-    edge = float(np.max([one.cells.edge.max() for one in held]))
+    edge = float(np.max([one.cells.edge.max() for one in snapshots]))
     count = 4 if blurred else 3
     spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS][:count]).T
 
@@ -43,18 +43,20 @@ def calibrated(
 
     def surprise(point: np.ndarray) -> float:
         trust = of(point)
-        return -float(np.mean([one.by(trust).at(place) for one, place in zip(held, places, strict=True)]))
+        return -float(
+            np.mean([one.by(trust).at(place) for one, place in zip(snapshots, places, strict=True)])
+        )
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD][:count])
     simplex = first + np.vstack([np.zeros(count), np.diag([1.0, -1.5, 1.0, 1.0][:count])])
-    found = minimize(
+    optimum = minimize(
         surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
     )
-    return levelled(of(found.x), held, places, share)
+    return levelled(of(optimum.x), snapshots, places, share)
 
 
-def levelled(trust: Trust, held: Sequence[Looked], places: np.ndarray, share: float) -> Trust:
+def levelled(trust: Trust, snapshots: Sequence[Looked], places: np.ndarray, share: float) -> Trust:
     """The trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
-    levels = np.sort([one.by(trust).level(place) for one, place in zip(held, places, strict=True)])
+    levels = np.sort([one.by(trust).level(place) for one, place in zip(snapshots, places, strict=True)])
     rank = int(np.ceil((len(levels) + 1) * share))
     return replace(trust, level=float(levels[rank - 1]) if rank <= len(levels) else 1.0)

@@ -20,6 +20,7 @@ from sklearn.isotonic import IsotonicRegression
 LEAST_ROWS = 40  # held out, for any promise
 ROWS_OF_A_BIN, BLOCKS_OF_A_BIN = 150, 8
 MOST_BINS = 8
+PARTS = 5  # of blocks, that are calibrated without by turns
 ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
 REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
 TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.995, 0.998, 0.999]])
@@ -161,14 +162,14 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
     """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
     size = np.abs(used.error)
     whole = float(np.quantile(size, level))
-    found = np.ones(int(used.station.max()) + 1)
-    for number in np.unique(used.station) if len(found) > 1 and whole > 0 else ():
+    factors = np.ones(int(used.station.max()) + 1)
+    for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
         own = used.station == number
         if own.sum() >= LEAST_ROWS:
             blocks = len(np.unique(used.block[own]))
             ratio = max(float(np.quantile(size[own], level)), 1e-3 * whole) / whole
-            found[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
-    return found
+            factors[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
+    return factors
 
 
 def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -177,7 +178,7 @@ def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.n
     return IsotonicRegression().fit_transform(np.arange(len(distance)), width, sample_weight=weight)
 
 
-def held(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+def covered(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     """Rows (n,) bool whose measurement lies in the interval, and widths (n,) [dB], NaN where nothing is said.
 
     A silent row is in an interval that reaches below its level.
@@ -208,28 +209,20 @@ class Coverage:
     own_width_db: float
 
 
-def cross_validated(evidence: Evidence, share: float, parts: int = 5, seed: int = 0) -> Coverage:
+def cross_validated(evidence: Evidence, share: float) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
-    part = np.random.default_rng(seed).permutation(len(blocks))[number.reshape(-1)] % parts
+    part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
     inside, width = np.zeros(len(evidence), bool), np.full(len(evidence), np.nan)
-    for turn in range(min(parts, len(blocks))):
+    for turn in range(min(PARTS, len(blocks))):
         rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
-        inside[tried], width[tried] = held(calibrate(evidence.at(rest), share), evidence.at(tried))
-    said = np.isfinite(width)
-    return coverage_of(evidence, inside, width, said, len(blocks), share)
-
-
-def coverage_of(
-    evidence: Evidence, inside: np.ndarray, width: np.ndarray, said: np.ndarray, blocks: int, share: float
-) -> Coverage:
-    """Shares and means over the rows (n,) that something is said of."""
+        inside[tried], width[tried] = covered(calibrate(evidence.at(rest), share), evidence.at(tried))
+    known = np.isfinite(width)
     half = float(norm.ppf((1 + share) / 2))
     own = np.abs(evidence.error) <= half
-    spread = evidence.spread_db[said]
     return Coverage(
-        float(inside[said].mean()), float(width[said].mean()), float(said.mean()), int(said.sum()), blocks,
-        float(own[said].mean()), float(2 * half * spread.mean()),
+        float(inside[known].mean()), float(width[known].mean()), float(known.mean()), int(known.sum()),
+        len(blocks), float(own[known].mean()), float(2 * half * evidence.spread_db[known].mean()),
     )  # fmt: skip
 
 
@@ -237,9 +230,9 @@ def distances(
     known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
 ) -> np.ndarray:
     """From places (n, D) to the nearest of `known` (m, D) of their station, of any where it has none [m]."""
-    found = np.full(len(places), np.inf)
+    distance = np.full(len(places), np.inf)
     for number in np.unique(station):
         own = known[known_station == number]
         chosen = station == number
-        found[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
-    return found
+        distance[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
+    return distance

@@ -85,11 +85,11 @@ class Promise:
 
 def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
     """What a checkpoint's `extra` holds; None where its map was never calibrated."""
-    found = extra.get(KEY)
-    if found is None:
+    state = extra.get(KEY)
+    if state is None:
         return None
-    known, station = np.asarray(found["known"]), np.asarray(found["station"])
-    return Promise(Evidence.restored(found["evidence"]), known, station, float(found["block_m"]))
+    known, station = np.asarray(state["known"]), np.asarray(state["station"])
+    return Promise(Evidence.restored(state["evidence"]), known, station, float(state["block_m"]))
 
 
 def gather(
@@ -134,8 +134,8 @@ def gather(
         unit = cut.unit[tried] + number * (len(data) + 1)
         return evidence_of(learned, data, replace(inner, test=tried), unit)
 
-    found = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
-    parts = [found[number] for number in range(settings.folds)]
+    by_number = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
+    parts = [by_number[number] for number in range(settings.folds)]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
     return Promise(evidence, places, station_of(data, known), side)
 
@@ -145,13 +145,13 @@ def without(
 ) -> Method:
     """A method that knows nothing of the test rows of a fold."""
     if isinstance(method, Reconditions):
-        found = method.reconditioned(data, np.sort(np.concatenate([fold.train, fold.val])))
-        if found is not None:
-            return found
-    found = for_links(make, data)
+        refit = method.reconditioned(data, np.sort(np.concatenate([fold.train, fold.val])))
+        if refit is not None:
+            return refit
+    refit = for_links(make, data)
     with tempfile.TemporaryDirectory() as folder:
-        found.fit(data, fold, replace(context, run_dir=Path(folder)))
-    return found
+        refit.fit(data, fold, replace(context, run_dir=Path(folder)))
+    return refit
 
 
 def answerable(method: Method, data: Measurements, fold: Fold) -> Fold:
@@ -170,8 +170,8 @@ def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarra
     level, silent = measured(data, rows)
     station = station_of(data, rows)
     far = distances(data.moving[known], station_of(data, known), data.moving[rows], station)
-    found = Evidence(level, mean, spread, far, block, station, silent)
-    return found.at(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
+    evidence = Evidence(level, mean, spread, far, block, station, silent)
+    return evidence.at(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
 
 
 def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -182,8 +182,8 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[
         chosen = np.flatnonzero(station == number)
         for start in range(0, len(chosen), CHUNK):
             part = chosen[start : start + CHUNK]
-            said = method.answer(data.batch(rows[part]))
-            mean[part], spread[part] = predicted(said, data.site.kind, data.site.target_scale)
+            prediction = method.answer(data.batch(rows[part]))
+            mean[part], spread[part] = predicted(prediction, data.site.kind, data.site.target_scale)
     return mean, spread
 
 

@@ -18,11 +18,12 @@ from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_kernel, principal_components
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import training_targets
-from gsparc.prediction.risk_threshold import Promise, Threshold
+from gsparc.prediction.risk_threshold import Guarantee, Threshold
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 
-KINDS = ("learned", "expected", "distance", "gp_variance")
+RIVALS = ("distance", "gp_variance")
+KINDS = ("learned", "expected", *RIVALS)
 CHUNK = 64
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 
@@ -48,37 +49,47 @@ class Evidence:
 
 
 def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
-    """Ask `method` about `rows`, and the rivals too.
-
-    `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
-    (in a fade the same variance is a larger relative error); a method without them has no such kind.
-    """
+    """What `method` predicts of rows, and the rivals of its confidence."""
     parts = []
     for start in range(0, len(rows), CHUNK):
         some = rows[start : start + CHUNK]
         batch = data.batch(some)
         parts.append(Evidence(some, data.moving[some], *judged(method.answer(batch), batch.target)))
-    found = joined(parts)
-    return replace(found, scores=found.scores | rivals(data, fold, rows))
+    evidence = joined(parts)
+    return replace(evidence, scores=evidence.scores | rivals(data, fold, rows))
 
 
-def judged(said: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state."""
-    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
-    expected = None if said.variance is None else expected_score(said)
-    own = {"learned": said.confidence, "expected": expected}
-    stated = {kind: score.double().numpy() for kind, score in own.items() if score is not None}
+def judged(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state.
+
+    `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
+    (in a fade the same variance is a larger relative error); a method without them has no such kind.
+    """
+    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (prediction.mean - true, true))
+    own = {"learned": prediction.confidence, "expected": expected_score(prediction)}
+    scores = {kind: score.double().numpy() for kind, score in own.items() if score is not None}
     error = (miss / power.clamp_min(1e-30)).double().numpy()
-    return error, {kind: score for kind, score in stated.items() if not np.isnan(score).any()}
+    return error, {kind: score for kind, score in scores.items() if not np.isnan(score).any()}
+
+
+def expected_score(prediction: Prediction) -> Tensor | None:
+    """Minus the error variance over the power predicted (B,); None without a variance."""
+    if prediction.variance is None:
+        return None
+    return -prediction.variance / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
 def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """The two cheap confidences (n,) of rows (n,): minus the distance to the nearest training point [m], and
-    minus the variance of a Gaussian process, as a share of the prior's."""
-    known = known_positions(data, fold)
-    distance = cKDTree(known).query(data.moving[rows])[0]
-    variance = process_variance(position_kernel(data, fold), known, data.moving[rows])
-    return {"distance": -distance, "gp_variance": -variance}
+    """The confidences `RIVALS` (n,) of rows (n,), which rest on places alone."""
+    known, kernel = known_positions(data, fold), position_kernel(data, fold)
+    return {kind: rival_score(kind, known, kernel, data.moving[rows]) for kind in RIVALS}
+
+
+def rival_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndarray) -> np.ndarray:
+    """Minus the distance of places (B, 3) to the nearest that is known [m], or minus `process_variance`."""
+    if kind == "distance":
+        return -cKDTree(known).query(places)[0]
+    return -process_variance(kernel, known, places)
 
 
 def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
@@ -99,12 +110,6 @@ def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> n
     rows = torch.from_numpy(known)
     white = Factor.of(kernel.gram(rows)).whitened(kernel.between(rows, torch.from_numpy(places)))
     return (1 + kernel.noise - white.square().sum(0)).numpy()
-
-
-def expected_score(said: Prediction) -> Tensor:
-    """Minus the error variance over the power predicted (B,): in a fade the same variance is worse."""
-    assert said.variance is not None
-    return -said.variance / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
 def joined(parts: Sequence[Evidence]) -> Evidence:
@@ -133,45 +138,43 @@ class Trusted:
 
     kind: str | None = None
     threshold: float = float("inf")
-    promise: Promise | None = None
+    promise: Guarantee | None = None
     known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     kernel: Kernel | None = None
 
-    def confidence(self, said: Prediction, places: np.ndarray | None, kind: str | None = None) -> np.ndarray:
+    def confidence(
+        self, prediction: Prediction, places: np.ndarray | None, kind: str | None = None
+    ) -> np.ndarray:
         """Confidence (B,) float32 in [0, 1] of predictions at local `places` (B, 3) [m] (None: unknown).
 
         Raises:
             ValueError: the method, or the checkpoint, does not have what `kind` needs.
         """
         kind = kind or self.kind or "learned"
-        return as_confidence(kind, self._score(kind, said, places)).astype(np.float32)
+        return as_confidence(kind, self._score(kind, prediction, places)).astype(np.float32)
 
     def check(self, kind: str) -> None:
         """Refuse a kind that there is not, or that needs what was never stored: `ValueError`."""
         if kind not in KINDS:
             raise ValueError(f"confidence={kind}: expected one of {', '.join(KINDS)}")
-        if kind in ("distance", "gp_variance") and self.kernel is None:
+        if kind in RIVALS and self.kernel is None:
             raise ValueError(
                 f"confidence={kind}: the checkpoint does not say where was measured; "
                 "gsparc calibrate ckpt=FILE stores it"
             )
 
-    def _score(self, kind: str, said: Prediction, places: np.ndarray | None) -> np.ndarray:
-        if kind == "learned":
-            if said.confidence is None:
-                raise ValueError("confidence=learned: this model has no confidence of its own")
-            return said.confidence.double().numpy()
-        if kind == "expected":
-            if said.variance is None:
-                raise ValueError("confidence=expected: this model states no error variance")
-            return expected_score(said).double().numpy()
+    def _score(self, kind: str, prediction: Prediction, places: np.ndarray | None) -> np.ndarray:
         self.check(kind)
-        assert self.kernel is not None
-        if places is None:
-            raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
-        if kind == "distance":
-            return -cKDTree(self.known).query(places)[0]
-        return -process_variance(self.kernel, self.known, places)
+        if kind in RIVALS:
+            assert self.kernel is not None
+            if places is None:
+                raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
+            return rival_score(kind, self.known, self.kernel, places)
+        score = prediction.confidence if kind == "learned" else expected_score(prediction)
+        if score is None:
+            what = "has no confidence of its own" if kind == "learned" else "states no error variance"
+            raise ValueError(f"confidence={kind}: this model {what}")
+        return score.double().numpy()
 
 
 def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
@@ -187,18 +190,18 @@ def keep(path: str | Path, trusted: Trusted) -> None:
     checkpoint.amend(path, {KEY: asdict(trusted)})
 
 
-def kept(extra: Mapping[str, Any]) -> Trusted:
+def trusted_of(extra: Mapping[str, Any]) -> Trusted:
     """What a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
-    found = extra.get(KEY)
-    if found is None:
+    state = extra.get(KEY)
+    if state is None:
         return Trusted()
-    promise = None if found["promise"] is None else Promise(**found["promise"])
-    kernel = None if found["kernel"] is None else Kernel(**found["kernel"])
-    known = np.asarray(found["known"], np.float64)
-    return Trusted(found["kind"], float(found["threshold"]), promise, known, kernel)
+    promise = None if state["promise"] is None else Guarantee(**state["promise"])
+    kernel = None if state["kernel"] is None else Kernel(**state["kernel"])
+    known = np.asarray(state["known"], np.float64)
+    return Trusted(state["kind"], float(state["threshold"]), promise, known, kernel)
 
 
-def threshold_of(kind: str, found: Threshold) -> float:
+def threshold_of(kind: str, threshold: Threshold) -> float:
     """A threshold of scores as one of confidences."""
-    value = np.array(found.value)
+    value = np.array(threshold.value)
     return float(as_confidence(kind, value)) if np.isfinite(value) else float("inf")

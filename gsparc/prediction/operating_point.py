@@ -18,7 +18,7 @@ from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
 from gsparc.models.pareto import Point, Settings
 from gsparc.models.reduced import Measured, reduced
-from gsparc.prediction.confidence import kept as trusted_of
+from gsparc.prediction.confidence import trusted_of
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, interleaved
 

@@ -20,7 +20,7 @@ SURE_OF_EFFECT = 0.8
 
 
 @dataclass(frozen=True)
-class Promise:
+class Guarantee:
     """What is promised.
 
     Attributes:
@@ -82,7 +82,11 @@ def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
 
 
 def choose(
-    score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Promise, group: np.ndarray | None = None
+    score: np.ndarray,
+    bad: np.ndarray,
+    levels: np.ndarray,
+    promise: Guarantee,
+    group: np.ndarray | None = None,
 ) -> Threshold:
     """The laxest threshold that the calibration set (n,) supports.
 
@@ -91,17 +95,17 @@ def choose(
     1965; approximate, where the test without groups is exact). A level too strict to be tested (no outcome
     could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
     """
-    found = Threshold(float("inf"), 0, 0)
+    threshold = Threshold(float("inf"), 0, 0)
     for level in levels:
-        taken = score >= level
-        accepted, wrong = int(taken.sum()), int(bad[taken].sum())
+        rows = score >= level
+        accepted, wrong = int(rows.sum()), int(bad[rows].sum())
         if accepted < promise.least:
             continue
-        effect = 1.0 if group is None else design_effect(bad[taken], group[taken])
+        effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
         if _tail(wrong / effect, accepted / effect, promise.alpha) > promise.delta:
             break
-        found = Threshold(float(level), accepted, wrong)
-    return found
+        threshold = Threshold(float(level), accepted, wrong)
+    return threshold
 
 
 def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
@@ -131,12 +135,12 @@ def spread_out(
     """Some of `rows`, no two within `apart_m` [m]: neighbours err together and count as one."""
     if apart_m <= 0:
         return rows
-    kept: list[int] = []
+    chosen: list[int] = []
     order = rng.permutation(rows)
     near = cKDTree(positions[order]).query_ball_point(positions[order], apart_m)
     gone = np.zeros(len(order), bool)
     for i, others in enumerate(near):
         if not gone[i]:
-            kept.append(int(order[i]))
+            chosen.append(int(order[i]))
             gone[others] = True
-    return np.sort(np.array(kept, dtype=np.int64))
+    return np.sort(np.array(chosen, dtype=np.int64))

@@ -18,8 +18,7 @@ from gsparc.evaluation.open_runs import open_files
 from gsparc.maps import levels
 from gsparc.models import loading
 from gsparc.models.reduced import reduced
-from gsparc.prediction.confidence import Trusted
-from gsparc.prediction.confidence import kept as trusted_of
+from gsparc.prediction.confidence import Trusted, trusted_of
 from gsparc.prediction.operating_point import kept
 from gsparc.prediction.predictor import Predictor
 

@@ -13,16 +13,16 @@ import pytest
 from campaigns import spectra
 from hydra import initialize_config_module
 
+from gsparc.commands import compare as command
 from gsparc.commands.run_lock import held
 from gsparc.evaluation.experiment import fitting
 from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, prepare
-from gsparc.evaluation.experiment.latency import timed_here
+from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.problem import (
     Problem,
     SplitChoice,
     _may_match,
-    split_choices,
     stored_problems,
 )
 from gsparc.models.checkpoint import CheckpointError
@@ -48,6 +48,16 @@ def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
     assert timed_here(cells, {}, tmp_path, measure=True)["toy"]["gp"].p50_ms == 1.5
     assert "models of gp are not here" in caplog.text
     assert timed_here(cells, {}, tmp_path / "none", measure=True) == {"toy": {}}
+
+
+def test_what_is_only_timed_is_a_page_too(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(command, "show", lambda *given: shown.append(given))
+    facts = {"dataset/kind": "spectrum"}
+    cell = Filled(Cell("toy", "random", "nerf2_published", None, None), tmp_path, facts)
+    command.report([cell], {"toy": {"nerf2_published": Latency(6e4, 6e4, 1.0, 1)}}, "gsparc", tmp_path)
+    assert "nerf2_published on toy: 60 s a query, timed only" in (tmp_path / "compare.md").read_text()
+    assert len((tmp_path / "compare.csv").read_text().splitlines()) == 1 and shown
 
 
 def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path):
@@ -90,11 +100,6 @@ def test_kept_results_of_draws_are_a_problem_each(tmp_path):
         (tmp_path / f"toy-drawn-gp-{draw}" / "cell.json").write_text(json.dumps(facts))
     found = stored_problems(tmp_path, "toy", [SplitChoice("drawn", draws=3)])
     assert [(p.draw, p.hashes[1]) for p in found] == [(0, "s0"), (1, "s1")]
-
-
-def test_an_unknown_setting_of_a_split_is_named():
-    with pytest.raises(ValueError, match=r"splits\.far: unknown 'draw'"):
-        split_choices({"far": {"draw": 3}})
 
 
 @pytest.mark.parametrize("model", ["gsparc", "moving_array"])

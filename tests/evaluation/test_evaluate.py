@@ -22,19 +22,20 @@ from gsparc.training.context import FitContext
 QUICK = ClockSettings(rounds=3, least=2, warmup=1)
 
 
-def fit_all(make, data, split, path):
+def fit_all(make, data, split):
     methods = [make() for _ in split.folds]
-    return methods, [
-        method.fit(data, fold, FitContext(path)).seconds
-        for method, fold in zip(methods, split.folds, strict=True)
-    ]
+    fits = [method.fit(data, fold, FitContext()) for method, fold in zip(methods, split.folds, strict=True)]
+    return methods, [fit.seconds for fit in fits]
+
+
+def evaluated(make, data, split, **more):
+    return evaluate(*fit_all(make, data, split), data, split, clock=QUICK, **more)
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
 def test_everything_the_contract_lists(campaign, folds, tmp_path, kind):
     data, split = campaign(kind, 40), folds(40)
-    methods, seconds = fit_all(InverseDistance, data, split, tmp_path)
-    found = evaluate(methods, seconds, data, split, clock=QUICK)
+    found = evaluated(InverseDistance, data, split)
     facts = found.facts
     own = {
         "spectrum": {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "mse", "mae", "nmse"},
@@ -62,8 +63,7 @@ def test_everything_the_contract_lists(campaign, folds, tmp_path, kind):
 
 def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
-    methods, seconds = fit_all(InverseDistance, data, split, tmp_path)
-    facts = evaluate(methods, seconds, data, split, clock=QUICK).facts
+    facts = evaluated(InverseDistance, data, split).facts
     for figure in ("ssim", "ssim_gauss", "psnr_db", "skill"):
         assert facts[f"test/{figure}"] == facts[f"baseline/idw/{figure}"]
     assert facts["baseline/nearest/skill"] == 0
@@ -86,7 +86,7 @@ def test_standard_error_of_paired_differences(campaign, folds, tmp_path):
 
 def test_folds_are_pooled(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 45), folds(45, 5)
-    methods, seconds = fit_all(Mean, data, split, tmp_path)
+    methods, seconds = fit_all(Mean, data, split)
     scores = score(methods, data, split)
     assert sorted(scores.row) == list(range(45)) and list(np.unique(scores.fold)) == [0, 1, 2, 3, 4]
     first = score(methods[:1], data, dataclasses.replace(split, folds=split.folds[:1]))
@@ -99,7 +99,7 @@ def test_folds_are_pooled(campaign, folds, tmp_path):
 
 def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
-    methods, _ = fit_all(Mean, data, split, tmp_path)
+    methods, _ = fit_all(Mean, data, split)
     facts = evaluate(methods, None, data, split, eval_on="train", baselines=("nearest",), clock=QUICK).facts
     assert facts["train/samples"] == len(split.folds[0].train) and "test/ssim" not in facts
     # The nearest training row is the row itself: its error is no bar.
@@ -119,7 +119,7 @@ def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, tm
 
 def test_wrong_counts_are_refused(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40, 2)
-    methods, seconds = fit_all(Mean, data, split, tmp_path)
+    methods, seconds = fit_all(Mean, data, split)
     with pytest.raises(ValueError, match="1 methods for the 2 folds"):
         evaluate(methods[0], seconds[:1], data, split, clock=QUICK)
     with pytest.raises(ValueError, match="1 training times for 2 methods"):
@@ -128,16 +128,15 @@ def test_wrong_counts_are_refused(campaign, folds, tmp_path):
 
 def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
-    (method,), _ = fit_all(Mean, data, split, tmp_path)
+    (method,), _ = fit_all(Mean, data, split)
     method.value[3] = torch.nan
     with pytest.raises(ValueError, match="NaN or Inf"):
         evaluate(method, None, data, split, clock=QUICK)
 
 
-def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatch):
+def test_cached_baselines_are_not_refitted(campaign, folds, stored, monkeypatch):
     data, split = campaign("csi", 40), folds(40, 2)
-    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
-    first = baseline("gp", data, split, cache=tmp_path)
+    first = baseline("gp", data, split, cache=stored)
 
     def refuse(*arguments):
         raise AssertionError("fitted again")
@@ -145,14 +144,14 @@ def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr("gsparc.models.baselines.gp.GaussianProcess.fit", refuse)
         patch.setattr("gsparc.evaluation.baseline_cache.score", refuse)
-        second = baseline("gp", data, split, cache=tmp_path)
+        second = baseline("gp", data, split, cache=stored)
     assert second.train_s == first.train_s
     for name, values in first.scores.samples.items():
         assert np.array_equal(second.scores.samples[name], values)
     other = dataclasses.replace(data, site=dataclasses.replace(data.site, sha256="other"))
     with monkeypatch.context() as patch, pytest.raises(AssertionError, match="fitted again"):
         patch.setattr("gsparc.models.baselines.gp.GaussianProcess.fit", refuse)
-        baseline("gp", other, split, cache=tmp_path)
+        baseline("gp", other, split, cache=stored)
 
 
 def test_a_cheap_fit_is_timed_anew(campaign, folds, tmp_path, monkeypatch):
@@ -164,28 +163,33 @@ def test_a_cheap_fit_is_timed_anew(campaign, folds, tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("fold*.ckpt")) and list(tmp_path.rglob("test.npz"))
 
 
-def test_the_cache_knows_the_local_frame(campaign, folds, tmp_path, monkeypatch):
+def test_the_cache_knows_the_local_frame(campaign, folds, stored):
     data, split = campaign("csi", 40), folds(40)
-    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
-    here = baseline("gp", data, split, cache=tmp_path).scores.figures()
+    here = baseline("gp", data, split, cache=stored).scores.figures()
     shift = np.array([5.0, 0.0, 0.0])
     site = dataclasses.replace(data.site, origin=data.site.origin - shift)
     moved = dataclasses.replace(data, site=site, tx=data.tx + shift, rx_position=data.rx_position + shift)
-    there = baseline("gp", moved, split, cache=tmp_path)
+    there = baseline("gp", moved, split, cache=stored)
     fold = split.folds[0]
     assert np.allclose(there.methods[0].scores.places, moved.tx[np.concatenate([fold.train, fold.val])])
     assert there.scores.figures()["nmse"] == pytest.approx(here["nmse"], rel=1e-2)
 
 
-def test_a_damaged_cache_is_made_anew(campaign, folds, tmp_path, monkeypatch, caplog):
+def test_a_damaged_cache_is_made_anew(campaign, folds, stored, caplog):
     data, split = campaign("csi", 40), folds(40)
-    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
-    first = baseline("gp", data, split, cache=tmp_path)
-    for path in tmp_path.rglob("*.*"):
+    first = baseline("gp", data, split, cache=stored)
+    for path in stored.rglob("*.*"):
         path.write_bytes(b"rubbish")
-    again = baseline("gp", data, split, cache=tmp_path)
+    again = baseline("gp", data, split, cache=stored)
     assert again.scores.figures() == first.scores.figures()
     assert "fitted again" in caplog.text
+
+
+@pytest.fixture
+def stored(tmp_path, monkeypatch):
+    """A cache that keeps every fit."""
+    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
+    return tmp_path
 
 
 class Remembering(Method):
@@ -234,7 +238,7 @@ def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, mo
 def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_path, kind):
     """NMSE was 7e13 by one row, without a word."""
     data, split = campaign(kind, 60), folds(60)
-    methods, seconds = fit_all(InverseDistance, data, split, tmp_path)
+    methods, seconds = fit_all(InverseDistance, data, split)
     quiet = evaluate(methods, seconds, data, split, baselines=(), clock=QUICK).facts
     assert not any("decided_by" in key for key in quiet) and not decided_by_a_row(quiet)
     row, target = int(split.folds[0].test[2]), data.target.copy()
@@ -252,7 +256,6 @@ def test_rows_of_links_whose_both_ends_moved_name_both_places(folds, tmp_path):
     ends = np.random.default_rng(0).uniform(0, 10, (2, 40, 3))
     power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
     data = from_arrays({"tx_position": ends[0], "rx_position": ends[1], "rssi_db": power, "carrier_hz": 1e9})
-    methods, seconds = fit_all(InverseDistance, data, folds(40), tmp_path)
-    found = evaluate(methods, seconds, data, folds(40), baselines=(), clock=QUICK).columns
+    found = evaluated(InverseDistance, data, folds(40), baselines=()).columns
     for end, names in zip(ends, (("tx_x_m", "tx_y_m", "tx_z_m"), ("x_m", "y_m", "z_m")), strict=True):
         np.testing.assert_allclose(np.column_stack([found[n] for n in names]), end[found["row"]], atol=1e-6)

@@ -47,9 +47,8 @@ def predicted(world: World, folder: Path, objects: Objects) -> None:
     if data.site.stations is not None and len(data.site.stations) > 1:
         predictor = predictor.at(data.site.stations.name[0])
     near, far = _places(data, rows, 0.0), _places(data, rows, FAR_M)
-    name = {"csi": "csi", "rssi": "rssi", "spectrum": "spectrum"}[data.site.kind]
     for places in (near, far):
-        found = np.asarray(getattr(predictor, name)(**places))
+        found = np.asarray(getattr(predictor, data.site.kind)(**places))
         assert np.isfinite(found).all(), "predict: not finite"
     sure = [float(np.median(np.asarray(predictor.confidence(**places)))) for places in (near, far)]
     assert sure[1] <= max(SURE_FAR, 0.5 * sure[0]) and sure[1] <= sure[0], f"confidence near, far: {sure}"

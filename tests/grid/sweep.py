@@ -19,8 +19,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from judging import Outcome, repeated, run
 from product import PARTS
 from rich.console import Console
-from rich.table import Table
 from worlds import World, covering, drawn, every
+
+from gsparc.evaluation.summary import table
 
 MANY = 100
 
@@ -42,21 +43,18 @@ def one(world: World, folder: Path, more: tuple[str, ...]) -> tuple[Outcome, lis
 HEADS = ("combination", "seconds", "fit s", "gsparc", "best plain", "allowed", "model", "verdict")
 
 
+def outcome_of(entry: dict) -> Outcome:
+    """A line of results without what did not answer."""
+    return Outcome(**{key: value for key, value in entry.items() if key != "failures"})
+
+
 def cells(entry: dict) -> tuple[str, ...]:
     """One result, as `HEADS` name it."""
-    found = Outcome(**{key: value for key, value in entry.items() if key != "failures"})
+    found = outcome_of(entry)
     verdict = found.refused or "; ".join(entry["failures"]) or ("behind" if found.behind else "")
     figures = (f"{found.own:.4g}", f"{found.name} {found.best:.4g}", f"{found.allowed:.2g}")
     model = found.model + (" (five seeds)" if found.seed < 0 else "")
     return found.world, f"{found.seconds:.0f}", f"{found.fit_s:.1f}", *figures, model, verdict
-
-
-def table(lines: list[dict]) -> Table:
-    """All results."""
-    shown = Table(*HEADS)
-    for entry in lines:
-        shown.add_row(*cells(entry))
-    return shown
 
 
 def main() -> int:
@@ -72,11 +70,8 @@ def main() -> int:
     worlds = every(tuple(given.rows))
     chosen = covering(worlds) if given.seed is None else list(drawn(worlds, MANY, given.seed))
     given.results.parent.mkdir(parents=True, exist_ok=True)
-    done = (
-        [json.loads(line) for line in given.results.read_text().splitlines()]
-        if given.results.exists()
-        else []
-    )
+    given.results.touch()
+    done = [json.loads(line) for line in given.results.read_text().splitlines()]
     known, console = {entry["world"] for entry in done}, Console(width=220)
     for number, world in enumerate(chosen, 1):
         if world.name in known:
@@ -87,15 +82,11 @@ def main() -> int:
         with given.results.open("a") as file:
             file.write(json.dumps(done[-1]) + "\n")
         console.print(f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False)
-    console.print(table(done))
+    console.print(table("kinds of data", HEADS, (), map(cells, done)))
     if given.csv is not None:
         with given.csv.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([HEADS, *map(cells, done)])
-    bad = [
-        entry
-        for entry in done
-        if entry["refused"] or entry["failures"] or entry["own"] - entry["best"] > entry["allowed"]
-    ]
+    bad = [one for one in done if one["refused"] or one["failures"] or outcome_of(one).behind]
     plain = sum(entry["plain"] for entry in done)
     console.print(
         f"{len(done)} combinations, {len(bad)} with something wrong, {plain} no more than a plain process"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.maps.intervals import LEAST_ROWS, Evidence, calibrate, cross_validated, distances, held
+from gsparc.maps.intervals import LEAST_ROWS, Evidence, calibrate, covered, cross_validated, distances
 
 
 def evidence(count=3000, seed=0, heavy=False, stations=1):
@@ -27,7 +27,7 @@ def evidence(count=3000, seed=0, heavy=False, stations=1):
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.9])
 def test_as_many_lie_inside_as_promised(heavy, share):
     learned, fresh = evidence(heavy=heavy), evidence(seed=1, heavy=heavy)
-    inside, width = held(calibrate(learned, share), fresh)
+    inside, width = covered(calibrate(learned, share), fresh)
     assert abs(inside[np.isfinite(width)].mean() - share) < 0.03
     assert abs(cross_validated(learned, share).share - share) < 0.03
 
@@ -50,7 +50,7 @@ def test_the_model_without_any_sense_of_distance_still_gets_wider():
 
 def test_each_station_holds_its_own_share():
     known, fresh = evidence(stations=3), evidence(seed=1, stations=3)
-    inside, _ = held(calibrate(known), fresh)
+    inside, _ = covered(calibrate(known), fresh)
     shares = [inside[fresh.station == t].mean() for t in range(3)]
     assert max(shares) - min(shares) < 0.08
     assert calibrate(known).station[2] > 1.5 * calibrate(known).station[0]

@@ -18,7 +18,7 @@ from gsparc.prediction.confidence import (
     known_positions,
     position_kernel,
 )
-from gsparc.prediction.risk_threshold import Promise
+from gsparc.prediction.risk_threshold import Guarantee
 from gsparc.training.context import FitContext
 
 
@@ -36,7 +36,10 @@ def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     data, fold, file = site
     method, _ = loading.load(file)
     evidence = gather(method, data, fold, fold.test)
-    keep(file, Trusted("distance", 0.2, Promise(), known_positions(data, fold), position_kernel(data, fold)))
+    keep(
+        file,
+        Trusted("distance", 0.2, Guarantee(), known_positions(data, fold), position_kernel(data, fold)),
+    )
     world = data.tx[fold.test] + data.site.origin
     for kind, score in evidence.scores.items():
         answered = gsparc.load(file, confidence=kind).confidence(tx=world)
@@ -57,7 +60,10 @@ def test_what_was_never_stored_is_said(site) -> None:
         gsparc.load(file, confidence="distance")
     with pytest.raises(ValueError, match="expected one of learned"):
         gsparc.load(file, confidence="hope")
-    keep(file, Trusted("learned", 0.5, Promise(), known_positions(data, fold), position_kernel(data, fold)))
+    keep(
+        file,
+        Trusted("learned", 0.5, Guarantee(), known_positions(data, fold), position_kernel(data, fold)),
+    )
     with pytest.raises(ValueError, match="threshold is one of confidence=learned"):
         gsparc.load(file, confidence="distance").accepts(tx=world)
 
@@ -68,6 +74,6 @@ def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None
     data, fold, file = site
     known, kernel = known_positions(data, fold), replace(position_kernel(data, fold), noise=0.5)
     laxest = as_confidence(kind, np.array(-1.49 if kind == "gp_variance" else -100.0))
-    keep(file, Trusted(kind, float(laxest), Promise(), known, kernel))
+    keep(file, Trusted(kind, float(laxest), Guarantee(), known, kernel))
     near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
     assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()

@@ -34,7 +34,7 @@ from gsparc.evaluation.calibration import accept
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import shown, table, write_summary
 from gsparc.prediction.export import SUBCARRIERS_PER_BLOCK, centred
-from gsparc.prediction.risk_threshold import Promise
+from gsparc.prediction.risk_threshold import Guarantee
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     # What is accepted is judged on the band that is used: this antenna, the PUSCH grid.
     grid = channels(method, data, fold.test, centred(float(tones.mean()), spacing, count), one)
     evidence = on_band(grid, data, fold, fold.test)
-    promise = Promise(**settings["promise"])
+    promise = Guarantee(**settings["promise"])
     how = config.confidence, config.spatial, int(config.seed)
     kind, threshold, test, aside = accept(evidence, promise, *how)
     rows, score = fold.test[test], evidence.scores[kind][test]

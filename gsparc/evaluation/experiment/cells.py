@@ -33,7 +33,6 @@ class Contender:
         kinds: of data it serves; empty for all.
         stations: takes part only where there are several stations, some rows of each being learned from.
         scene: takes part only where the measurements name the scene that they were made in.
-        reserve_s: part of the budget that its own `budget_s` does not count [s].
         only_longest: too slow for any but the longest budget.
         timed_only: too slow to be scored at all: fitted for its latency.
     """
@@ -44,14 +43,17 @@ class Contender:
     kinds: tuple[str, ...] = ()
     stations: bool = False
     scene: bool = False
-    reserve_s: float = 0.0
     only_longest: bool = False
     timed_only: bool = False
 
+    def serves(self, problem: Problem) -> bool:
+        """Whether it can take part."""
+        kind = not self.kinds or problem.kind in self.kinds
+        return kind and problem.stations >= self.stations and problem.scene >= self.scene
+
     def overrides(self, budget_s: float | None) -> list[str]:
         """Overrides of train.yaml, but for the seed."""
-        left = None if budget_s is None else max(budget_s - self.reserve_s, 1.0)
-        timed = [] if left is None else [text.format(budget_s=f"{left:g}") for text in self.budget]
+        timed = [] if budget_s is None else [text.format(budget_s=f"{budget_s:g}") for text in self.budget]
         return [*self.choose, *timed]
 
 
@@ -76,33 +78,15 @@ class Cell:
         return f"{self.dataset}/{self.split}/{self.method}/{budget}/{ANY if self.seed is None else self.seed}"
 
 
-def contenders(config: Mapping[str, Any]) -> dict[str, Contender]:
-    """The group `methods` of conf/compare.yaml.
-
-    Raises:
-        ValueError: an entry with an unknown setting, or without `choose`.
-    """
-    found = {}
-    for name, entry in config.items():
-        try:
-            lists: dict[str, Any] = {
-                k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()
-            }
-            found[str(name)] = Contender(str(name), **lists)
-        except TypeError as error:
-            raise ValueError(f"methods.{name}: {str(error).partition('() ')[2]}") from None
-    return found
-
-
 def plugged() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
-    offered, found = ConfigStore.instance().repo.get("model", {}), {}
+    offered, methods = ConfigStore.instance().repo.get("model", {}), {}
     for name, path in plugins("model").items():
         if name not in METHODS and f"{name}.yaml" in offered:
             kind = find(path)
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
-            found[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
-    return found
+            methods[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
+    return methods
 
 
 @dataclass(frozen=True)
@@ -138,31 +122,27 @@ def plan(
         ValueError: a pattern that no cell matches.
     """
 
-    def serves(method: Contender, problem: Problem) -> bool:
-        kind = not method.kinds or problem.kind in method.kinds
-        return kind and problem.stations >= method.stations and problem.scene >= method.scene
-
-    able = [(p, [m for m in methods.values() if serves(m, p)]) for p in problems]
-
-    def cell(problem: Problem, method: Contender, budget_s: float | None, seed: int | None) -> Cell:
-        drawn = seed if problem.draw is None else problem.draw
-        return Cell(problem.dataset, problem.split, method.name, budget_s, drawn)
-
-    cells = [(p, cell(p, m, None, None)) for p, those in able for m in those if not m.budget]
+    able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
+    chosen: list[tuple[Problem, Contender, float | None, int | None]] = []
+    chosen += [(problem, m, None, None) for problem, those in able for m in those if not m.budget]
     longest = max((b.seconds for b in budgets), default=0.0)
     turns = max((len(b.seeds) for b in budgets), default=0)
     for turn in range(turns):  # first seeds of all budgets before second ones
         for budget in (b for b in budgets if turn < len(b.seeds)):
             for problem, those in able:
-                if (budget.splits and problem.split not in budget.splits) or (
-                    turn and problem.draw is not None
-                ):
+                if budget.splits and problem.split not in budget.splits:
                     continue
-                cells += [
-                    (problem, cell(problem, m, budget.seconds, budget.seeds[turn]))
+                if turn and problem.draw is not None:
+                    continue
+                chosen += [
+                    (problem, m, budget.seconds, budget.seeds[turn])
                     for m in those
                     if m.budget and not (m.only_longest and (turn > 0 or budget.seconds < longest))
                 ]
+    cells = [
+        (p, Cell(p.dataset, p.split, m.name, budget_s, seed if p.draw is None else p.draw))
+        for p, m, budget_s, seed in chosen
+    ]
     names = [str(cell) for _, cell in cells]
     for pattern in only:
         if not any(fnmatchcase(name, pattern) for name in names):

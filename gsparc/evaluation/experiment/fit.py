@@ -134,12 +134,12 @@ def fit_and_score(
         report = parts.fit(method, there, rows, contexts[number])
         return method, report, time.process_time() - before
 
-    found: dict[int, tuple[Method, FitReport, float]] = {}
+    by_fold: dict[int, tuple[Method, FitReport, float]] = {}
     for number, one in each(fitted, range(len(split.folds)), "folds"):
-        found[number] = one
+        by_fold[number] = one
         if keep is not None:
             keep(number, *one[:2])
-    methods, reports, processor = zip(*(found[number] for number in sorted(found)), strict=True)
+    methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
     fits = Outcome(
         methods, tuple(one.seconds for one in reports), processor, {}, 0.0, reports[0].notes,
         less_repeatable(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),

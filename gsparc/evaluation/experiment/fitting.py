@@ -111,11 +111,11 @@ class Prepared:
         same |= {"dataset/sha256": data, "split/sha256": folds}
         files = self.folder.parent.glob(f"{stem}-*/{RESULT}")
         every = {file.parent: facts_of(file) or {} for file in files}
-        found = {path: f for path, f in every.items() if all(f.get(k) == v for k, v in same.items())}
-        found = {path: f for path, f in found.items() if f.get("dataset/identity", whole) == whole}
-        if not found:
+        results = {path: f for path, f in every.items() if all(f.get(k) == v for k, v in same.items())}
+        results = {path: f for path, f in results.items() if f.get("dataset/identity", whole) == whole}
+        if not results:
             return None
-        folder, facts = max(found.items(), key=lambda item: item[1].get("made") or "")
+        folder, facts = max(results.items(), key=lambda item: item[1].get("made") or "")
         return Filled(self.cell, folder, {**facts, EARLIER: str(facts.get("git"))[:8]})
 
 
@@ -127,20 +127,11 @@ def prepare(
     overrides = [*chosen, *contender.overrides(cell.budget_s)]
     config = compose(settings, overrides, problem.draw, cell.seed)
     whole = plain(config)
-    trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
-    # cells from before there was a choice keep their names
-    if whole["trainer"].get("strategy") == "auto":
-        trainer["trainer"] = {name: v for name, v in whole["trainer"].items() if name != "strategy"}
-    if whole["stations"] == "together" or (whole["stations"] == "auto" and problem.stations):
-        trainer["stations"] = whole["stations"]
-    beside = {**whole, "batch_size": whole["dataset"].get("batch_size", 16)}
-    clock = "wall" if whole["budget_s"] is None else "processor"  # as cells without this in their name had
-    for setting, usual in (("budget_clock", clock), ("init_from", None), ("batch_size", 16)):
-        if beside[setting] != usual:
-            trainer[setting] = beside[setting]
-    for named in ((whole["model"].get("init") or {}).get("file"), whole["init_from"]):
-        if named and Path(named).is_file():  # walls, and a start, may change under their names
-            trainer[Path(named).name] = sha256(Path(named).read_bytes()).hexdigest()
+    beside = ("trainer", "callbacks", "budget_s", "budget_clock", "init_from", "stations")
+    trainer = {name: whole[name] for name in beside} | {"batch_size": whole["dataset"].get("batch_size")}
+    for file in ((whole["model"].get("init") or {}).get("file"), whole["init_from"]):
+        if file and Path(file).is_file():  # walls, and a start, may change under their names
+            trainer[Path(file).name] = sha256(Path(file).read_bytes()).hexdigest()
     if problem.draw is None and cell.seed and "seed" not in whole["model"]:
         trainer["seed"] = cell.seed  # of a draw, the split's own hash tells
     name = key(whole["model"], trainer, *problem.hashes)
@@ -167,20 +158,20 @@ def fill(prepared: Prepared) -> Filled:
         checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
 
     folds = split if prepared.scored else replace(split, folds=split.folds[:1])
-    found = fit_and_score(
+    outcome = fit_and_score(
         partial(build, config.model), data, folds, in_folders(context_of(config, run_dir=folder)),
         eval_on="test" if prepared.scored else None, keep=keep,
     )  # fmt: skip
-    facts: dict[str, Any] = {f"test/{name}": value for name, value in found.figures.items()}
+    facts: dict[str, Any] = {f"test/{name}": value for name, value in outcome.figures.items()}
     facts |= {
-        "time/train_s": statistics.fmean(found.train_s),
-        "time/train_cpu_s": statistics.fmean(found.train_cpu_s),
-        "time/score_s": found.score_s,
+        "time/train_s": statistics.fmean(outcome.train_s),
+        "time/train_cpu_s": statistics.fmean(outcome.train_cpu_s),
+        "time/score_s": outcome.score_s,
         "model/name": prepared.cell.method,
-        **found.methods[0].facts(),
-        "model/label": common_label(found.methods[0].name, found.methods),
-        "model/effects": found.methods[0].effects,
-        "model/notes": "; ".join(found.notes),
+        **outcome.methods[0].facts(),
+        "model/label": common_label(outcome.methods[0].name, outcome.methods),
+        "model/effects": outcome.methods[0].effects,
+        "model/notes": "; ".join(outcome.notes),
         "problem/drawn": prepared.problem.draw is not None,
         "problem/stations": prepared.problem.stations,
         "problem/scene": prepared.problem.scene,
@@ -227,15 +218,17 @@ def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | 
 
     here = [one for one in missing if train and one.problem.data is not None]
     try:
-        for number, found in each(_tried, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
-            if isinstance(found, str):
-                log.warning("%s cannot be filled: %s", here[number].cell, found)
+        for number, result in each(_tried, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
+            if isinstance(result, str):
+                log.warning("%s cannot be filled: %s", here[number].cell, result)
                 broken.add(str(here[number].cell))
                 continue
-            score = f"{score_db(found.facts['dataset/kind'], found.facts):.2f} dB" if found.scored() else "-"
-            log.info("%s: %s after %.1f s", found.cell, score, found.facts["time/train_s"])
+            score = (
+                f"{score_db(result.facts['dataset/kind'], result.facts):.2f} dB" if result.scored() else "-"
+            )
+            log.info("%s: %s after %.1f s", result.cell, score, result.facts["time/train_s"])
     except KeyboardInterrupt:
-        said = "interrupted; finished cells are kept: the same command goes on with the others"
-        raise KeyboardInterrupt(said) from None
-    kept = [one.found() or (None if str(one.cell) in broken else one.found_earlier()) for one in prepared]
-    return [one for one in kept if one is not None]
+        message = "interrupted; finished cells are kept: the same command goes on with the others"
+        raise KeyboardInterrupt(message) from None
+    results = [one.found() or (None if str(one.cell) in broken else one.found_earlier()) for one in prepared]
+    return [one for one in results if one is not None]

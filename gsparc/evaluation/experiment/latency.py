@@ -62,12 +62,12 @@ def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
     cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}
     warm = interleaved(cold, replace(SLOW, rounds=1))  # a first call may make what later ones keep
     slow = {name for name in cold if warm[name][0] > SLOW_MS}
-    found = {name: latency for name, latency in _summaries(once).items() if name in endless}
+    summaries = {name: latency for name, latency in _summaries(once).items() if name in endless}
     for group, clock in ((set(calls) - slow - endless, FAST), (slow, SLOW)):
         if group:
             timed = interleaved({**{n: calls[n] for n in calls if n in group}, COPY: reference_copy()}, clock)
-            found |= _summaries(timed)
-    return {name: found[name] for name in methods}
+            summaries |= _summaries(timed)
+    return {name: summaries[name] for name in methods}
 
 
 def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:
@@ -83,7 +83,7 @@ def timed_here(
     filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem], kept: Path, measure: bool
 ) -> dict[str, dict[str, Latency]]:
     """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
-    found: dict[str, dict[str, Latency]] = {}
+    by_dataset: dict[str, dict[str, Latency]] = {}
     for dataset in dict.fromkeys(one.cell.dataset for one in filled):
         here = [one for one in filled if one.cell.dataset == dataset]
         split, file = here[0].cell.split, kept / f"latency-{dataset}.json"
@@ -98,10 +98,10 @@ def timed_here(
             )  # fmt: skip
         elif measure and present and problems[dataset, split].data is not None:
             log.info("%s: timing single queries of every method in turns", dataset)
-            found[dataset] = latencies(present, problems[dataset, split])
-            rows = {name: asdict(one) for name, one in found[dataset].items()}
+            by_dataset[dataset] = latencies(present, problems[dataset, split])
+            rows = {name: asdict(one) for name, one in by_dataset[dataset].items()}
             with whole_file(file) as partial:  # another comparison may read it
                 partial.write_text(json.dumps(rows, indent=2), encoding="utf-8")
             continue
-        found[dataset] = {name: Latency(**values) for name, values in stored.items()}
-    return found
+        by_dataset[dataset] = {name: Latency(**values) for name, values in stored.items()}
+    return by_dataset

@@ -2,47 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.artist import Artist
 
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
-from gsparc.evaluation.experiment.study import Row as StudyRow
-from gsparc.evaluation.experiment.table import SCORE, Row, mean_behind
+from gsparc.evaluation.experiment.table import SCORE, by_mean_behind
 from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
 LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches
 
 
-def draw_budgets(rows: Sequence[Row], path: Path, ours: str) -> None:
-    """A method looks the same in all panels; a line joins its budgets.
-
-    Args:
-        rows: of the splits that are not drawn several times.
-        path: PNG file.
-        ours: the method with the largest mark.
-    """
-    datasets = list(dict.fromkeys(row.dataset for row in rows))
-    splits = {name: list(dict.fromkeys(r.split for r in rows if r.dataset == name)) for name in datasets}
-    columns = max(map(len, splits.values())) + any(row.query_ms for row in rows)
-    size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(datasets) + 0.9)
-    figure, grid = panels(*size, len(datasets), columns, sharey="row")
-    for line, dataset in zip(grid, datasets, strict=True):
-        here = [row for row in rows if row.dataset == dataset]
-        for axis, split in zip(line, splits[dataset], strict=False):
-            _panel(axis, [row for row in here if row.split == split], "train_cpu_s", ours)
-            axis.set(title=f"{dataset}, {split}", xlabel="training, CPU [s]")
-        line[0].set_ylabel(SCORE[here[0].figure])
-        free = line[len(splits[dataset]) :]
-        timed = [row for row in here if row.split == splits[dataset][0] and row.query_ms is not None]
-        if timed:
-            _panel(free[0], timed, "query_ms", ours)
-            free[0].set(title=f"{dataset}, {splits[dataset][0]}", xlabel="one query [ms]")
-        for axis in free[1 if timed else 0 :]:
+def draw_budgets(rows: pd.DataFrame, path: Path, ours: str) -> None:
+    """Accuracy against costs, of rows as of `rows_of`: a line joins the budgets; `ours` has a large mark."""
+    groups = [here for _, here in rows.groupby("dataset", sort=False)]
+    columns = max(here.split.nunique() for here in groups) + bool(rows.query_ms.any())
+    size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
+    figure, grid = panels(*size, len(groups), columns, sharey="row")
+    for line, here in zip(grid, groups, strict=True):
+        free = list(line)
+        first = here[here.split == here.split.iloc[0]]
+        wanted = [(own, "train_cpu_s", "training, CPU [s]") for _, own in here.groupby("split", sort=False)]
+        if first.query_ms.notna().any():
+            wanted.append((first, "query_ms", "one query [ms]"))
+        for own, horizontal, label in wanted:
+            axis = free.pop(0)
+            _panel(axis, own, horizontal, ours)
+            axis.set(title=f"{own.dataset.iloc[0]}, {own.split.iloc[0]}", xlabel=label)
+        line[0].set_ylabel(SCORE[here.figure.iloc[0]])
+        for axis in free:
             axis.set_visible(False)
     handles: dict[str, Artist] = {}
     for axis in grid.flat:
@@ -53,58 +45,46 @@ def draw_budgets(rows: Sequence[Row], path: Path, ours: str) -> None:
     save(figure, path)
 
 
-def _panel(axis: Any, rows: Sequence[Row], horizontal: str, ours: str) -> None:
-    for name in dict.fromkeys(row.method for row in rows):
-        own: Iterable[Row] = sorted((r for r in rows if r.method == name), key=lambda r: r.budget_s or 0)
-        known = [(getattr(r, horizontal), r.score_db, r.spread_db or 0.0) for r in own]
-        points = [(max(x, LEAST_S), *rest) for x, *rest in known if x is not None]
-        if points:
-            style = look(name).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
-            axis.errorbar(*zip(*points, strict=True), label=name, **style)
+def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
+    for name, own in rows.dropna(subset=horizontal).groupby("method", sort=False):
+        own = own.sort_values("budget_s", na_position="first")
+        style = look(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
+        x, spread = own[horizontal].clip(lower=LEAST_S), own.spread_db.fillna(0.0)
+        axis.errorbar(x, own.score_db, spread, label=name, **style)
     logarithmic(axis, fine=False)
 
 
 LINE = 0.34  # height of a method [inch]
 
 
-def draw_splits(rows: Sequence[Row], path: Path) -> None:
-    """A panel per split of one dataset: mean and standard error over draws, training and query beside it.
-
-    Args:
-        rows: of one dataset, all of drawn splits.
-        path: PNG file.
-    """
-    splits = list(dict.fromkeys(row.split for row in rows))
-    names = sorted(dict.fromkeys(row.method for row in rows), key=lambda name: mean_behind(rows, name))
+def draw_splits(rows: pd.DataFrame, path: Path) -> None:
+    """A panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
+    splits, names = list(rows.split.unique()), list(by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
-        here = {row.method: row for row in rows if row.split == split}
-        most = max(row.value + (row.value_error or 0.0) for row in here.values())
-        best = min(here.values(), key=lambda row: -row.score_db)
+        here = rows[rows.split == split].drop_duplicates("method", keep="last")  # the longest budget
+        here = here.fillna({"value_error": 0.0}).set_index("method")
+        most = (here.value + here.value_error).max()
+        best = here.score_db.idxmax()
         for number, name in enumerate(names):
-            if name not in here:
+            if name not in here.index:
                 axis.text(0.02 * most, number, "not possible", va="center", fontsize=8, color="0.5")
                 continue
-            row = here[name]
-            axis.barh(
-                number,
-                row.value,
-                xerr=row.value_error or 0.0,
-                color=look(name).colour,
-                alpha=1.0 if row is best else 0.45,
-                capsize=2.5,
-            )
+            row = here.loc[name]
+            bar = {"color": look(name).colour, "alpha": 1.0 if name == best else 0.45, "capsize": 2.5}
+            axis.barh(number, row.value, xerr=row.value_error, **bar)
             axis.text(
-                min(row.value + (row.value_error or 0.0) + 0.02 * most, 1.02 * most), number,
+                min(row.value + row.value_error + 0.02 * most, 1.02 * most), number,
                 f"{row.value:.3g}, fit {_seconds(row.train_s)}", va="center", fontsize=7.5,
             )  # fmt: skip
-        draws = max(row.seeds for row in here.values())
+        draws = int(here.seeds.max())
         axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
-        axis.set_xlabel(axis_of(best.figure))
+        axis.set_xlabel(axis_of(here.figure.iloc[0]))
         axis.set_yticks(np.arange(len(names)), names)
         axis.grid(axis="y", visible=False)
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
-    figure.suptitle(f"{rows[0].dataset}: mean and standard error over draws of the split; the best is dark")
+    name = rows.dataset.iloc[0]
+    figure.suptitle(f"{name}: mean and standard error over draws of the split; the best is dark")
     save(figure, path)
 
 
@@ -116,41 +96,40 @@ def _seconds(value: float) -> str:
 
 TRAINING = "training of one model [s]"
 ACCURACY = "value"
-# Condition whose rows are drawn, label of the horizontal axis, horizontal and vertical coordinate of a row.
-PANELS: tuple[tuple[str, str, Callable[[StudyRow], float], str], ...] = (
-    ("query", "position error in queries [cm]", lambda row: 100 * row.amount, ACCURACY),
-    ("train", "position error in training [cm]", lambda row: 100 * row.amount, ACCURACY),
-    ("train_known", "the same, its size known [cm]", lambda row: 100 * row.amount, ACCURACY),
-    ("directions", "error of directions of arrival [degrees]", lambda row: row.amount, ACCURACY),
-    ("keep", "measurements learned from", lambda row: row.rows, ACCURACY),
-    ("keep", "measurements learned from", lambda row: row.rows, "train_s"),
-    ("none", TRAINING, lambda row: row.train_s, ACCURACY),
-    ("none", "one query, median [ms]", lambda row: row.query_ms, ACCURACY),
+# Condition whose rows are drawn, label of the horizontal axis, its column and factor, column of the vertical.
+PANELS = (
+    ("query", "position error in queries [cm]", "amount", 100, ACCURACY),
+    ("train", "position error in training [cm]", "amount", 100, ACCURACY),
+    ("train_known", "the same, its size known [cm]", "amount", 100, ACCURACY),
+    ("directions", "error of directions of arrival [degrees]", "amount", 1, ACCURACY),
+    ("keep", "measurements learned from", "rows", 1, ACCURACY),
+    ("keep", "measurements learned from", "rows", 1, "train_s"),
+    ("none", TRAINING, "train_s", 1, ACCURACY),
+    ("none", "one query, median [ms]", "query_ms", 1, ACCURACY),
 )
 
 
-def draw_study(rows: Sequence[StudyRow], title: str, path: Path) -> None:
-    """Save the figure as PNG; a dotted line is the variant's accuracy on undisturbed data."""
-    drawn = {row.what for row in rows} - {"none"} or {"none"}  # costs alone where nothing was changed
+def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
+    """Save rows of a `Study` as PNG; a dotted line is the variant's accuracy on undisturbed data."""
+    drawn = set(rows.what) - {"none"} or {"none"}  # costs alone where nothing was changed
     wanted = [panel for panel in PANELS if panel[0] in drawn]
     figure, grid = panels(5 * len(wanted), 4, 1, len(wanted))
     figure.suptitle(title, fontsize=11)
-    for axes, (what, label, x_of, y_of) in zip(grid[0], wanted, strict=True):
-        for name in dict.fromkeys(row.variant for row in rows):
-            own = [row for row in rows if row.variant == name and row.what == what]
-            if not own:
+    name = rows.figure.iloc[0]
+    for axes, (what, label, x, factor, y) in zip(grid[0], wanted, strict=True):
+        for variant, own in rows.groupby("variant", sort=False):
+            clean, own = own[own.what == "none"], own[own.what == what]
+            if own.empty:
                 continue
-            x, y = [x_of(row) for row in own], [getattr(row, y_of) for row in own]
-            spread = [row.spread or 0.0 for row in own] if y_of == ACCURACY else None
-            (line, *_) = axes.errorbar(x, y, spread, marker="o", capsize=2, label=name)
-            clean = [row.value for row in rows if row.variant == name and row.what == "none"]
-            if clean and what != "none" and y_of == ACCURACY:
-                axes.axhline(clean[0], color=line.get_color(), linestyle=":", linewidth=1)
+            spread = own.spread.fillna(0.0) if y == ACCURACY else None
+            line, *_ = axes.errorbar(factor * own[x], own[y], spread, marker="o", capsize=2, label=variant)
+            if len(clean) and what != "none" and y == ACCURACY:
+                axes.axhline(clean.value.iloc[0], color=line.get_color(), linestyle=":", linewidth=1)
         logarithmic(axes)
-        axes.set(xlabel=label, ylabel=rows[0].figure if y_of == ACCURACY else TRAINING)
-        if y_of != ACCURACY:
+        axes.set(xlabel=label, ylabel=name if y == ACCURACY else TRAINING)
+        if y != ACCURACY:
             axes.set_yscale("log")
-        elif lower_is_better(rows[0].figure):
+        elif lower_is_better(name):
             axes.invert_yaxis()
     grid[0, 0].legend(fontsize=8)
     save(figure, path)

@@ -6,12 +6,13 @@ import functools
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
@@ -26,6 +27,7 @@ from gsparc.simulate.scenes.build import names_scene
 log = logging.getLogger(__name__)
 
 RESULT = "cell.json"
+Entry = TypeVar("Entry")
 
 
 @dataclass(frozen=True)
@@ -94,22 +96,22 @@ class Problem:
         return self.data, self.folds
 
 
-def split_choices(config: Mapping[str, Any]) -> dict[str, SplitChoice]:
-    """The group `splits` of conf/compare.yaml; an entry without settings means the split of its name.
+def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
+    """A group of named settings of conf/compare.yaml: `methods` or `splits`; an empty entry has defaults.
 
     Raises:
-        ValueError: an entry with an unknown setting.
+        ValueError: an entry with an unknown setting, or without one that is needed.
     """
-    found = {}
+    known, entries = [name for name in signature(of).parameters if name != "name"], {}
     for name, entry in config.items():
-        lists: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in dict(entry or {}).items()
-        }
-        unknown = sorted(set(lists) - {"choose", "datasets", "draws"})
-        if unknown:
-            raise ValueError(f"splits.{name}: unknown {unknown[0]!r}; there are choose, datasets and draws")
-        found[str(name)] = SplitChoice(str(name), **lists)
-    return found
+        own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry or {}).items()}
+        if unknown := sorted(set(own) - set(known)):
+            raise ValueError(f"{group}.{name}: unknown {unknown[0]!r}; there are {', '.join(known)}")
+        try:
+            entries[str(name)] = of(name=str(name), **own)
+        except TypeError as error:
+            raise ValueError(f"{group}.{name}: {str(error).partition('() ')[2]}") from None
+    return entries
 
 
 def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[SplitChoice]) -> list[Problem]:
@@ -134,32 +136,32 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
 def facts_of(result: Path) -> dict[str, Any] | None:
     """What a kept result says; None where there is none, or no whole one."""
     try:
-        found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
+        facts: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return found
+    return facts
 
 
 def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> list[Problem]:
     """The problems of a dataset that most kept results are of, one per draw of a split."""
-    found = []
+    problems = []
     for split in splits:
         files = sorted(kept.glob(f"{dataset}-{split.name}-*/{RESULT}"))
         facts = [one for file in files if (one := facts_of(file)) is not None]
         for draw in split.numbers:
             known = Counter(
                 (
-                    *(f[of] for of in ("dataset/kind", "dataset/sha256", "split/sha256")),
-                    f.get("dataset/identity", ""),  # earlier versions kept none
+                    f["dataset/kind"],
+                    (f["dataset/sha256"], f["split/sha256"], f.get("dataset/identity", "")),  # once not kept
                     *(bool(f.get(f"problem/{of}")) for of in ("stations", "scene")),
                 )
                 for f in facts
                 if draw is None or f["seed"] == draw
             )
             if known:
-                kind, data, folds, whole, several, scene = known.most_common(1)[0][0]
-                found.append(Problem(dataset, split.name, kind, (data, folds, whole), draw, several, scene))
-    return found
+                kind, hashes, several, scene = known.most_common(1)[0][0]
+                problems.append(Problem(dataset, split.name, kind, hashes, draw, several, scene))
+    return problems
 
 
 def compose(
@@ -195,7 +197,7 @@ def problems_of(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
     Without its path a dataset is there as far as results were kept, for the table alone.
     """
     wanted = [str(pattern) for pattern in settings["only"]]
-    splits = split_choices(settings["splits"])
+    splits = named("splits", SplitChoice, settings["splits"])
     problems: list[Problem] = []
     absent: dict[str, list[str]] = {"here as far as results were kept": [], "left out": []}
     paths = {

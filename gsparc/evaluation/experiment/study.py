@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
+import pandas as pd
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
@@ -29,66 +30,57 @@ class Condition:
     """One state of the data.
 
     Attributes:
-        what: what was changed; `none`: nothing.
-        amount: by how much, in the units of `what`.
-        learned: data and rows of a fold that are learned from, by a seed; None: as they are.
-        tested: data that are tested on, by a seed; None: as they are.
+        what: what was changed: `none`, places of a `query` or in training (`train`; `train_known`: by a known
+            error), `directions` of arrival, or how many measurements one may `keep`.
+        amount: by how much: metres, degrees, or a share up to 1 and a number of rows above.
     """
 
     what: str = "none"
     amount: float = 0.0
-    learned: Callable[[Measurements, Fold, int], tuple[Measurements, Fold]] | None = None
-    tested: Callable[[Measurements, Split, int], Measurements] | None = None
 
     def __str__(self) -> str:
         return self.what if self.what == "none" else f"{self.what} {self.amount:g}"
 
+    @property
+    def trained(self) -> bool:
+        """Whether it changes what is learned from."""
+        return self.what not in ("none", "query")
+
     def learned_from(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
         """Data and rows of a fold under this condition."""
-        return (data, fold) if self.learned is None else self.learned(data, fold, seed)
+        if self.what == "keep":
+            return data, thinned(fold, self.amount, seed)
+        if self.what == "directions":
+            return turned(data, self.amount, seed), fold
+        if self.what not in ("train", "train_known"):
+            return data, fold
+        moved = displaced(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
+        known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
+        return replace(moved, position_std=known), fold
+
+    def tested_on(self, data: Measurements, split: Split, seed: int) -> Measurements:
+        """Data whose test rows are asked about."""
+        return displaced(data, np.concatenate([fold.test for fold in split.folds]), self.amount, seed)
 
 
-@dataclass(frozen=True)
-class Row:
-    """A variant under a condition.
-
-    Attributes:
-        variant, what, amount: names and amount, see `Study` and `Condition`.
-        effects: the propagation effects it computes.
-        rows: measurements it learned from, mean over folds.
-        figure: name of the accuracy.
-        value: the accuracy on the test rows, mean over rounds.
-        spread: its standard deviation over rounds; None for one round.
-        train_s, train_cpu_s: training of one model by the clock and of the processor, median over rounds [s].
-        train_ratio: median over rounds of `train_s` to the base variant's of the same round.
-        query_ms, query_p95_ms: single queries, timed in turns with all other rows' [ms].
-        query_ratio: to the base variant's.
-    """
-
-    variant: str
-    what: str
-    amount: float
-    effects: str
-    rows: float
-    figure: str
-    value: float
-    spread: float | None
-    train_s: float
-    train_cpu_s: float
-    train_ratio: float | None
-    query_ms: float
-    query_p95_ms: float
-    query_ratio: float | None
-
-    def facts(self) -> dict[str, Any]:
-        """`study/<variant>[/<what>/<amount>]/*`: accuracy under its own name, seconds, milliseconds."""
-        stem = f"study/{self.variant}" + ("" if self.what == "none" else f"/{self.what}/{self.amount:g}")
-        named = {self.figure: self.value, f"{self.figure}_spread": self.spread}
-        rest = {k: v for k, v in asdict(self).items() if k not in NAMES}
-        return {f"{stem}/{key}": value for key, value in {**named, **rest}.items() if value is not None}
-
-
+ROW = (
+    "variant", "what", "amount", "effects", "rows", "figure", "value", "spread", "train_s", "train_cpu_s",
+    "train_ratio", "query_ms", "query_p95_ms", "query_ratio",
+)  # fmt: skip
 NAMES = ("variant", "what", "amount", "figure", "value", "spread")
+
+
+def facts_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """`study/<variant>[/<what>/<amount>]/*`: accuracy under its own name, seconds, milliseconds."""
+    facts: dict[str, Any] = {}
+    for row in rows.to_dict("records"):
+        stem = f"study/{row['variant']}" + (
+            "" if row["what"] == "none" else f"/{row['what']}/{row['amount']:g}"
+        )
+        own = {row["figure"]: row["value"], f"{row['figure']}_spread": row["spread"]}
+        own |= {name: value for name, value in row.items() if name not in NAMES}
+        facts |= {f"{stem}/{name}": value for name, value in own.items() if pd.notna(value)}
+    return facts
 
 
 @dataclass(frozen=True)
@@ -115,12 +107,21 @@ class Study:
         if self.base is not None and self.base not in self.variants:
             raise ValueError(f"base={self.base}: no such variant; there are {', '.join(self.variants)}")
 
-    def run(self, data: Measurements, split: Split, context: FitContext) -> list[Row]:
+    def run(self, data: Measurements, split: Split, context: FitContext) -> pd.DataFrame:
         """Fit, score and time everything; a variant that the data do not allow is left out.
 
         Args:
             data, split: as they are before any condition.
             context: of every fit, but for its folder and seed.
+
+        Returns:
+            A row per variant and condition, columns `ROW` (those of `study.csv`).
+            `effects` that the variant computes; measurements (`rows`) that it learned from, mean over folds.
+            `figure`, `value`: accuracy on the test rows, mean over rounds; `spread`: standard deviation.
+            `train_s`, `train_cpu_s`: training of one model by the clock and of the processor, median over
+            rounds [s]; `train_ratio`: median of `train_s` to the base variant's of the same round.
+            `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms];
+            `query_ratio`: to the base variant's. NaN where there is no spread or ratio.
 
         Raises:
             ValueError: the base variant, or every variant, cannot be trained here.
@@ -130,14 +131,14 @@ class Study:
         for turn in range(self.rounds):
             for variant in list(allowed):
                 try:
-                    found = self._outcomes(variant, data, split, context, turn)
+                    by_condition = self._outcomes(variant, data, split, context, turn)
                 except ValueError as refused:
                     if variant == self.base or REFUSED not in str(refused) or len(allowed) == 1:
                         raise
                     log.info("%s is left out: %s", variant, refused)
                     allowed.remove(variant)
                     continue
-                for condition, outcome in found.items():
+                for condition, outcome in by_condition.items():
                     outcomes.setdefault((variant, condition), []).append(outcome)
         return self._rows(outcomes, data, split)
 
@@ -145,60 +146,52 @@ class Study:
         self, variant: str, data: Measurements, split: Split, context: FitContext, turn: int
     ) -> dict[Condition, Outcome]:
         """One training per condition that changes what is learned from."""
-        found: dict[Condition, Outcome] = {}
+        by_condition: dict[Condition, Outcome] = {}
         seed, plain = self.seed + turn, None
         for condition in self.conditions:
-            outcome, learned = plain, condition.learned
-            if outcome is None or learned is not None:
+            outcome = plain
+            if outcome is None or condition.trained:
                 folder = context.run_dir / variant / str(condition).replace(" ", "-") / str(turn)
                 settings = in_folders(replace(context, run_dir=folder, seed=seed))
                 learned_from = partial(condition.learned_from, seed=seed)
-                make = self.variants[variant]
-                outcome = fit_and_score(make, data, split, settings, learned=learned_from)
-                plain = outcome if learned is None else plain
-            if condition.tested is not None:
-                outcome = outcome.scored_on(condition.tested(data, split, seed), split)
-            found[condition] = outcome
+                outcome = fit_and_score(self.variants[variant], data, split, settings, learned=learned_from)
+                plain = plain if condition.trained else outcome
+            if condition.what == "query":
+                outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)
+            by_condition[condition] = outcome
             figure = DECIDING[data.site.kind]
             log.info(
                 "%s, %s, round %d of %d: %s %.4g after %.3g s of training",
                 variant, condition, turn + 1, self.rounds, figure, _value(outcome, figure),
                 sum(outcome.train_s),
             )  # fmt: skip
-        return found
+        return by_condition
 
     def _rows(
         self, outcomes: Mapping[tuple[str, Condition], list[Outcome]], data: Measurements, split: Split
-    ) -> list[Row]:
+    ) -> pd.DataFrame:
         figure = DECIDING[data.site.kind]
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
         methods = {str(id(o[-1].methods[0])): o[-1].methods[0] for o in outcomes.values()}
         times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)
-        asked = {name: percentiles(ms) for name, ms in times.items()}
+        query = {key: percentiles(times[str(id(o[-1].methods[0]))]) for key, o in outcomes.items()}
+        train = {key: np.array([np.mean(one.train_s) for one in o]) for key, o in outcomes.items()}
         rows = []
-        for (variant, condition), found in outcomes.items():
-            values = [_value(one, figure) for one in found]
-            seconds = np.array([np.mean(one.train_s) for one in found])
-            p50, p95 = asked[str(id(found[-1].methods[0]))]
-            train_ratio = query_ratio = None
-            base = outcomes.get((self.base or "", condition))
-            if base is not None:
-                train_ratio = float(np.median(seconds / np.array([np.mean(one.train_s) for one in base])))
-                query_ratio = p50 / asked[str(id(base[-1].methods[0]))][0]
+        for key, rounds in outcomes.items():
+            variant, condition = key
+            values = np.array([_value(one, figure) for one in rounds])
+            base = (self.base or "", condition)
+            compared = base in outcomes
             folds = [condition.learned_from(data, fold, self.seed)[1] for fold in split.folds]
-            rows.append(
-                Row(
-                    variant, condition.what, condition.amount,
-                    str(found[-1].methods[0].effects or "none"),
-                    float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
-                    figure, float(np.mean(values)),
-                    float(np.std(values, ddof=1)) if len(values) > 1 else None,
-                    float(np.median(seconds)),
-                    float(np.median([np.mean(one.train_cpu_s) for one in found])),
-                    train_ratio, p50, p95, query_ratio,
-                )
-            )  # fmt: skip
-        return rows
+            rows.append((
+                variant, condition.what, condition.amount, str(rounds[-1].methods[0].effects or "none"),
+                float(np.mean([len(fold.train) + len(fold.val) for fold in folds])), figure, values.mean(),
+                values.std(ddof=1) if len(values) > 1 else np.nan, np.median(train[key]),
+                np.median([np.mean(one.train_cpu_s) for one in rounds]),
+                np.median(train[key] / train[base]) if compared else np.nan, *query[key],
+                query[key][0] / query[base][0] if compared else np.nan,
+            ))  # fmt: skip
+        return pd.DataFrame(rows, columns=ROW)
 
 
 def _value(outcome: Outcome, figure: str) -> float:
@@ -239,14 +232,12 @@ class Positions:
         errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
         return [
             Condition(),
-            *(Condition("query", error, tested=partial(_asked_elsewhere, error)) for error in errors),
             *(
-                Condition(name, error, learned=partial(_learned_elsewhere, error, known))
-                for name, known in (("train", False), ("train_known", True))
+                Condition(what, error)
+                for what in ("query", *(("train", "train_known") if self.train_errors else ()))
                 for error in errors
-                if self.train_errors
             ),
-            *(Condition("directions", error, learned=partial(_turned, error)) for error in degrees),
+            *(Condition("directions", error) for error in degrees),
         ]
 
 
@@ -268,26 +259,7 @@ class Measured:
 
     def conditions(self) -> list[Condition]:
         """A condition per training set, called `keep`."""
-        return [Condition("keep", float(keep), learned=partial(_thinned, float(keep))) for keep in self.keep]
-
-
-def _asked_elsewhere(error_m: float, data: Measurements, split: Split, seed: int) -> Measurements:
-    return displaced(data, np.concatenate([fold.test for fold in split.folds]), error_m, seed)
-
-
-def _learned_elsewhere(
-    error_m: float, known: bool, data: Measurements, fold: Fold, seed: int
-) -> tuple[Measurements, Fold]:
-    moved = displaced(data, np.concatenate([fold.train, fold.val]), error_m, seed)
-    return (replace(moved, position_std=np.full(len(data), error_m)) if known else moved), fold
-
-
-def _turned(error_deg: float, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
-    return turned(data, error_deg, seed), fold
-
-
-def _thinned(keep: float, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
-    return data, thinned(fold, keep, seed)
+        return [Condition("keep", float(keep)) for keep in self.keep]
 
 
 def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:

@@ -3,265 +3,188 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from itertools import groupby
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from gsparc.data.schema import Kind
-from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled, score_db
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.metric_formats import DECIDING, heading_of
-from gsparc.evaluation.summary import BUSY, shown
+from gsparc.evaluation.summary import BUSY, markdown_table, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 CLOSE_DB = 0.5
+PROBLEM = ["dataset", "split"]
+GROUP = [*PROBLEM, "budget_s", "method"]
+CELL = [*GROUP[:2], "method", "budget_s", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
+ROW = [
+    *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
+    "behind_error_db", "coverage", "outage", "after_constant", "second", "second_value", "train_s",
+    "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label",
+]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Row:
-    """A method under one budget, over its seeds.
+def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
+    """Every scored cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
+    rows = []
+    for one in filled:
+        if not one.scored():
+            continue
+        facts, kind = one.facts, one.facts["dataset/kind"]
+        figure, second = DECIDING[kind], SECOND[kind]
+        label = str(facts.get("model/label") or "")
+        rows.append({
+            **asdict(one.cell), "figure": figure, "value": float(facts[f"test/{figure}"]),
+            "train_s": facts["time/train_s"], "train_cpu_s": facts["time/train_cpu_s"],
+            "load": facts.get("machine/load"), "draws": one.drawn,
+            "score_db": score_db(kind, facts) + 0.0,  # -0.0 would be shown as such
+            "coverage": facts.get("test/interval/coverage_90"), "outage": facts.get("test/outage/brier"),
+            "after_constant": facts.get("test/rmse_db_after_constant"), "second": second,
+            "second_value": facts.get(f"test/{second}"), "earlier": one.earlier or "",
+            "label": label[label.find(" (") :] if " (" in label else "",
+        })  # fmt: skip
+    if not rows:
+        return pd.DataFrame(columns=CELL)
+    seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
+    numbers = ["budget_s", "load", "coverage", "outage", "after_constant", "second_value"]
+    return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
-    Attributes:
-        dataset, split: names.
-        budget_s: [s]; None for a method without one, which stands in the tables of all budgets.
-        method: name.
-        score_db: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE.
-        spread_db: standard deviation over seeds [dB]; of draws of the split, standard error of the mean; None
-            for a single one.
-        seeds: how many.
-        draws: whether these are draws of the split.
-        figure, value: the figure behind the score, mean over seeds.
-        value_error: standard error of `value` over draws.
-        behind_db: how much the problem's best has more, mean of the same draws [dB]; None unless drawn.
-        behind_error_db: standard error of that [dB].
-        coverage: share of measured powers within the predicted 90 % interval; None without variances.
-        outage: Brier score of predicted outages, 0 when perfect; None where every place heard something.
-        after_constant: RMSE of powers after a constant of each station [dB]; where stations are held out.
-        second, second_value: another figure for the reader.
-        train_s, train_cpu_s: seconds of training per model, on the clock and of processor [s].
-        query_ms: one query, median [ms]; None when not timed.
-        query_p95_ms: 95th percentile [ms].
-        to_copy: the median in units of a 16 MiB copy of the same rounds.
-        load: 1-minute load per core at the end of the training, mean over seeds.
-        earlier: commits of earlier program text that it was measured with; empty for today's.
-        label: what most draws say behind the method's name, ` (Vecchia 30)`; else empty.
+
+def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
+    """The scored cells of a method under one budget, averaged over seeds or over draws of the split.
+
+    Args:
+        filled: cells.
+        timed: latencies by dataset and method, of the dataset's first split and shown there alone: models
+            of fewer measurements answer faster.
+
+    Returns:
+        Columns `ROW` (those of `compare.csv`); NaN where something is not known.
+        `budget_s` [s]: NaN for a method without one, which stands in the tables of all budgets.
+        `score_db`: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE; `spread_db`: its standard
+        deviation over `seeds`, of `draws` of the split the standard error of the mean.
+        `figure`, `value`: the figure behind the score; `value_error`: its standard error over draws.
+        `behind_db`: how much the problem's best has more, mean of the same draws, and its standard error.
+        `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier score of
+        predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB].
+        `train_s`, `train_cpu_s`: seconds of training per model, on the clock and of the processor.
+        `query_ms`, `query_p95_ms`: one query; `to_copy`: in units of a 16 MiB copy of the same rounds.
+        `load`: 1-minute load per core at the end of the training.
+        `earlier`: commits of earlier program text that it was measured with.
+        `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
     """
-
-    dataset: str
-    split: str
-    budget_s: float | None
-    method: str
-    score_db: float
-    spread_db: float | None
-    seeds: int
-    draws: bool
-    figure: str
-    value: float
-    value_error: float | None
-    behind_db: float | None
-    behind_error_db: float | None
-    coverage: float | None
-    outage: float | None
-    after_constant: float | None
-    second: str
-    second_value: float | None
-    train_s: float
-    train_cpu_s: float
-    query_ms: float | None
-    query_p95_ms: float | None
-    to_copy: float | None
-    load: float | None
-    earlier: str = ""
-    label: str = ""
-
-
-def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> list[Row]:
-    """Average the scored cells over seeds, or over the draws of a split.
-
-    `timed` holds latencies by dataset and method, of the dataset's first split and shown there alone: models
-    of fewer measurements answer faster.
-    """
-    groups: dict[tuple[str, str, float, str], list[Filled]] = {}
-    for cell, one in ((one.cell, one) for one in filled if one.scored()):
-        groups.setdefault((cell.dataset, cell.split, cell.budget_s or 0.0, cell.method), []).append(one)
-    problems = list(dict.fromkeys((dataset, split) for dataset, split, *_ in groups))
-    first = dict(reversed(problems))
-    best = {problem: _best([g for key, g in groups.items() if key[:2] == problem]) for problem in problems}
-    return [
-        _row(
-            groups[key], timed.get(key[0], {}).get(key[3]) if key[1] == first[key[0]] else None, best[key[:2]]
-        )
-        for key in sorted(groups, key=lambda key: (problems.index(key[:2]), *key))
-    ]
-
-
-def scores_by_seed(same: Sequence[Filled]) -> dict[int | None, float]:
-    """The score [dB] of each seed or draw."""
-    return {one.cell.seed: score_db(one.facts["dataset/kind"], one.facts) for one in same}
-
-
-def _best(groups: Sequence[list[Filled]]) -> dict[int | None, float]:
-    """The scores of the best of a problem's methods that have as many draws as any."""
-    found = [scores_by_seed(same) for same in groups]
-    most = max(map(len, found))
-    return max((s for s in found if len(s) == most), key=lambda s: float(np.mean(list(s.values()))))
-
-
-def _mean_and_error(values: Sequence[float]) -> tuple[float, float | None]:
-    """Mean, and its standard error where there are two at least."""
-    error = float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
-    return float(np.mean(values)), error
-
-
-def _row(same: list[Filled], latency: Latency | None, best: Mapping[int | None, float]) -> Row:
-    cell, facts = same[0].cell, [one.facts for one in same]
-    kind: Kind = facts[0]["dataset/kind"]
-    by_seed = scores_by_seed(same)
-    scores = list(by_seed.values())
-    drawn = any(one.drawn for one in same)
-    behind, behind_error = None, None
-    paired = [best[seed] - score for seed, score in by_seed.items() if seed in best]
-    if drawn and paired:
-        behind, behind_error = _mean_and_error(paired)
-    value, value_error = _mean_and_error([float(f[f"test/{DECIDING[kind]}"]) for f in facts])
-    spread = None
-    if len(scores) > 1:
-        spread = _mean_and_error(scores)[1] if drawn else float(np.std(scores, ddof=1))
-
-    def mean(name: str) -> float | None:
-        values = [f[name] for f in facts if f.get(name) is not None]
-        return float(np.mean(values)) if values else None
-
-    return Row(
-        cell.dataset, cell.split, cell.budget_s, cell.method,
-        score_db=float(np.mean(scores)),
-        spread_db=spread,
-        seeds=len(same), draws=drawn,
-        figure=DECIDING[kind], value=value, value_error=value_error if drawn else None,
-        behind_db=behind, behind_error_db=behind_error,
-        coverage=mean("test/interval/coverage_90"), outage=mean("test/outage/brier"),
-        after_constant=mean("test/rmse_db_after_constant"),
-        second=SECOND[kind], second_value=mean(f"test/{SECOND[kind]}"),
-        train_s=mean("time/train_s") or 0.0, train_cpu_s=mean("time/train_cpu_s") or 0.0,
-        query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,
-        to_copy=latency.to_copy if latency else None, load=mean("machine/load"),
-        earlier=" ".join(sorted({one.earlier for one in same if one.earlier})),
-        label=_label(facts),
-    )  # fmt: skip
-
-
-def _label(facts: Sequence[Mapping[str, Any]]) -> str:
-    """What stands behind the name of the method in the label that most of its draws have."""
-    label, _ = Counter(str(f.get("model/label") or "") for f in facts).most_common(1)[0]
-    return label[label.find(" (") :] if " (" in label else ""
-
-
-@dataclass(frozen=True)
-class Result(Cell):
-    """One scored cell, so that anyone can pair what they like.
-
-    Attributes:
-        figure, value: the deciding figure.
-        train_s, train_cpu_s: of one model [s].
-        load: 1-minute load per core at the end of the training.
-    """
-
-    figure: str
-    value: float
-    train_s: float
-    train_cpu_s: float
-    load: float | None
-
-
-def results(filled: Sequence[Filled]) -> list[Result]:
-    """Of every scored cell."""
-    return [
-        Result(
-            **asdict(one.cell), figure=figure, value=one.facts[f"test/{figure}"],
-            train_s=one.facts["time/train_s"], train_cpu_s=one.facts["time/train_cpu_s"],
-            load=one.facts.get("machine/load"),
-        )
-        for one in filled if one.scored() for figure in [DECIDING[one.facts["dataset/kind"]]]
+    cells = cells_of(filled)
+    if cells.empty:
+        return pd.DataFrame(columns=ROW).astype({"draws": bool})
+    cells["behind_db"] = _behind(cells)
+    groups = cells.groupby(GROUP, dropna=False, sort=False)
+    means = [
+        "score_db", "value", "behind_db", "coverage", "outage", "after_constant", "second_value", "train_s",
+        "train_cpu_s", "load",
     ]  # fmt: skip
+    rows = groups[means].mean()
+    rows[["figure", "second"]] = groups[["figure", "second"]].first()
+    rows["seeds"], drawn = groups.size(), groups["draws"].any()
+    rows["draws"] = drawn
+    rows["spread_db"] = groups["score_db"].std().where(~drawn, groups["score_db"].sem())
+    rows["value_error"] = groups["value"].sem().where(drawn)
+    rows["behind_error_db"] = groups["behind_db"].sem()
+    rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
+    rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
+    rows = rows.reset_index()
+    problems = list(dict.fromkeys(zip(rows.dataset, rows.split, strict=True)))
+    first = dict(reversed(problems))  # split of each dataset
+    times = [
+        timed.get(row.dataset, {}).get(row.method) if row.split == first[row.dataset] else None
+        for row in rows.itertuples()
+    ]
+    for name, field in (("query_ms", "p50_ms"), ("query_p95_ms", "p95_ms"), ("to_copy", "to_copy")):
+        rows[name] = [getattr(one, field, np.nan) for one in times]
+    order = [problems.index((row.dataset, row.split)) for row in rows.itertuples()]
+    rows = rows.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
+    return rows[ROW].reset_index(drop=True)
 
 
-@dataclass(frozen=True)
-class Block:
-    """The table of one problem and budget, best first."""
-
-    dataset: str
-    split: str
-    budget_s: float | None
-    rows: tuple[Row, ...]
-
-    @property
-    def title(self) -> str:
-        """Names and budget."""
-        budget = "" if self.budget_s is None else f", {self.budget_s:g} s of training per model"
-        draws = max(row.seeds for row in self.rows) if any(row.draws for row in self.rows) else 0
-        drawn = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
-        return f"{self.dataset}, split {self.split}{budget}{drawn}"
+def _behind(cells: pd.DataFrame) -> pd.Series:
+    """How much the problem's best of the methods with most draws has more on the same draw [dB]."""
+    behind = pd.Series(np.nan, cells.index)
+    for _, here in cells[cells.draws].groupby(PROBLEM):
+        groups = here.groupby(["budget_s", "method"], dropna=False, sort=False).score_db
+        count = groups.transform("count")
+        best = groups.transform("mean")[count == count.max()].idxmax()
+        same = here[groups.ngroup() == groups.ngroup()[best]].set_index("seed").score_db
+        behind[here.index] = here.seed.map(same) - here.score_db
+    return behind
 
 
-def blocks(found: Sequence[Row]) -> list[Block]:
-    """One per dataset, split and budget; methods without a budget stand in each."""
-    result = []
-    for (dataset, split), group in groupby(found, lambda r: (r.dataset, r.split)):
-        here = sorted(group, key=lambda r: r.budget_s is not None)
-        budgets: list[float | None] = [*sorted({r.budget_s for r in here if r.budget_s is not None})]
-        for budget in budgets or [None]:
-            members = [r for r in here if r.budget_s in (None, budget)]
-            result.append(Block(dataset, split, budget, tuple(sorted(members, key=lambda r: -r.score_db))))
-    return result
+def blocks_of(rows: pd.DataFrame) -> list[pd.DataFrame]:
+    """A table per dataset, split and budget, best first; methods without a budget stand in each."""
+    blocks = []
+    for _, here in rows.groupby(PROBLEM, sort=False):
+        without = here.budget_s.isna()
+        for budget in sorted(here.budget_s.dropna().unique()) or [None]:
+            members = here[without | (here.budget_s == budget)]
+            blocks.append(members.sort_values("score_db", ascending=False, kind="stable"))
+    return blocks
 
 
-def remarks(block: Block, ours: str) -> list[str]:
+def title_of(block: pd.DataFrame) -> str:
+    """Names and budget of a block, and how often its split was drawn."""
+    budget = block.budget_s.max()
+    timed = "" if np.isnan(budget) else f", {budget:g} s of training per model"
+    draws = int(block.seeds.max()) if block.draws.any() else 0
+    drawn = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
+    return f"{block.dataset.iloc[0]}, split {block.split.iloc[0]}{timed}{drawn}"
+
+
+def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     """What the table shows about simple baselines and about our own default, favourable or not."""
-    first = block.rows[0]
-    found = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
-    if first.method in SIMPLE and any(row.method not in SIMPLE for row in block.rows):
-        found.append(f"a simple baseline wins: take {first.method} for this data and split")
-    own = next((r for r in block.rows if r.method == ours), None)
+    rows = list(block.itertuples())
+    first = rows[0]
+    lines = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
+    if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
+        lines.append(f"a simple baseline wins: take {first.method} for this data and split")
+    own = next((row for row in rows if row.method == ours), None)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
-        spread = float(np.hypot(own.spread_db or 0.0, first.spread_db or 0.0))  # of both over seeds
+        spread = float(np.hypot(*np.nan_to_num([own.spread_db, first.spread_db])))  # of both over seeds
         level = own.score_db >= first.score_db - spread
-        found.append(gap + (", within the seeds' spread" if level else ""))
-    if own is not None and own.outage is not None and (first.outage or 0.0) > own.outage:
+        lines.append(gap + (", within the seeds' spread" if level else ""))
+    if own is not None and first.outage > own.outage:
         both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
-        found.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
-    for row in block.rows:
-        if own is not None and row.method in SIMPLE and row.score_db > own.score_db and row is not first:
-            found.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
-    close = [r for r in block.rows if r.score_db >= first.score_db - CLOSE_DB and r.query_ms is not None]
-    if close:
-        quick = min(close, key=lambda r: r.query_ms or np.inf)
+        lines.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
+    for row in rows[1:]:
+        if own is not None and row.method in SIMPLE and row.score_db > own.score_db:
+            lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
+    close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
+    if len(close):
+        quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
-        found.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
-    old = ", ".join(f"{r.method} ({r.earlier})" for r in block.rows if r.earlier)
+        lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
+    old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
     if old:
-        found.append(f"measured before the program or its settings were last changed (at commit): {old}")
-    loads = [r.load for r in block.rows if r.load is not None and r.budget_s is not None]
-    if loads and max(loads) > BUSY:
-        found.append(
-            f"the machine was busy (load up to {max(loads):.1f} per core): train s is inflated, "
+        lines.append(f"measured before the program or its settings were last changed (at commit): {old}")
+    load = block.load[block.budget_s.notna()].max()
+    if load > BUSY:
+        lines.append(
+            f"the machine was busy (load up to {load:.1f} per core): train s is inflated, "
             "cpu s is what was spent"
         )
-    return found
+    return lines
 
 
 def markdown(
-    found: Sequence[Block], ours: str, timed: Mapping[str, Mapping[str, Latency]] | None = None
+    blocks: Sequence[pd.DataFrame], ours: str, timed: Mapping[str, Mapping[str, Latency]] | None = None
 ) -> str:
     """All blocks as one page, and what was timed but is too slow to be scored."""
-    pages = [_page(block, ours) for block in found]
-    scored = {row.method for block in found for row in block.rows}
+    pages = [_page(block, ours) for block in blocks]
+    scored = {name for block in blocks for name in block.method}
     pages += [
         f"{name} on {dataset}: {latency.p50_ms / 1e3:.3g} s a query, timed only ({latency.rounds} rounds)"
         for dataset, here in (timed or {}).items()
@@ -271,86 +194,82 @@ def markdown(
     return "\n\n".join(pages) + "\n"
 
 
-def _page(block: Block, ours: str) -> str:
+def _page(block: pd.DataFrame, ours: str) -> str:
     columns = _columns(block)
-    lines = ["| " + " | ".join(columns) + " |", "|---" + "|---:" * (len(columns) - 1) + "|"]
-    for row in block.rows:
+    lines = []
+    for row in block.itertuples():
         cells = [write(row) for write in columns.values()]
-        bold = row.method == ours
-        lines.append("| " + " | ".join(f"**{c}**" if bold else c for c in cells) + " |")
-    return "\n".join([f"### {block.title}", "", *lines, "", *(f"- {r}" for r in remarks(block, ours))])
+        lines.append([f"**{cell}**" for cell in cells] if row.method == ours else cells)
+    table = markdown_table(columns, lines, numbers=True)
+    return "\n".join([f"### {title_of(block)}", "", *table, "", *(f"- {r}" for r in remarks(block, ours))])
 
 
-def _columns(block: Block) -> dict[str, Callable[[Row], str]]:
+def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
     """Head of each column, and how a row fills it; columns that no row fills are left out."""
-    some, drawn = block.rows[0], any(row.draws for row in block.rows)
-    plain = some.figure == "psnr_db"  # is its own score
+    figure, drawn = block.figure.iloc[0], block.draws.any()
 
-    def near(value: float | None, error: float | None, form: str) -> str:
-        return shown(value, form) + ("" if error is None else f" ± {error:{form}}")
+    def column(name: str, form: str, error: str | None = None) -> Callable[[Any], str]:
+        def write(row: Any) -> str:
+            near = np.nan if error is None else getattr(row, error)
+            return shown(getattr(row, name), form) + ("" if np.isnan(near) else f" ± {near:{form}}")
 
-    found: dict[str, Callable[[Row], str]] = {
-        "method": lambda r: r.method + r.label,
-        SCORE[some.figure]: lambda r: near(r.score_db, r.spread_db, ".2f"),
+        return write
+
+    columns: dict[str, Callable[[Any], str]] = {
+        "method": lambda row: row.method + row.label,
+        SCORE[figure]: column("score_db", ".2f", "spread_db"),
     }
     if drawn:
-        found["behind the best, dB"] = lambda r: near(r.behind_db, r.behind_error_db, ".2f")
-    if not plain and not (drawn and some.figure == "rmse_db"):  # that is the score but for its sign
-        found[some.figure] = lambda r: near(r.value, r.value_error, ".3g" if drawn else ".4g")
-    found[some.second] = lambda r: shown(r.second_value, ".4g")
-    if any(row.after_constant is not None for row in block.rows):
-        found["after a constant, dB"] = lambda r: shown(r.after_constant, ".2f")
-    if any(row.coverage is not None for row in block.rows):
-        found["in 90 % interval"] = lambda r: shown(r.coverage, ".2f")
-    if any(row.outage is not None for row in block.rows):
-        found["outage, Brier score"] = lambda r: shown(r.outage, ".4f")
+        columns["behind the best, dB"] = column("behind_db", ".2f", "behind_error_db")
+    if figure == "nmse" or (figure == "rmse_db" and not drawn):  # else it is the score but for its sign
+        columns[figure] = column("value", ".3g" if drawn else ".4g", "value_error")
+    columns[block.second.iloc[0]] = column("second_value", ".4g")
+    for name, head, form in (
+        ("after_constant", "after a constant, dB", ".2f"), ("coverage", "in 90 % interval", ".2f"),
+        ("outage", "outage, Brier score", ".4f"),
+    ):  # fmt: skip
+        if block[name].notna().any():
+            columns[head] = column(name, form)
     if not drawn:
-        found["seeds"] = lambda r: str(r.seeds)
-    return found | {
-        "train s": lambda r: f"{r.train_s:.3g}",
-        "cpu s": lambda r: f"{r.train_cpu_s:.3g}",
-        "query ms p50": lambda r: shown(r.query_ms, ".3g"),
-        "p95": lambda r: shown(r.query_p95_ms, ".3g"),
-        "x copy": lambda r: shown(r.to_copy, ".2g"),
-    }
+        columns["seeds"] = column("seeds", "d")
+    costs = (
+        ("train_s", "train s", ".3g"), ("train_cpu_s", "cpu s", ".3g"), ("query_ms", "query ms p50", ".3g"),
+        ("query_p95_ms", "p95", ".3g"), ("to_copy", "x copy", ".2g"),
+    )  # fmt: skip
+    return columns | {head: column(name, form) for name, head, form in costs}
 
 
-def overview(rows: Sequence[Row]) -> str:
+def overview(rows: pd.DataFrame) -> str:
     """Markdown: the figure ± its standard error of the mean, (how far behind the best of the same draws).
 
     The best of a split is bold, and so is whatever is within two standard errors of it. Seconds of one fit
-    and milliseconds of one query are those of the first split.
-
-    Args:
-        rows: of one dataset, all of drawn splits.
+    and milliseconds of one query are those of the first split. Rows are of one dataset and of drawn splits.
     """
-    splits = list(dict.fromkeys(row.split for row in rows))
-    names = sorted(dict.fromkeys(row.method for row in rows), key=lambda name: mean_behind(rows, name))
-    draws = max(row.seeds for row in rows)
-    head = ["method", *splits, "fit s", "query ms"]
-    lines = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    for name in names:
-        own = {row.split: row for row in rows if row.method == name}
+    splits = list(rows.split.unique())
+    lines = []
+    for name in by_mean_behind(rows):
+        own = {row.split: row for row in rows.itertuples() if row.method == name}
         first = next(iter(own.values()))
         cells = [_cell(own[split]) if split in own else "-" for split in splits]
-        lines.append(
-            "| " + " | ".join([name, *cells, f"{first.train_s:.2g}", shown(first.query_ms, ".2g")]) + " |"
-        )
-    figure = heading_of(rows[0].figure).replace(" dB", ", dB")
-    title = f"### {rows[0].dataset}: {figure}, {draws} draws of each split"
-    return "\n".join([title, "", *lines])
+        lines.append([name, *cells, f"{first.train_s:.2g}", shown(first.query_ms, ".2g")])
+    figure = heading_of(rows.figure.iloc[0]).replace(" dB", ", dB")
+    title = f"### {rows.dataset.iloc[0]}: {figure}, {rows.seeds.max()} draws of each split"
+    table = markdown_table(["method", *splits, "fit s", "query ms"], lines, numbers=True)
+    return "\n".join([title, "", *table])
 
 
-def _cell(row: Row) -> str:
-    value = f"{row.value:.3f}" if row.figure == "nmse" else f"{row.value:.2f}"
-    if row.value_error is not None:
-        value += f" ± {row.value_error:.3f}" if row.figure == "nmse" else f" ± {row.value_error:.2f}"
-    behind, error = row.behind_db or 0.0, row.behind_error_db or 0.0
+def _cell(row: Any) -> str:
+    form = ".3f" if row.figure == "nmse" else ".2f"
+    value = f"{row.value:{form}}"
+    if not np.isnan(row.value_error):
+        value += f" ± {row.value_error:{form}}"
+    behind, error = np.nan_to_num([row.behind_db, row.behind_error_db])
     if behind <= 2 * error:
         value = f"**{value}**"
     return value if behind == 0 else f"{value} ({behind:.2f} ± {error:.2f} dB)"
 
 
-def mean_behind(rows: Sequence[Row], name: str) -> float:
-    """How far a method is behind the best, mean over the splits it is possible on [dB]."""
-    return float(np.mean([row.behind_db or 0.0 for row in rows if row.method == name]))
+def by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:
+    """Methods, the least behind first: mean over the splits that each is possible on."""
+    behind = rows.assign(behind_db=rows.behind_db.fillna(0.0)).groupby("method", sort=False).behind_db.mean()
+    return list(behind.sort_values(kind="stable").index)

@@ -94,9 +94,9 @@ class Recorded(View):
 
     def answer(self, batch: Batch) -> Prediction:
         """See `Method.answer`."""
-        found = self.inner.answer(batch)
-        self.means.append(found.mean)
-        return found
+        prediction = self.inner.answer(batch)
+        self.means.append(prediction.mean)
+        return prediction
 
 
 def closeness(answers: Tensor, whole: Tensor) -> float:
@@ -106,9 +106,9 @@ def closeness(answers: Tensor, whole: Tensor) -> float:
 
 
 def _difference(scores: Scores, full: Scores, figure: str) -> tuple[float | None, float | None]:
-    found = paired_differences(scores, full, "full")
+    differences = paired_differences(scores, full, "full")
     stem = f"paired/full/{PAIRED.get(figure, figure)}"
-    return found.get(stem), found.get(f"{stem}_se")
+    return differences.get(stem), differences.get(f"{stem}_se")
 
 
 @dataclass(frozen=True)
@@ -136,16 +136,7 @@ def draw_front(
     method: str,
     title: str,
 ) -> Figure:
-    """The picture.
-
-    Args:
-        points: all of them.
-        on_front: indices of the front, fastest first.
-        others: baselines and peers by name.
-        figure_name: key of the accuracy.
-        method: whose points they are.
-        title: what was measured.
-    """
+    """The points of a method beside others by name; `on_front` are indices of the front, fastest first."""
     lines = 0.16 * (len(on_front) + 1)  # inches of the legend
     figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))
     value = [p.value(figure_name) for p in points]
@@ -178,13 +169,13 @@ def draw_front(
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
     winner = {i: beaten_by(points[i], others, figure_name) for i in on_front}
-    told = [
+    rows = [
         f"{number:2d}  {points[i].p50:7.3g} ms  {value[i]:7.4g}  {points[i].label}"
         + (f" ({winner[i]} is better)" if winner[i] else "")
         for number, i in enumerate(on_front, 1)
     ]
     legend.axis("off")
-    text = "\n".join(["       median  accuracy  settings", *told])
+    text = "\n".join(["       median  accuracy  settings", *rows])
     legend.text(0, 1, text, va="top", family="monospace", fontsize=7.5)
     return figure
 
@@ -195,18 +186,18 @@ def others_of(
     """Baselines and the methods in other checkpoints, with the deciding figure of each."""
     figure, data = DECIDING[run.data.site.kind], run.data
     whole = Split("tradeoff", (run.split.folds[0],), "")
-    found: dict[str, tuple[Method, float | None]] = {}
+    methods: dict[str, tuple[Method, float | None]] = {}
     for name in baselines:
         fitted = baseline(name, data, run.split, eval_on, cache)
-        found[name] = (fitted.methods[0], fitted.scores.figures()[figure])
+        methods[name] = (fitted.methods[0], fitted.scores.figures()[figure])
     for path in peers:
         method, other = loading.load(path)
         if trained_on([other], replace(run.split, folds=run.split.folds[:1])) is False:
             raise ValueError(f"peers: {path} was trained on another split than {ckpt}")
         names = (method.name, f"{method.name} ({Path(path).parent.name})", path)
-        name = next(name for name in names if name not in found)
-        found[name] = (method, score([method], data, whole, eval_on).figures()[figure])
-    return found
+        name = next(name for name in names if name not in methods)
+        methods[name] = (method, score([method], data, whole, eval_on).figures()[figure])
+    return methods
 
 
 def columns_of(

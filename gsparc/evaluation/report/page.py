@@ -44,12 +44,7 @@ class Study:
 
 
 def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()) -> list[Study]:
-    """Everything there is to show, study by study.
-
-    Args:
-        runs: of any datasets.
-        fronts: `tradeoff.csv` by column, each with the name of its dataset.
-    """
+    """Everything there is to show, study by study; `fronts`: names of datasets, `tradeoff.csv` by column."""
     return [
         _study(f"{dataset}, split {split}", group, [columns for name, columns in fronts if name == dataset])
         for (dataset, split), group in by_study(runs).items()
@@ -62,8 +57,7 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
     makers = (tables.results, tables.within_minutes, tables.costs, tables.effects, tables.worst)
-    found = [make(runs) for make in makers]
-    study.tables += [table for table in found if table is not None and table.rows]
+    study.tables += [table for table in (make(runs) for make in makers) if table.rows]
     drawn = (
         plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.latency_cdf(runs), plots.learning(runs),
         plots.costs(runs), plots.measurements(runs), plots.confidence(runs),
@@ -111,13 +105,7 @@ def _png(path: Path) -> str:
 
 
 def html(title: str, made: str, shown: Sequence[Study]) -> str:
-    """The page.
-
-    Args:
-        title: above everything.
-        made: where it comes from.
-        shown: what is on it.
-    """
+    """The page; `made` says where it comes from."""
     text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
     return Environment(autoescape=True).from_string(text).render(title=title, made=made, studies=shown)
 
@@ -166,16 +154,13 @@ def refresh(path: Path, runs: Sequence[Run]) -> None:
 def _short(title: str, runs: Sequence[Run]) -> str:
     """The settings of a study over seeds, then the baselines."""
     runs = [replace(run, render_ms=np.zeros(0)) for run in runs]  # on the clock that timed the baselines
-    table, whole, facts = tables.seeds(runs), tables.results(runs), runs[0].facts
-    names, heads = ([column.name for column in one.columns] for one in (table, whole))
-    rows = list(table.rows)
-    for row in whole.rows[len(runs) :]:  # the baselines have no seeds
-        cells = dict(zip(heads, row, strict=True))
-        if row[0] not in OMITTED_ROWS:
-            rows.append([cells.get(name) for name in names])
+    table, facts = tables.seeds(runs), runs[0].facts
+    beside = [one for one in tables.baselines_of(runs[0]) if one.setting not in OMITTED_ROWS]
+    plain = tables.seeds(beside).rows if beside else ()
+    rows = [*table.rows, *([name, None, *rest] for name, _, *rest in plain)]  # baselines have no seeds
     load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
     machine = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s)"
     note = f"{machine}, load {load:.1f} per core; queries in turns."
-    kept = [i for i, name in enumerate(names) if name not in OMITTED_COLUMNS]
-    short = [[row[i] for i in kept] for row in rows]
-    return Table(title, [table.columns[i] for i in kept], short, note).markdown()
+    columns = [i for i, column in enumerate(table.columns) if column.name not in OMITTED_COLUMNS]
+    short = [[row[i] for i in columns] for row in rows]
+    return Table(title, [table.columns[i] for i in columns], short, note).markdown()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -20,12 +21,13 @@ from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
 from gsparc.evaluation.report.table import interval, over_seeds
-from gsparc.evaluation.report.tables import BASELINES, curve, grouped, validation_figure
+from gsparc.evaluation.report.tables import baselines_of, curve, grouped, validation_figure
 from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8
 MOST_CONFIDENCES = 8
 BAND = 0.95
+TIMES = "render_ms"  # of single queries, beside the figures of samples
 CDFS: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"), "rssi": ("error_db",)
 }  # fmt: skip
@@ -47,25 +49,21 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     for (setting, group), style in _styled(runs):
         for run in group:
             p50, p95 = run.latency
-            found = interval(run, name)
-            if p50 is None or found is None:
+            estimate = interval(run, name)
+            if p50 is None or estimate is None:
                 continue
-            low, high = (found.low or found.value), (found.high or found.value)
             axes.errorbar(
-                [p50], [found.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
-                yerr=[[max(found.value - low, 0.0)], [max(high - found.value, 0.0)]],
-                fmt="o", ms=4, lw=0.7, color=style["color"],
-                label=setting if run is group[0] else None,
+                [p50], [estimate.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]], yerr=estimate.bars,
+                fmt="o", ms=4, lw=0.7, color=style["color"], label=setting if run is group[0] else None,
             )  # fmt: skip
-            points.append((p50, found.value))
-    for base in _shared_baselines(runs):
-        value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
+            points.append((p50, estimate.value))
+    for base in _rivals(runs):
+        value, (ms, _), look_of = base.figure_of(name), base.latency, look(base.setting)
         if value is not None and ms is not None:
-            axes.plot([ms], [value], **look(base).marked, ms=4)
-            axes.annotate(
-                base, (ms, value), (4, -3), textcoords="offset points", fontsize=7, color=look(base).colour
-            )
-            points.append((float(ms), float(value)))
+            axes.plot([ms], [value], **look_of.marked, ms=4)
+            how: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
+            axes.annotate(base.setting, (ms, value), (4, -3), **how)
+            points.append((ms, value))
     for columns in fronts:
         if name in columns:
             x, y = (columns[key][columns["front"] == 1] for key in ("render_ms_p50", name))
@@ -86,18 +84,26 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
 def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
     name, axes = PER_SAMPLE[runs[0].kind], _axes()
-    for (setting, group), style in _styled(runs):
-        values = [sizes(run, name) for run in group if name in run.samples]
-        if values:
-            pooled = np.concatenate(values)
-            _cdf(axes, pooled[np.isfinite(pooled)], setting, style, samples=len(values[0]))
-    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in _shared_baselines(runs) else None
-    if rival is not None:
+    _cdfs(axes, runs, name)
+    rival = runs[0].samples.get(f"baseline/gp/{name}")
+    if rival is not None and any(base.setting == "gp" for base in _rivals(runs)):
         share = np.arange(1, len(rival) + 1) / len(rival)
         axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
     axes.set_ylabel("share of samples")
     title = "How the accuracy is distributed (95 % bands)"
     return _finished(axes, title, f"{heading_of(name)} of a test sample")
+
+
+def latency_cdf(runs: Sequence[Run]) -> Figure | None:
+    """Share of single queries that take at most so long; None where none were timed one by one."""
+    if not any(len(run.render_ms) for run in runs):
+        return None
+    axes = _axes()
+    _cdfs(axes, runs, TIMES)
+    logarithmic(axes)
+    axes.set_ylabel("share of queries")
+    title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
+    return _finished(axes, title, "one query, end to end [ms]")
 
 
 def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
@@ -106,22 +112,18 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
     names = [name for name in CDFS[runs[0].kind] if name in runs[0].samples]
-    timed = any(len(run.render_ms) for run in runs)
-    figure, ((*line,),) = panels(4.2 * (len(names) + timed), 3.9, 1, len(names) + timed)
-    for (setting, group), style in _styled(runs):
+    names += [TIMES] if any(len(run.render_ms) for run in runs) else []
+    labels = {}
+    for setting, group in grouped(runs).items():
         seconds = np.mean([float(run.facts["time/train_s"]) for run in group])
-        ms = [p50 for p50, _ in (run.latency for run in group) if p50 is not None]
-        label = f"{short(setting, 40)}: {seconds:.3g} s, {np.mean(ms):.3g} ms"
-        for axes, name in zip(line, names, strict=False):
-            values = np.abs(np.concatenate([run.samples[name] for run in group]))
-            _cdf(axes, values[np.isfinite(values)], label, style, samples=len(group[0].samples[name]))
-            axes.set_xlabel(heading_of(name))
-        if timed:
-            every = [run.render_ms for run in group if len(run.render_ms)]
-            _cdf(line[-1], np.concatenate(every), label, style)
-            line[-1].set_xlabel("one query, alone [ms]")
-            logarithmic(line[-1], fine=True)
-    for axes, name in zip(line, names, strict=False):
+        ms = np.mean([p50 for p50, _ in (run.latency for run in group) if p50 is not None])
+        labels[setting] = f"{short(setting, 40)}: {seconds:.3g} s, {ms:.3g} ms"
+    figure, ((*line,),) = panels(4.2 * len(names), 3.9, 1, len(names))
+    for axes, name in zip(line, names, strict=True):
+        _cdfs(axes, runs, name, labels)
+        axes.set_xlabel("one query, alone [ms]" if name == TIMES else heading_of(name))
+        if name == TIMES:
+            logarithmic(axes, fine=True)
         if name in ("mse", "error_power"):
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap
@@ -132,29 +134,24 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     save(figure, path, 100)
 
 
-def latency_cdf(runs: Sequence[Run]) -> Figure | None:
-    """Share of single queries that take at most so long; None where none were timed one by one."""
-    timed = [run for run in runs if len(run.render_ms)]
-    if not timed:
-        return None
-    axes = _axes()
-    for (setting, group), style in _styled(timed):
-        _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, style)
-    logarithmic(axes)
-    axes.set_ylabel("share of queries")
-    title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
-    return _finished(axes, title, "one query, end to end [ms]")
+def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] | None = None) -> None:
+    """Distributions of a figure of samples, or of `TIMES`, over all seeds of each setting.
 
-
-def _cdf(
-    axes: Axes, values: np.ndarray, label: str, style: dict[str, Any], samples: int | None = None
-) -> None:
-    """With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart)."""
-    share = np.arange(1, len(values) + 1) / len(values)
-    half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * (samples or len(values))))
-    axes.step(np.sort(values), share, where="post", lw=1.2, label=label, **style)
-    low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
-    axes.fill_between(np.sort(values), low, high, step="post", color=style["color"], alpha=0.08, lw=0)
+    With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart): seeds
+    share their test samples, whose number counts once.
+    """
+    for (setting, group), style in _styled(runs):
+        every = [run.render_ms if name == TIMES else sizes(run, name) for run in group]
+        every = [values[np.isfinite(values)] for values in every]
+        values = np.sort(np.concatenate(every))
+        if not len(values):
+            continue
+        share = np.arange(1, len(values) + 1) / len(values)
+        count = len(values) if name == TIMES else max(map(len, every))
+        half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * count))
+        axes.step(values, share, where="post", lw=1.2, label=(labels or {}).get(setting, setting), **style)
+        low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
+        axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
 
 
 def learning(runs: Sequence[Run]) -> Figure:
@@ -189,22 +186,18 @@ def costs(runs: Sequence[Run]) -> Figure:
         "ms a query": lambda run: run.latency[0],
         heading_of(name): lambda run: run.figure_of(name),
     }
-    columns = {
-        title: value for title, value in columns.items() if any(value(run) is not None for run in runs)
-    }
+    columns = {title: of for title, of in columns.items() if any(of(run) is not None for run in runs)}
     size = WIDE + 2, 1.2 + 0.35 * len(groups)
     figure, (line,) = panels(*size, 1, len(columns), grid=False, sharey=True)
     for panel, (title, value) in zip(line, columns.items(), strict=True):
         for row, ((_, group), style) in enumerate(_styled(runs)):
-            found = over_seeds([value(run) for run in group])
-            if found is None:
+            spread = over_seeds([value(run) for run in group])
+            if spread is None:
                 panel.text(0, row, " none", va="center", fontsize=7, color="0.5")
                 continue
-            low, high = found.low or found.value, found.high or found.value
-            reach = [[found.value - low], [high - found.value]]
-            panel.barh(row, found.value, color=style["color"], alpha=0.8)
-            panel.errorbar([found.value], [row], xerr=reach, c="k", lw=0.8)
-            panel.text(found.value, row, f" {found.value:.3g}", va="center", fontsize=7)
+            panel.barh(row, spread.value, color=style["color"], alpha=0.8)
+            panel.errorbar([spread.value], [row], xerr=spread.bars, c="k", lw=0.8)
+            panel.text(spread.value, row, f" {spread.value:.3g}", va="center", fontsize=7)
         panel.set_title(title, fontsize=8)
         panel.tick_params(labelsize=7)
         panel.margins(x=0.3)
@@ -219,18 +212,15 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
     if len({run.measured for run in runs}) < 2:
         return None
     name, axes = runs[0].figure, _axes()
-    series: dict[str, dict[int, list[float]]] = {}
-    for run in runs:
-        found = {str(run.facts.get("model/name")): run.figure_of(name)}
-        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in _shared_baselines(runs)}
-        for method, value in found.items():
-            if value is not None:
-                series.setdefault(method, {}).setdefault(run.measured, []).append(float(value))
-    for method, by_count in series.items():
-        counts, style = sorted(by_count), look(method)
-        mean, low, high = ([float(of(by_count[n])) for n in counts] for of in (np.mean, min, max))
-        axes.plot(counts, mean, ms=4, lw=1, label=method, **style.marked)
-        axes.fill_between(counts, low, high, color=style.colour, alpha=0.15, lw=0)
+    rows = [
+        (str(one.facts.get("model/name")), run.measured, one.figure_of(name))
+        for run in runs
+        for one in (run, *_rivals(runs, run))
+    ]
+    for method, own in pd.DataFrame(rows, columns=["method", "count", "value"]).groupby("method", sort=False):
+        band, style = own.dropna().groupby("count").value.agg(["mean", "min", "max"]), look(str(method))
+        axes.plot(band.index, band["mean"], ms=4, lw=1, label=method, **style.marked)
+        axes.fill_between(band.index, band["min"], band["max"], color=style.colour, alpha=0.15, lw=0)
     logarithmic(axes)
     _accuracy_axis(axes, name)
     title = "Accuracy against the number of measurements (band: seeds)"
@@ -240,11 +230,13 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
 def confidence(runs: Sequence[Run]) -> Figure | None:
     """Error against confidence, and the error of the most confident share of answers; None without any."""
     name = PER_SAMPLE[runs[0].kind]
-    sure = [r for r in runs if name in r.samples and np.isfinite(r.samples.get("confidence", [np.nan])).any()]
-    if not sure:
+    stating = [
+        r for r in runs if name in r.samples and np.isfinite(r.samples.get("confidence", [np.nan])).any()
+    ]
+    if not stating:
         return None
-    figure, ((points, kept),) = panels(WIDE, TALL, 1, 2)
-    shown = [(run, style) for (_, group), style in _styled(sure) for run in group]
+    figure, ((points, risk),) = panels(WIDE, TALL, 1, 2)
+    shown = [(run, style) for (_, group), style in _styled(stating) for run in group]
     for run, style in shown[:MOST_CONFIDENCES]:
         value, stated = sizes(run, name), run.samples["confidence"]
         known = np.isfinite(value) & np.isfinite(stated)
@@ -257,27 +249,28 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
         error = value.std(ddof=1) / np.sqrt(count)
         color = style["color"]
         points.scatter(stated, value, s=8, color=color, label=f"{short(run.setting)}: rank {rank:+.2f}")
-        kept.plot(share, mean, lw=1, **style)
-        kept.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
+        risk.plot(share, mean, lw=1, **style)
+        risk.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
     points.set(xlabel="confidence", ylabel=heading_of(name))
-    kept.set_xlabel("share of answers used, most confident first")
-    kept.set_title("mean over the answers used (95 % band)", fontsize=8)
+    risk.set_xlabel("share of answers used, most confident first")
+    risk.set_title("mean over the answers used (95 % band)", fontsize=8)
     figure.set_label("Error against confidence")
     _legend(points)
     return figure
 
 
-def _shared_baselines(runs: Sequence[Run]) -> list[str]:
-    """Baselines that no run is of."""
-    return [base for base in BASELINES if base not in {run.facts.get("model/name") for run in runs}]
+def _rivals(runs: Sequence[Run], beside: Run | None = None) -> list[Run]:
+    """Baselines beside a run (the first) that no run is of."""
+    methods = {run.facts.get("model/name") for run in runs}
+    return [base for base in baselines_of(beside or runs[0]) if base.setting not in methods]
 
 
 def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:
     """Settings, their runs, colour and line: a method's own where each has one setting, else one by one."""
     groups = grouped(runs)
     names = [str(group[0].facts.get("model/name")) for group in groups.values()]
-    alone = len(set(names)) == len(names)
-    styles = [look(name).line if alone else numbered(i) for i, name in enumerate(names)]
+    unique = len(set(names)) == len(names)
+    styles = [look(name).line if unique else numbered(i) for i, name in enumerate(names)]
     return list(zip(groups.items(), styles, strict=True))
 
 

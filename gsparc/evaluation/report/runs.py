@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -65,6 +65,11 @@ class Run:
         return " ".join([str(self.facts.get("model/name", "?")), *short])
 
     @property
+    def effects(self) -> str:
+        """Propagation effects that the model computes; `none` where it has none."""
+        return self.facts.get("model/effects") or "none"
+
+    @property
     def study(self) -> tuple[str, str]:
         """What makes figures comparable: dataset and split by name."""
         return str(self.facts.get("dataset/name")), str(self.facts.get("split/name"))
@@ -89,8 +94,8 @@ class Run:
     @property
     def checkpoints(self) -> list[Path]:
         """Its models, one per fold."""
-        found = self.folder / "model.ckpt"
-        return [found] if found.exists() else sorted(self.folder.glob("fold*/model.ckpt"))
+        path = self.folder / "model.ckpt"
+        return [path] if path.exists() else sorted(self.folder.glob("fold*/model.ckpt"))
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Run]:
@@ -99,36 +104,26 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     Raises:
         ValueError: a directory that does not exist or holds no run; it is named.
     """
-    found: dict[Path, Run] = {}
-    simulated: dict[str, float] = {}
+    runs: dict[Path, Run] = {}
+    simulated: dict[str, float] = {}  # seconds by the content hash of what was made
     for path in map(Path, paths):
         if not path.is_dir():
             raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
-        files = (
-            [path / "summary.json"] if _is_run(path / "summary.json") else sorted(path.rglob("summary.json"))
-        )
-        here = {file.parent.resolve(): file for file in files if _is_run(file)}
-        made = _simulated(files)
-        simulated |= made
+        own = path / "summary.json"
+        files = [own] if own.is_file() and _is_run(_facts(own)) else sorted(path.rglob(own.name))
+        every = {file.parent.resolve(): _facts(file) for file in files}
+        here = [folder for folder, facts in every.items() if _is_run(facts)]
+        made = [facts for facts in every.values() if "time/total_s" in facts and "dataset/receivers" in facts]
         if not here and not made and not any(path.rglob("tradeoff.csv")):
             raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
-        found |= {folder: read_run(folder) for folder in here if folder not in found}
-    if not found:
+        simulated |= {str(facts["dataset/sha256"]): float(facts["time/total_s"]) for facts in made}
+        runs |= {folder: read_run(folder) for folder in here if folder not in runs}
+    if not runs:
         raise ValueError("a swept front or a simulation is no report: give the directory of a run too")
-    for run in found.values():
+    for run in runs.values():
         if run.facts.get("dataset/simulate_s") is None:
             run.facts["dataset/simulate_s"] = simulated.get(str(run.facts.get("dataset/sha256")))
-    return list(found.values())
-
-
-def _simulated(files: Iterable[Path]) -> dict[str, float]:
-    """Seconds that `gsparc.simulate` took [s], by the content hash of what it made."""
-    every = [_facts(file) for file in files if file.is_file()]
-    return {
-        str(facts["dataset/sha256"]): float(facts["time/total_s"])
-        for facts in every
-        if "time/total_s" in facts and "dataset/receivers" in facts
-    }
+    return list(runs.values())
 
 
 def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
@@ -147,10 +142,7 @@ def distinct_overrides(runs: Sequence[Run]) -> list[Run]:
     return [replace(run, overrides=tuple(o for o in run.overrides if o not in shared)) for run in runs]
 
 
-def _is_run(file: Path) -> bool:
-    if not file.is_file():
-        return False
-    facts = _facts(file)
+def _is_run(facts: Mapping[str, Any]) -> bool:
     return "split/sha256" in facts and "time/train_s" in facts and "tradeoff/points" not in facts
 
 
@@ -178,19 +170,19 @@ def read_run(folder: Path) -> Run:
 
 
 def columns(path: Path) -> dict[str, np.ndarray]:
-    """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file."""
+    """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file or rows."""
     if not path.is_file():
         return {}
     with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return {name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+        heads, *rows = csv.reader(file)
+    return {name: _column(cells) for name, cells in zip(heads, zip(*rows, strict=True), strict=False)}
 
 
-def _column(cells: Sequence[str | None]) -> np.ndarray:
+def _column(cells: Sequence[str]) -> np.ndarray:
     try:
         return np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
-        return np.array([cell or "" for cell in cells])
+        return np.array(cells)
 
 
 def _overrides(path: Path) -> tuple[str, ...]:
@@ -205,8 +197,9 @@ def number(value: object) -> float | None:
 
 
 def sizes(run: Run, name: str) -> np.ndarray:
-    """A per-sample figure (n,) of a run; an error by its size."""
-    return np.abs(run.samples[name]) if name == "error_db" else run.samples[name]
+    """A per-sample figure (n,) of a run, empty where it has none; an error by its size."""
+    values = run.samples.get(name, np.zeros(0))
+    return np.abs(values) if name == "error_db" else values
 
 
 log = logging.getLogger(__name__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
@@ -16,7 +16,9 @@ from rich.table import Table as Shown
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import one_line, open_console
-from gsparc.evaluation.report.table import Column, Interval, Table
+
+if TYPE_CHECKING:  # every training imports this module; pandas takes half a second
+    from gsparc.evaluation.report.table import Column, Table
 
 log = logging.getLogger(__name__)
 
@@ -96,13 +98,14 @@ def _on_screen(table: Table) -> Shown:
     columns = [i for i, column in enumerate(table.columns) if column.name not in WIDE]
     first, *others = (table.columns[i].name for i in columns)
     rows = ([_spread(row[i], table.columns[i]) for i in columns] for row in table.rows)
-    found = summary.table(table.title, [first], others, rows)
-    found.caption = "least to largest over seeds; sweep.csv has more"
-    return found
+    screen = summary.table(table.title, [first], others, rows)
+    screen.caption = "least to largest over seeds; sweep.csv has more"
+    return screen
 
 
 def _spread(value: Any, column: Column) -> str:
-    if isinstance(value, Interval) and value.low is not None and value.high is not None:
-        low, high = format(value.low, column.form), format(value.high, column.form)
-        return low if low == high else f"{low} to {high}"
-    return Table("", ()).shown(value, column)
+    low, high = (getattr(value, end, None) for end in ("low", "high"))
+    if low is None or high is None:
+        return column.shown(value)
+    low, high = format(low, column.form), format(high, column.form)
+    return low if low == high else f"{low} to {high}"

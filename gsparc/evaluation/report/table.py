@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gsparc.evaluation.report.runs import Run
+from gsparc.evaluation.summary import markdown_table
 
 DRAWS = 1000
 LEVEL = 0.95
@@ -29,6 +30,12 @@ class Interval:
     value: float
     low: float | None = None
     high: float | None = None
+
+    @property
+    def bars(self) -> list[list[float]]:
+        """Lengths of error bars below and above, (2, 1)."""
+        ends = (self.value if end is None else end for end in (self.low, self.high))
+        return [[max(sign * (end - self.value), 0.0)] for sign, end in zip((-1, 1), ends, strict=True)]
 
     def shown(self, form: str = ".2f") -> str:
         """`29.08 [27.4, 30.6]`."""
@@ -62,11 +69,11 @@ def _parts(run: Run, figure: str) -> tuple[np.ndarray, np.ndarray | None] | None
     if figure == "nmse" and "error_power" in own and "target_power" in own:
         known = np.isfinite(own["error_power"])
         return own["error_power"][known], own["target_power"][known]
-    found = own.get(figure)
-    if found is None or found.dtype.kind != "f":
+    values = own.get(figure)
+    if values is None or values.dtype.kind != "f":
         return None
-    found = found[np.isfinite(found)]
-    return (found, None) if len(found) > 1 else None
+    values = values[np.isfinite(values)]
+    return (values, None) if len(values) > 1 else None
 
 
 def over_seeds(values: Sequence[float | None]) -> Interval | None:
@@ -79,17 +86,31 @@ def over_seeds(values: Sequence[float | None]) -> Interval | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A heading.
+    """A heading, and what stands below it.
 
     Attributes:
         name: as shown, with its unit.
         form: how numbers are written.
         note: what it means, for a reader who points at it.
+        of: a run's value: the key of a fact, or a function; unused where rows are given.
     """
 
     name: str
     form: str = ".4g"
     note: str = ""
+    of: str | Callable[[Run], Any] = ""
+
+    def value(self, run: Run) -> Any:
+        """What a run has in this column: text, a number, an interval or None."""
+        return run.facts.get(self.of) if isinstance(self.of, str) else self.of(run)
+
+    def shown(self, value: Any) -> str:
+        """A cell as text."""
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            return "–"
+        if isinstance(value, Interval):
+            return value.shown(self.form)
+        return format(value, self.form) if isinstance(value, (int, float)) else str(value)
 
 
 @dataclass
@@ -105,52 +126,39 @@ class Table:
 
     title: str
     columns: Sequence[Column]
-    rows: list[list[Any]] = field(default_factory=list)
+    rows: Sequence[Sequence[Any]] = ()
     note: str = ""
 
-    def add(self, *values: Any) -> None:
-        """One row; `ValueError` when it does not fit the headings."""
-        if len(values) != len(self.columns):
-            raise ValueError(f"{self.title}: {len(values)} values under {len(self.columns)} headings")
-        self.rows.append(list(values))
-
-    def shown(self, value: Any, column: Column) -> str:
-        """A cell as text."""
-        if value is None or (isinstance(value, float) and math.isnan(value)):
-            return "–"
-        if isinstance(value, Interval):
-            return value.shown(column.form)
-        return format(value, column.form) if isinstance(value, (int, float)) else str(value)
+    @classmethod
+    def of(cls, title: str, columns: Sequence[Column], runs: Sequence[Run], note: str = "") -> Table:
+        """A row per run."""
+        return cls(title, columns, [[column.value(run) for column in columns] for run in runs], note)
 
     @staticmethod
     def key(value: Any) -> str:
         """What a cell is sorted by."""
-        value = value.value if isinstance(value, Interval) else value
+        value = getattr(value, "value", value)
         return "" if value is None else str(value)
 
     def csv(self) -> str:
         """Comma-separated, an interval as three columns."""
-        spread = [any(isinstance(row[i], Interval) for row in self.rows) for i in range(len(self.columns))]
+        parts: dict[str, list[Any]] = {}
+        for number, column in enumerate(self.columns):
+            cells = [row[number] for row in self.rows]
+            parts[column.name] = [getattr(cell, "value", cell) for cell in cells]
+            if any(isinstance(cell, Interval) for cell in cells):
+                for end in ("low", "high"):
+                    parts[f"{column.name} {end}"] = [getattr(cell, end, None) for cell in cells]
         out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        heads: list[str] = []
-        for column, wide in zip(self.columns, spread, strict=True):
-            heads += [column.name, f"{column.name} low", f"{column.name} high"] if wide else [column.name]
-        writer.writerow(heads)
-        for row in self.rows:
-            cells: list[Any] = []
-            for value, wide in zip(row, spread, strict=True):
-                one = value if isinstance(value, Interval) or not wide else Interval(value)
-                cells += [one.value, one.low, one.high] if isinstance(one, Interval) else [one]
-            writer.writerow(["" if cell is None else cell for cell in cells])
+        csv.writer(out, lineterminator="\n").writerows([parts, *zip(*parts.values(), strict=True)])
         return out.getvalue()
 
     def markdown(self) -> str:
         """A Markdown table under its title."""
-        heads = [column.name for column in self.columns]
-        lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
-        for row in self.rows:
-            cells = [self.shown(v, c).replace("|", "\\|") for v, c in zip(row, self.columns, strict=True)]
-            lines.append(f"| {' | '.join(cells)} |")
+        cells = [
+            [column.shown(value).replace("|", "\\|") for column, value in zip(self.columns, row, strict=True)]
+            for row in self.rows
+        ]
+        lines = markdown_table([column.name for column in self.columns], cells)
         note = f"\n{self.note}\n" if self.note else ""
         return f"### {self.title}\n{note}\n" + "\n".join(lines) + "\n"

@@ -9,8 +9,8 @@ from campaigns import compose
 from omegaconf import OmegaConf
 
 import gsparc.models.peers
-from gsparc.evaluation.experiment.cells import Budget, Contender, code_version, contenders, key, plan
-from gsparc.evaluation.experiment.problem import Problem, split_choices
+from gsparc.evaluation.experiment.cells import Budget, Contender, code_version, key, plan
+from gsparc.evaluation.experiment.problem import Problem, SplitChoice, named
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
@@ -58,16 +58,11 @@ def test_a_draw_of_a_split_is_the_seed_of_every_method():
     ]  # fmt: skip
 
 
-def test_all_stations_together_are_learned_where_there_are_several():
-    methods = {"one": Contender("one", ("model=gp",), stations=True)}
-    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", stations=True)], methods, [])]
-    assert found == ["b"]
-
-
-def test_a_ray_tracer_takes_part_where_a_scene_is_known():
-    methods = {"one": Contender("one", ("model=calibrated_raytracer",), scene=True)}
-    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", scene=True)], methods, [])]
-    assert found == ["b"]
+@pytest.mark.parametrize("needed", ["stations", "scene"])
+def test_a_method_takes_part_where_what_it_needs_is_there(needed):
+    methods = {"one": Contender("one", ("model=gp",), **{needed: True})}
+    problems = [problem("a"), problem("b", **{needed: True})]
+    assert [cell.dataset for _, cell in plan(problems, methods, [])] == ["b"]
 
 
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
@@ -76,22 +71,32 @@ def test_only_filters_and_a_pattern_of_nothing_is_an_error():
         names("rfid/rndom/*")
 
 
-def test_budgets_leave_room_for_what_they_do_not_count():
-    contender = Contender("x", ("model=gsparc",), ("model.b={budget_s}",), reserve_s=10)
-    assert contender.overrides(60) == ["model=gsparc", "model.b=50"]
-    assert contender.overrides(None) == ["model=gsparc"]
-
-
 def test_every_method_of_the_default_comparison_composes():
     config = OmegaConf.to_container(compose(config="compare"), resolve=True)
-    for contender in contenders(config["methods"]).values():
+    for contender in named("methods", Contender, config["methods"]).values():
         assert compose(*contender.overrides(60)).model
     assert config["ours"] in config["methods"]
-    for split in split_choices(config["splits"]).values():
+    for split in named("splits", SplitChoice, config["splits"]).values():
         assert set(split.datasets) <= set(config["datasets"])
         assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
-    with pytest.raises(ValueError, match=r"methods\.x: .*chose"):
-        contenders({"x": {"chose": ["model=gp"]}})
+
+
+@pytest.mark.parametrize(
+    ("group", "of", "entry", "message"),
+    [
+        (
+            "methods",
+            Contender,
+            {"chose": ["model=gp"]},
+            r"methods\.x: unknown 'chose'; there are choose",
+        ),
+        ("methods", Contender, {}, r"methods\.x: missing 1 required positional argument: 'choose'"),
+        ("splits", SplitChoice, {"draw": 3}, r"splits\.x: unknown 'draw'; there are choose, datasets, draws"),
+    ],
+)
+def test_a_wrong_entry_is_named(group, of, entry, message):
+    with pytest.raises(ValueError, match=message):
+        named(group, of, {"x": entry})
 
 
 MODULE = '''"""{doc}"""

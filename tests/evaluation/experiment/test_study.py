@@ -10,7 +10,7 @@ from clocks import WoundClock
 from invented import divide, invent
 
 from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
-from gsparc.evaluation.experiment.study import Measured, Positions, Study
+from gsparc.evaluation.experiment.study import Measured, Positions, Study, facts_of
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.baselines.nearest import Nearest
@@ -61,14 +61,14 @@ def test_times_are_ratios_to_the_base(monkeypatch):
     monkeypatch.setattr(timing.time, "perf_counter", WATCH)
     made = dict(plain=Quick, slow=Slow, impossible=Impossible, needs=NeedsUplink)
     rows = Study(made, base="plain", rounds=2, clock=CLOCK).run(invent("csi"), divide(48), CONTEXT)
-    found = {row.variant: row for row in rows}
+    found = {row.variant: row for row in rows.itertuples()}
     assert list(found) == ["plain", "slow", "needs"]
     assert found["plain"].query_ratio == found["plain"].train_ratio == 1
     assert found["slow"].train_ratio == pytest.approx(3) and found["slow"].query_ms >= 4
     assert 3 < found["slow"].query_ratio < 4 and found["slow"].effects == "sleep"  # 4.1 ms to 1.1
     assert found["slow"].value == found["needs"].value == pytest.approx(found["plain"].value)
     assert found["plain"].spread == 0 and found["plain"].rows == 36
-    facts = found["slow"].facts()
+    facts = facts_of(rows)
     assert facts["study/slow/train_s"] == 3 and {"study/slow/nmse", "study/slow/query_ms"} <= set(facts)
 
 
@@ -96,22 +96,22 @@ def test_errors_cost_an_interpolator_and_not_the_mean():
     data, split = invent(), divide(48)
     conditions = Positions([0.001, 0.3]).conditions()
     rows = Study(dict(gp=GaussianProcess, mean=Mean), conditions, clock=CLOCK).run(data, split, CONTEXT)
-    value = {(r.variant, r.what, r.amount): r.value for r in rows}
+    value = {(r.variant, r.what, r.amount): r.value for r in rows.itertuples()}
     assert len(value) == 14
     for what in ("query", "train"):
         assert value["gp", what, 0.3] < value["gp", "none", 0.0] - 1
         assert abs(value["mean", what, 0.3] - value["mean", "none", 0.0]) < 1e-6
-    clean, asked = (next(r for r in rows if r.what == what) for what in ("none", "query"))
+    clean, asked = (next(r for r in rows.itertuples() if r.what == what) for what in ("none", "query"))
     assert (clean.train_s, clean.query_ms) == (asked.train_s, asked.query_ms)  # trained and timed once
 
 
 def test_more_measurements_are_better_and_are_counted():
     conditions = Measured([1, 0.5, 9]).conditions()
     rows = Study(dict(gp=GaussianProcess), conditions, clock=CLOCK).run(invent(), divide(48), CONTEXT)
-    assert [row.rows for row in rows] == [36, 18, 9]
-    values = [row.value for row in rows]
+    assert list(rows.rows) == [36, 18, 9]
+    values = list(rows.value)
     assert values == sorted(values, reverse=True) and values[0] > values[-1] + 1
-    assert "study/gp/keep/0.5/psnr_db" in rows[1].facts()
+    assert "study/gp/keep/0.5/psnr_db" in facts_of(rows)
     with pytest.raises(ValueError, match="keep="):
         Measured([0.0])
 
