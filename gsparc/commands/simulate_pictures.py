@@ -12,7 +12,6 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import bounded, draw_stations, draw_walls, legend_below
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
-from gsparc.simulate.survey import HasTriangles
 
 
 def floor_plan(outcome: Outcome, path: Path) -> None:
@@ -46,7 +45,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
             axis.scatter(*dark, s=size, c="lightgrey", label="nothing arrives" if first else None)
         draw_stations(axis, survey.transmitters[:, :2], "transmitter" if first else None, color="r")
         left, right, south, north = axis.axis()
-        if isinstance(survey.engine, HasTriangles):
+        if len(survey.engine.triangles()):
             draw_walls(axis, survey.engine.triangles())
         bounded(axis, (left, south), (right, north), **({} if first else {"ylabel": ""}))
     legend_below(figure)  # beside the title it would cover the last effects

@@ -14,7 +14,7 @@ from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import ARRAYS, Paths, starts
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
@@ -66,7 +66,7 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
 def assemble(
     campaign: Campaign,
     survey: Survey,
-    effects: Effects,
+    effects: PropagationEffects,
     choice: Choice | None,
     convergence: Convergence | None,
     seconds: float,
@@ -140,7 +140,7 @@ def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
 
 
 def _arrays(
-    campaign: Campaign, survey: Survey, effects: Effects, whole: Arrays, paths: Paths
+    campaign: Campaign, survey: Survey, effects: PropagationEffects, whole: Arrays, paths: Paths
 ) -> dict[str, np.ndarray]:
     scene, wavelength = campaign.scene, survey.engine.wavelength
     spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
@@ -197,7 +197,7 @@ def _ends(survey: Survey) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _provenance(campaign: Campaign, engine: Engine, effects: Effects) -> dict[str, Any]:
+def _provenance(campaign: Campaign, engine: Engine, effects: PropagationEffects) -> dict[str, Any]:
     """Attributes of the file: what it is and how it was made."""
     return {
         "name": campaign.scene.name,

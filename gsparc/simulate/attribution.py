@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
@@ -82,7 +82,7 @@ class Probe:
     """
 
     paths: Paths
-    effects: Effects
+    effects: PropagationEffects
     frequency_hz: np.ndarray
     wavelength: float
     elements: np.ndarray
@@ -128,7 +128,7 @@ class Probe:
         """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
-    def shares(self, kept: Effects | Paths) -> np.ndarray:
+    def shares(self, kept: PropagationEffects | Paths) -> np.ndarray:
         """Share of each receiver's power that is lost (R,), negative where more arrives.
 
         Args:
@@ -142,7 +142,7 @@ class Probe:
             rest = self._power[:ports, self._allowed(kept)].sum((0, 1))
         return 1 - rest / np.where(full > 0, full, 1)
 
-    def nmse(self, kept: Effects | Paths) -> np.ndarray:
+    def nmse(self, kept: PropagationEffects | Paths) -> np.ndarray:
         """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
         full = self._channels.sum(0)
         if isinstance(kept, Paths):
@@ -155,7 +155,7 @@ class Probe:
         energy = (np.abs(full) ** 2).sum((1, 2))
         return error / np.where(energy > 0, energy, 1)
 
-    def errors(self, kept: Effects | Paths, deliverable: Deliverable) -> np.ndarray:
+    def errors(self, kept: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
         """The deliverable's error at each receiver (R,), in the unit of its tolerance."""
         if deliverable.kind == "coverage":
             remains = np.maximum(1 - self.shares(kept), 10 ** (-SILENCE_DB / 10))
@@ -163,21 +163,21 @@ class Probe:
         if deliverable.kind == "csi":
             return 10 * np.log10(np.maximum(self.nmse(kept), 10 ** (-SILENCE_DB / 10)))
         full, near = self._images
-        if isinstance(kept, Effects):
+        if isinstance(kept, PropagationEffects):
             left = full if kept == self.effects else self._render(self.paths.under(kept))
         else:
             left = self._render(kept)
         error, rival = (((image - full) ** 2).mean((1, 2)) for image in (left, near))
         return error / np.maximum(rival, 1e-12)
 
-    def _allowed(self, kept: Effects) -> np.ndarray:
+    def _allowed(self, kept: PropagationEffects) -> np.ndarray:
         return kept.allows(*self._kinds[0].T)
 
     def _render(self, paths: Paths) -> np.ndarray:
         return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
 
 
-def removals(full: Effects) -> dict[str, Effects]:
+def removals(full: PropagationEffects) -> dict[str, PropagationEffects]:
     """What can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation."""
     found = {name: less for name in full.on if (less := _without(full, name)) is not None}
     found |= {f"depth > {depth}": replace(full, depth=depth) for depth in range(full.depth - 1, 0, -1)}
@@ -186,7 +186,7 @@ def removals(full: Effects) -> dict[str, Effects]:
     return found
 
 
-def combinations(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
+def combinations(full: PropagationEffects, removable: tuple[str, ...]) -> list[PropagationEffects]:
     """Every set of switches that leaves out some of `removable` (names as in `removals`); `full` first."""
     sets = {full}
     for name in removable:
@@ -199,7 +199,7 @@ def combinations(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
     return sorted(sets, key=lambda s: (len(full.on) - len(s.on), full.depth - s.depth, not s.polarisation))
 
 
-def _without(effects: Effects, name: str) -> Effects | None:
+def _without(effects: PropagationEffects, name: str) -> PropagationEffects | None:
     """None when nothing would be left."""
     try:
         return effects.without(name)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import binom
 
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths
 
 log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ class AutoSettings:
     held_back: int = 128
     rays: float = 0.3
     reuse: bool = True
-    full: Effects = field(default_factory=lambda: Effects(depth=5))
+    full: PropagationEffects = field(default_factory=lambda: PropagationEffects(depth=5))
 
     def __post_init__(self) -> None:
         if self.probes < 16 or self.held_back < 16:
@@ -135,7 +135,7 @@ class Choice:
         reused: whether it was taken over from an earlier run.
     """
 
-    effects: Effects
+    effects: PropagationEffects
     deliverable: str
     table: tuple[EffectRow, ...]
     probes: int
@@ -165,7 +165,12 @@ class Choice:
         verdict = None if stored["verdict"] is None else Verification(**stored["verdict"])
         table = tuple(EffectRow(**row) for row in stored["table"])
         return Choice(
-            **{**stored, "effects": Effects(**stored["effects"]), "table": table, "verdict": verdict}
+            **{
+                **stored,
+                "effects": PropagationEffects(**stored["effects"]),
+                "table": table,
+                "verdict": verdict,
+            }
         )
 
 
@@ -200,7 +205,7 @@ def decide(
         return None
     sets = sorted(combinations(full, removable), key=lambda some: price(some, full))
 
-    def holds(some: Effects) -> bool:
+    def holds(some: PropagationEffects) -> bool:
         return bool((probe.errors(some, deliverable)[reached] > deliverable.tolerance).sum() <= most)
 
     chosen = _cheapest(sets, holds, full)
@@ -255,7 +260,7 @@ def fewer_rays(
     return replace(choice, table=(*choice.table, row), samples=samples if enough else None)
 
 
-def everything(choice: Choice, full: Effects) -> Choice:
+def everything(choice: Choice, full: PropagationEffects) -> Choice:
     """All effects, in place of a choice that held-back receivers refute; the verdict is on the latter."""
     table = tuple(replace(row, kept=True) for row in choice.table)
     return replace(choice, effects=full, refuted=str(choice.effects), table=table)
@@ -293,7 +298,7 @@ def allowed_failures(first: int, all_: int, quantile: float, confidence: float) 
     return int(early), late
 
 
-def price(some: Effects, full: Effects, rays: float = 1.0) -> float:
+def price(some: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
     """Expected time of tracing with `some` and a share of the rays, 1 with everything."""
     off = [name for name in full.on if name not in some.on]
     off += ["polarisation"] if full.polarisation and not some.polarisation else []
@@ -307,9 +312,11 @@ def _most(heard: int, last: bool, settings: AutoSettings) -> tuple[int, int]:
     return allowed_failures(first, all_, settings.quantile, settings.confidence)
 
 
-def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effects) -> Effects:
+def _cheapest(
+    sets: list[PropagationEffects], holds: Callable[[PropagationEffects], bool], full: PropagationEffects
+) -> PropagationEffects:
     """The cheapest set that meets the requirement; of sets with similar prices, the smallest."""
-    found: list[Effects] = []
+    found: list[PropagationEffects] = []
     for some in sets:
         if found and price(some, full) > (1 + SIMILAR) * price(found[0], full):
             break

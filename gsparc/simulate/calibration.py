@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.raytracer import RayTracer
 
 log = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class Replay:
         effects: that are traced.
     """
 
-    def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: Effects) -> None:
+    def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: PropagationEffects) -> None:
         self.tracer, self._count = tracer, len(receivers)
         self._parts: list[tuple[dict[str, Any], Any]] = []
         first = 0
@@ -170,7 +170,9 @@ class Replay:
         return total
 
 
-def _kept(tracer: RayTracer, found: Any, effects: Effects, first: int) -> tuple[dict[str, Any], Any]:
+def _kept(
+    tracer: RayTracer, found: Any, effects: PropagationEffects, first: int
+) -> tuple[dict[str, Any], Any]:
     """Arguments of the field calculator, and the receivers of the paths, from `first` on."""
     import mitsuba as mi
 

@@ -17,7 +17,7 @@ from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.convergence import Convergence, compare
 from gsparc.simulate.deciding import Changed, Decision
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.scenes.build import build
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
@@ -45,7 +45,7 @@ class Outcome:
 
     made: Assembled
     survey: Survey
-    effects: Effects
+    effects: PropagationEffects
     choice: Choice | None
     changed: Changed | None
     convergence: Convergence | None
@@ -115,7 +115,7 @@ class _Tracing:
     """Traces and stores shards; where it is sent to, it builds the scene once, which cannot be pickled."""
 
     campaign: Campaign
-    effects: Effects
+    effects: PropagationEffects
     shards: Shards
     survey: Survey | None
     compiled: bool = False
@@ -138,7 +138,9 @@ class _Tracing:
         return math.nan if first else spent
 
 
-def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Shards) -> float | None:
+def _trace_all(
+    campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards
+) -> float | None:
     """Every shard that is not there yet.
 
     Returns:
@@ -160,7 +162,7 @@ def _decided_on(shards: Shards) -> np.ndarray:
 
 
 def _converge(
-    campaign: Campaign, survey: Survey, effects: Effects, shards: Shards, fewer: bool
+    campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards, fewer: bool
 ) -> Convergence | None:
     """The file's rows beside the same under a second seed; None for an engine without rays.
 

@@ -17,7 +17,7 @@ from gsparc.data.files import platform_cache, whole_file
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Probe, reasons
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths, join
 from gsparc.simulate.scenes.receivers import neighbours
 from gsparc.simulate.settings import Campaign
@@ -58,7 +58,7 @@ class Decision:
     """
 
     choice: Choice
-    effects: Effects
+    effects: PropagationEffects
     samples: int | None = None
     changed: Changed | None = None
     rows: np.ndarray | None = None
@@ -80,7 +80,7 @@ class Decision:
         """Inverse of `note`."""
         rows, errors = note["changed"] or ([], [])
         changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
-        effects = Effects(**note["effects"])
+        effects = PropagationEffects(**note["effects"])
         return Decision(Choice.from_dict(note["choice"]), effects, note.get("samples"), changed)
 
 
@@ -98,7 +98,9 @@ class Traced:
         compiling: of compiling, by the difference; None likewise.
     """
 
-    def __init__(self, survey: Survey, effects: Effects, ahead: np.ndarray = NONE, size: int = 1) -> None:
+    def __init__(
+        self, survey: Survey, effects: PropagationEffects, ahead: np.ndarray = NONE, size: int = 1
+    ) -> None:
         self.survey, self.effects, self._ahead, self._size = survey, effects, ahead, size
         self.rows = np.zeros(0, dtype=np.int64)
         self._parts: list[Paths] = []
@@ -203,8 +205,8 @@ class Decider:
         with whole_file(self._stored) as partial:
             partial.write_text(json.dumps(asdict(choice), indent=1), encoding="utf-8")
 
-    def _simulated(self, choice: Choice, rows: int) -> tuple[Effects, int | None]:
-        """Effects and rays of the choice, or everything where that is cheaper for so many rows."""
+    def _simulated(self, choice: Choice, rows: int) -> tuple[PropagationEffects, int | None]:
+        """PropagationEffects and rays of the choice, or everything where that is cheaper for so many rows."""
         rays = 1.0 if choice.samples is None else choice.samples / self.campaign.sampling.samples
         price = auto.price(choice.effects, self.full, rays)
         if (choice.effects == self.full and rays == 1) or pays(choice, rows, 1 - price):

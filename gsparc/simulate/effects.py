@@ -1,4 +1,4 @@
-"""Propagation effects as switches, and which of them a path needs."""
+"""Propagation effects of a simulator as switches, and which of them a path needs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MECHANISMS = ("line_of_sight", *BITS)
 
 
 @dataclass(frozen=True)
-class Effects:
+class PropagationEffects:
     """What is simulated; off means not computed.
 
     Attributes:
@@ -66,7 +66,7 @@ class Effects:
         """Names of the mechanisms that are computed."""
         return tuple(name for name in MECHANISMS if getattr(self, name))
 
-    def without(self, *names: str) -> Effects:
+    def without(self, *names: str) -> PropagationEffects:
         """The same with some switched off, and with what needs them."""
         needs = {"specular": "diffuse", "diffraction": "edge_diffraction"}
         off = {*names, *(needs[name] for name in names if name in needs)}
@@ -88,10 +88,10 @@ class Effects:
         return ", ".join([name.replace("_", " ") for name in self.on] + extra)
 
 
-def from_config(config: Mapping[str, Any]) -> Effects:
+def from_config(config: Mapping[str, Any]) -> PropagationEffects:
     """Switches from the config group `effects`.
 
     Raises:
         ValueError: a switch that does not exist, or a contradiction.
     """
-    return Effects(**known_keys(config, Effects, "effects", "effect"))
+    return PropagationEffects(**known_keys(config, PropagationEffects, "effects", "effect"))

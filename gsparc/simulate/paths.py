@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Paths:
         rows = first + np.arange(counts.sum())
         return Paths(starts(counts), *(getattr(self, name)[rows] for name in ARRAYS))
 
-    def under(self, effects: Effects) -> Paths:
+    def under(self, effects: PropagationEffects) -> Paths:
         """What remains of a full simulation under these switches."""
         kept = self.select(effects.allows(self.mechanisms, self.order))
         return kept if effects.polarisation else replace(kept, gain=kept.gain[:, :1])

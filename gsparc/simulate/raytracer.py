@@ -22,11 +22,12 @@ import torch
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
-from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
+from gsparc.simulate.effects import DIFFRACTION, EDGE, PropagationEffects
 from gsparc.simulate.paths import ARRAYS, Paths, join
 from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
+from gsparc.simulate.survey import Engine
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +65,7 @@ class Sampling:
         return math.ceil(self.batch / 3)
 
 
-class RayTracer:
+class RayTracer(Engine):
     """One scene with one transmitter, ready to trace.
 
     Args:
@@ -105,7 +106,9 @@ class RayTracer:
         self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
         self._arrays: list[tuple[int, str]] = []  # what the scene's antennas are, shared by `at`
         self.retried = 0  # batches traced again because candidates were cut off
-        self._buffer_factor: dict[Effects, int] = {}  # enlargement of the candidate buffer by effects
+        self._buffer_factor: dict[
+            PropagationEffects, int
+        ] = {}  # enlargement of the candidate buffer by effects
 
     def at(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
         """The same scene with the transmitter elsewhere."""
@@ -118,10 +121,6 @@ class RayTracer:
         other = copy(self)
         other.sampling = replace(self.sampling, samples=samples)
         return other
-
-    def supported(self, effects: Effects) -> Effects:
-        """Everything."""
-        return effects
 
     def versions(self) -> dict[str, str]:
         """Versions of the solver's packages."""
@@ -155,7 +154,7 @@ class RayTracer:
         used = {thing.radio_material.name for thing in self.scene.objects.values()}
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Paths from the transmitter to receivers (R, 3) [m].
 
         Args:
@@ -178,7 +177,7 @@ class RayTracer:
         return join(parts)
 
     def solutions(
-        self, receivers: np.ndarray, effects: Effects, seed: int | None = None
+        self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None
     ) -> Iterator[tuple[Any, int]]:
         """Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
 
@@ -188,7 +187,9 @@ class RayTracer:
         for first in range(0, len(receivers), size):
             yield from self._batch(receivers[first : first + size], effects, rays)
 
-    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Iterator[tuple[Any, int]]:
+    def _batch(
+        self, receivers: np.ndarray, effects: PropagationEffects, seed: int
+    ) -> Iterator[tuple[Any, int]]:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
         boost = self._buffer_factor.get(effects, 1)
         # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
@@ -213,7 +214,7 @@ class RayTracer:
         for part in (receivers[:half], receivers[half:]):
             yield from self._batch(part, effects, seed)
 
-    def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Any | None:
+    def _solve(self, receivers: np.ndarray, effects: PropagationEffects, seed: int, limit: int) -> Any | None:
         """Sionna's paths, or None when the solver ran into `limit` and left some out."""
         import sionna.rt as rt
         from sionna.rt.path_solvers import sb_candidate_generator as shooting

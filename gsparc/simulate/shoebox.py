@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.effects import SPECULAR, Effects
+from gsparc.simulate.effects import SPECULAR, PropagationEffects
 from gsparc.simulate.paths import Paths, starts
+from gsparc.simulate.survey import Engine
 
 WALLS = ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")
 
@@ -217,7 +218,7 @@ def trace(
     return Trace(csi, tx, rx, frequency, elements, mirrored, seen, variance)
 
 
-class ShoeboxEngine:
+class ShoeboxEngine(Engine):
     """A shoebox room with one transmitter as an `Engine`: line of sight and mirror reflections.
 
     Args:
@@ -236,7 +237,7 @@ class ShoeboxEngine:
         if not room.contains(self.transmitter):
             raise ValueError(f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box")
 
-    def supported(self, effects: Effects) -> Effects:
+    def supported(self, effects: PropagationEffects) -> PropagationEffects:
         """Line of sight and specular reflection; walls do not transmit, edges do not diffract."""
         return replace(
             effects.without("diffuse", "diffraction", "refraction"),
@@ -244,7 +245,7 @@ class ShoeboxEngine:
             depth=effects.depth if effects.specular else 0,
         )
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
         mirrored = images(self.room, effects.depth)
         seen = visible(self.room, mirrored, self.transmitter[None], receivers)
@@ -267,17 +268,9 @@ class ShoeboxEngine:
             order,
         )
 
-    def thinned(self, samples: int) -> ShoeboxEngine:
-        """Itself: there are no rays."""
-        return self
-
     def fingerprint(self) -> str:
         """Of the room."""
         return sha256(repr(self.room).encode()).hexdigest()
-
-    def versions(self) -> dict[str, str]:
-        """Part of this package."""
-        return {}
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """Amplitude reflection coefficients of the walls."""

@@ -8,12 +8,12 @@ from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.deciding import Decision, Traced, pays
-from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
+from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, PropagationEffects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings
 from gsparc.simulate.survey import Survey
 
-FULL = Effects(depth=2, polarisation=False)
+FULL = PropagationEffects(depth=2, polarisation=False)
 
 
 class Invented:
@@ -127,7 +127,7 @@ def test_few_failures_prove_the_quantile(probes, quantile, confidence, most):
 
 
 def test_prices_rank_sets():
-    full = Effects(depth=5)
+    full = PropagationEffects(depth=5)
     assert auto.price(full, full) == 1
     assert (
         auto.price(dataclasses.replace(full, depth=3), full) < auto.price(full.without("diffuse"), full) < 1
@@ -213,12 +213,12 @@ def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
 
 
 def test_removals_and_combinations_are_complete():
-    found = removals(Effects(depth=3))
+    found = removals(PropagationEffects(depth=3))
     assert set(found) == {"line_of_sight", "specular", "refraction", "diffraction", "edge_diffraction",
                           "diffuse", "depth > 2", "depth > 1", "polarisation"}  # fmt: skip
     assert found["depth > 1"].depth == 1
-    sets = combinations(Effects(depth=3), ("diffuse", "depth > 2", "polarisation"))
-    assert len(sets) == 8 and sets[0] == Effects(depth=3)
+    sets = combinations(PropagationEffects(depth=3), ("diffuse", "depth > 2", "polarisation"))
+    assert len(sets) == 8 and sets[0] == PropagationEffects(depth=3)
 
 
 def test_a_choice_survives_its_file():

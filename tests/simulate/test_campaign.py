@@ -28,20 +28,20 @@ from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.report import choice_table, figures, verdict
 from gsparc.simulate.scenes.build import SceneSettings, build
-from gsparc.simulate.settings import Campaign, CsiSettings
+from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.shoebox import Room, ShoeboxEngine, trace
-from gsparc.simulate.spectrum import SpectrumSettings
+from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 SCENE = SceneSettings(
     name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),
     num_receivers=60, carrier_hz=2.4e9, bandwidth_hz=40e6, subcarriers=4,
     room={"size_m": [6, 5, 3], "reflection": -0.6, "boxes_m": [[[2.6, 2.2, 0], [3.0, 2.6, 3]]]},
 )  # fmt: skip
-MIRROR = Effects(
+MIRROR = PropagationEffects(
     refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
 )
 SMALL = SpectrumSettings(height=18, width=36, rows=4, columns=4)
@@ -85,7 +85,7 @@ def test_paths_make_the_channel(tmp_path):
 
 
 def test_it_is_read_as_spectra_and_as_channels(tmp_path):
-    simulate(plan(csi=CsiSettings(rows=2, columns=2)), tmp_path / "box.h5")
+    simulate(plan(csi=ArraySettings(rows=2, columns=2)), tmp_path / "box.h5")
     spectra, csi = (
         load({"name": "sionna", "file": str(tmp_path / "box.h5"), "target": target})
         for target in ("spectrum", "csi")
@@ -104,7 +104,7 @@ def test_it_is_read_as_spectra_and_as_channels(tmp_path):
 def test_it_is_read_as_powers(tmp_path):
     """Sums of path powers; where no path arrives, a power is below the weakest that was heard."""
     blocked = replace(SCENE, room={**SCENE.room, "boxes_m": [[[2.6, 0, 0], [3.0, 4.0, 3]]]})
-    direct = Effects(**{**vars(MIRROR), "specular": False, "depth": 0})
+    direct = PropagationEffects(**{**vars(MIRROR), "specular": False, "depth": 0})
     made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").made
     data = load({"name": "sionna", "file": str(tmp_path / "box.h5"), "target": "rssi"})
     heard = made.power > 0
@@ -130,7 +130,9 @@ def test_one_outlier_does_not_say_how_weak_places_without_a_path_are():
 
 def test_noise_is_as_loud_as_said(tmp_path):
     simulate(plan(), tmp_path / "clean.h5")
-    simulate(plan(effects=Effects(**{**vars(MIRROR), "noise_snr_db": 20.0})), tmp_path / "noisy.h5")
+    simulate(
+        plan(effects=PropagationEffects(**{**vars(MIRROR), "noise_snr_db": 20.0})), tmp_path / "noisy.h5"
+    )
     clean, noisy = (arrays(tmp_path / f"{name}.h5")[0]["csi"] for name in ("clean", "noisy"))
     ratio = 10 * np.log10(np.mean(np.abs(clean) ** 2) / np.mean(np.abs(noisy - clean) ** 2))
     assert ratio == pytest.approx(20, abs=1.5)
@@ -183,7 +185,7 @@ MASTS = [{"name": "a", "position_m": [1.0, 1.5, 2.6]}, {"name": "b", "position_m
 def test_several_transmitters_are_stations_and_every_pair_is_there_once(tmp_path, monkeypatch):
     """Killed and gone on with; a place is tested on with all transmitters or with none."""
     several = replace(SCENE, transmitter_m=None, transmitters=MASTS)
-    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=3))
+    asked = AutoSettings(probes=16, held_back=20, full=PropagationEffects(depth=3))
     real, left = ShoeboxEngine.trace, [5]
 
     def dies(self, receivers, *rest, **named):
@@ -251,7 +253,7 @@ def test_a_kill_amid_the_removal_leaves_no_shards_without_their_plan(tmp_path, m
         with pytest.raises(KeyboardInterrupt):
             simulate(plan(), tmp_path / "box.h5")
     (tmp_path / "box.h5").unlink()
-    simulate(plan(csi=CsiSettings(rows=2, columns=2)), tmp_path / "box.h5")
+    simulate(plan(csi=ArraySettings(rows=2, columns=2)), tmp_path / "box.h5")
     assert arrays(tmp_path / "box.h5")[0]["csi"].shape[1:] == (4, 4)
     assert {path.name for path in tmp_path.iterdir()} == {"box.h5"}
 
@@ -264,7 +266,7 @@ def test_an_existing_file_is_not_overwritten(tmp_path):
 
 
 def test_auto_decides_once_verifies_and_is_drawn(tmp_path):
-    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
+    asked = AutoSettings(probes=16, held_back=20, full=PropagationEffects(depth=4))
     outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
     choice = outcome.choice
     assert choice is not None and choice.verdict is not None and choice.verdict.kept
@@ -288,7 +290,7 @@ def test_probes_are_rows_of_the_file_and_a_decision_is_kept(tmp_path, monkeypatc
         return real(self, receivers, effects, seed)
 
     monkeypatch.setattr(ShoeboxEngine, "trace", counts)
-    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
+    asked = AutoSettings(probes=16, held_back=20, full=PropagationEffects(depth=4))
     first = simulate(plan(effects=asked), tmp_path / "first.h5")
     assert sum(count for count, _ in traced) == 60 and first.effects.depth < 4
     chosen, _ = arrays(tmp_path / "first.h5")
@@ -371,7 +373,7 @@ def test_a_decision_that_left_rays_untried_is_taken_anew_where_trying_pays(tmp_p
 
 def test_what_held_back_receivers_refute_is_not_simulated(tmp_path, monkeypatch):
     """A run said NOT MET, simulated the choice all the same, and the next set of receivers took it over."""
-    real, full = deciding.auto.verify, Effects(**{**vars(MIRROR), "depth": 4})
+    real, full = deciding.auto.verify, PropagationEffects(**{**vars(MIRROR), "depth": 4})
 
     def refuted(*arguments):
         choice = real(*arguments)
@@ -387,13 +389,13 @@ def test_what_held_back_receivers_refute_is_not_simulated(tmp_path, monkeypatch)
 
 
 def test_where_few_are_left_everything_is_kept(tmp_path):
-    asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
+    asked = AutoSettings(probes=60, held_back=60, full=PropagationEffects(depth=4))
     outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
     assert outcome.effects.depth == 4 and outcome.choice.effects.depth < 4
 
 
 def test_a_decision_taken_over_simulates_everything_where_few_rows_are_asked(tmp_path, monkeypatch):
-    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
+    asked = AutoSettings(probes=16, held_back=20, full=PropagationEffects(depth=4))
     simulate(plan(effects=asked, shard=60), tmp_path / "first.h5")
     monkeypatch.setattr(deciding, "pays", lambda choice, rows, saved: rows > 60)
     few = simulate(plan(effects=asked), tmp_path / "few.h5")
@@ -404,7 +406,7 @@ def test_a_decision_taken_over_simulates_everything_where_few_rows_are_asked(tmp
 
 def test_a_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path, monkeypatch):
     """The shard of a decision nobody had noted stayed, beside rows of the decision taken instead of it."""
-    asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
+    asked = AutoSettings(probes=60, held_back=60, full=PropagationEffects(depth=4))
 
     def dies(*unused):
         raise KeyboardInterrupt
@@ -426,7 +428,7 @@ def put_together(out: Path, receivers: int) -> int:
     asked = plan(
         scene=replace(SCENE, num_receivers=receivers), effects=replace(MIRROR, noise_snr_db=20.0),
         spectrum=replace(SMALL, height=45, width=90, normalisation="none"),
-        csi=CsiSettings(rows=4, columns=4), weakest_db=6.0,
+        csi=ArraySettings(rows=4, columns=4), weakest_db=6.0,
     )  # fmt: skip
     survey, shards = build(asked.scene, asked.sampling), Shards(out, {"receivers": receivers})
     wavelength = survey.engine.wavelength

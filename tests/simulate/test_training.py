@@ -13,7 +13,7 @@ from gsparc.data.datasets.sionna import with_true_targets
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.simulate.campaign import simulate
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.scenes.build import SceneSettings
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -23,7 +23,7 @@ SCENE = SceneSettings(
     num_receivers=70, carrier_hz=2.4e9, bandwidth_hz=80e6, subcarriers=4,
     room={"size_m": [6, 5, 3], "reflection": -0.5},
 )  # fmt: skip
-MIRROR = Effects(
+MIRROR = PropagationEffects(
     refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
 )
 SEARCH = [
