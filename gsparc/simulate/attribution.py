@@ -1,4 +1,4 @@
-"""Contribution of each effect at each receiver, from the interaction record of one full simulation.
+"""Contribution of each propagation effect at each receiver, from the interactions of one full simulation.
 
 Nothing is traced again: without an effect the solver draws other rays, and the difference would include
 the solver's noise.
@@ -20,6 +20,7 @@ from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
 SILENCE_DB = 99.0  # error of a receiver that loses everything
 REQUIREMENT = re.compile(r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE)
+DEFAULTS = {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}  # where the text gives no number
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,11 @@ class Deliverable:
             expected = "'coverage +-1 dB', 'csi -20 dB' or 'spectrum skill 0.9'"
             raise ValueError(f"effects.deliverable={text!r}: expected {expected}")
         kind = found[1].lower()
-        number = float(found[2] or {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}[kind])
-        if kind == "coverage":
-            return Deliverable("coverage", abs(number), quantile)
-        if kind == "csi":
-            return Deliverable("csi", -abs(number), quantile)
-        if not 0 < number < 1:
+        number = float(found[2] or DEFAULTS[kind])
+        if kind == "spectrum" and not 0 < number < 1:
             raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
-        return Deliverable("spectrum", round(1 - number, 6), quantile)
+        tolerance = {"coverage": abs(number), "csi": -abs(number), "spectrum": round(1 - number, 6)}[kind]
+        return Deliverable(kind, tolerance, quantile)
 
     def __str__(self) -> str:
         share = f"for {self.quantile:.0%} of the receivers"
@@ -93,17 +91,18 @@ class Probe:
     def _kinds(self) -> tuple[np.ndarray, np.ndarray]:
         """Kinds of paths, by interactions and order (C, 2), and the kind (P,) of each path.
 
-        Every question sums over kinds: paths are gone through once, however many sets of effects are asked.
+        Sums over kinds serve every set of effects: paths are gone through once.
         """
         kinds = np.stack([self.paths.mechanisms, self.paths.order], axis=1)
-        return np.unique(kinds, axis=0, return_inverse=True)
+        unique, which = np.unique(kinds, axis=0, return_inverse=True)
+        return unique, which.reshape(-1)
 
     @cached_property
     def _power(self) -> np.ndarray:
         """(ports, C, R)."""
         kinds, which = self._kinds
         power, count = np.abs(self.paths.gain.astype(np.complex128)) ** 2, len(self.paths)
-        cell = which.reshape(-1) * count + self.paths.owner
+        cell = which * count + self.paths.owner
         return np.stack([
             np.bincount(cell, weights=one, minlength=len(kinds) * count).reshape(-1, count) for one in power.T
         ])  # fmt: skip
@@ -112,9 +111,7 @@ class Probe:
     def _channels(self) -> np.ndarray:
         """(C, R, ports x M, K)."""
         kinds, which = self._kinds
-        parts = (self.paths.select(which.reshape(-1) == i) for i in range(len(kinds)))
-        asked = self.frequency_hz, self.elements, self.wavelength
-        return np.stack([part.responses(*asked) for part in parts])
+        return np.stack([self._responses(self.paths.select(which == kind)) for kind in range(len(kinds))])
 
     @cached_property
     def _images(self) -> tuple[np.ndarray, np.ndarray]:
@@ -139,16 +136,16 @@ class Probe:
             rest = kept.received_power()
         else:
             ports = len(self._power) if kept.polarisation else 1
-            rest = self._power[:ports, self._allowed(kept)].sum((0, 1))
+            rest = self._power[:ports, kept.allows(*self._kinds[0].T)].sum((0, 1))
         return 1 - rest / np.where(full > 0, full, 1)
 
     def nmse(self, kept: PropagationEffects | Paths) -> np.ndarray:
         """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
         full = self._channels.sum(0)
         if isinstance(kept, Paths):
-            rest = kept.responses(self.frequency_hz, self.elements, self.wavelength)
+            rest = self._responses(kept)
         else:
-            rest = self._channels[self._allowed(kept)].sum(0)
+            rest = self._channels[kept.allows(*self._kinds[0].T)].sum(0)
             rest = rest if kept.polarisation else rest[:, : len(self.elements)]
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
@@ -157,21 +154,19 @@ class Probe:
 
     def errors(self, kept: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
         """The deliverable's error at each receiver (R,), in the unit of its tolerance."""
+        least = 10 ** (-SILENCE_DB / 10)
         if deliverable.kind == "coverage":
-            remains = np.maximum(1 - self.shares(kept), 10 ** (-SILENCE_DB / 10))
-            return np.abs(10 * np.log10(remains))
+            return np.abs(10 * np.log10(np.maximum(1 - self.shares(kept), least)))
         if deliverable.kind == "csi":
-            return 10 * np.log10(np.maximum(self.nmse(kept), 10 ** (-SILENCE_DB / 10)))
+            return 10 * np.log10(np.maximum(self.nmse(kept), least))
         full, near = self._images
-        if isinstance(kept, PropagationEffects):
-            left = full if kept == self.effects else self._render(self.paths.under(kept))
-        else:
-            left = self._render(kept)
-        error, rival = (((image - full) ** 2).mean((1, 2)) for image in (left, near))
-        return error / np.maximum(rival, 1e-12)
+        rest = kept if isinstance(kept, Paths) else self.paths.under(kept)
+        image = full if kept == self.effects else self._render(rest)
+        error, nearest = (((other - full) ** 2).mean((1, 2)) for other in (image, near))
+        return error / np.maximum(nearest, 1e-12)
 
-    def _allowed(self, kept: PropagationEffects) -> np.ndarray:
-        return kept.allows(*self._kinds[0].T)
+    def _responses(self, paths: Paths) -> np.ndarray:
+        return paths.responses(self.frequency_hz, self.elements, self.wavelength)
 
     def _render(self, paths: Paths) -> np.ndarray:
         return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
@@ -179,28 +174,23 @@ class Probe:
 
 def removals(full: PropagationEffects) -> dict[str, PropagationEffects]:
     """What can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation."""
-    found = {name: less for name in full.on if (less := _without(full, name)) is not None}
-    found |= {f"depth > {depth}": replace(full, depth=depth) for depth in range(full.depth - 1, 0, -1)}
-    if full.polarisation:
-        found["polarisation"] = replace(full, polarisation=False)
-    return found
+    names = [*full.on, *(f"depth > {depth}" for depth in range(full.depth - 1, 0, -1))]
+    names += ["polarisation"] if full.polarisation else []
+    return {name: less for name in names if (less := _without(full, name)) is not None}
 
 
 def combinations(full: PropagationEffects, removable: tuple[str, ...]) -> list[PropagationEffects]:
     """Every set of switches that leaves out some of `removable` (names as in `removals`); `full` first."""
     sets = {full}
     for name in removable:
-        if name.startswith("depth > "):
-            sets |= {replace(s, depth=min(s.depth, int(name[8:]))) for s in sets}
-        elif name == "polarisation":
-            sets |= {replace(s, polarisation=False) for s in sets}
-        else:
-            sets |= {less for less in (_without(s, name) for s in sets) if less is not None}
+        sets |= {less for less in (_without(one, name) for one in sets) if less is not None}
     return sorted(sets, key=lambda s: (len(full.on) - len(s.on), full.depth - s.depth, not s.polarisation))
 
 
 def _without(effects: PropagationEffects, name: str) -> PropagationEffects | None:
     """None when nothing would be left."""
+    if name.startswith("depth > "):
+        return replace(effects, depth=min(effects.depth, int(name[8:])))
     try:
         return effects.without(name)
     except ValueError:

@@ -19,6 +19,7 @@ import numpy as np
 from gsparc.data.files import whole_file
 
 ROWS = "rows"  # of a shard: which rows of the dataset it holds
+NOTE = "choice.json"
 
 
 class Shards:
@@ -45,13 +46,13 @@ class Shards:
         if not stored.exists():
             _write(stored, self.plan)
 
-    def write_note(self, name: str, content: Mapping[str, Any]) -> None:
+    def write_note(self, content: Mapping[str, Any]) -> None:
         """Store a decision, so that a resumed run does not decide again."""
-        _write(self.folder / f"{name}.json", json.dumps(content, indent=1))
+        _write(self.folder / NOTE, json.dumps(content, indent=1))
 
-    def read_note(self, name: str) -> dict[str, Any] | None:
+    def read_note(self) -> dict[str, Any] | None:
         """The stored decision, or None."""
-        path = self.folder / f"{name}.json"
+        path = self.folder / NOTE
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     @property

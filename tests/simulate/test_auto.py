@@ -60,7 +60,7 @@ def decided(deliverable, record=RECORD):
                   small, engine.trace(receivers + 1, FULL))  # fmt: skip
     settings = AutoSettings(deliverable=deliverable, probes=20, held_back=20, full=FULL)
     choice = auto.decide(probe, settings, lambda p: {"diffuse": "smooth"})
-    return auto.verify(choice, settings, probe)
+    return auto.verify(choice, settings, probe.errors(choice.effects, settings.required))
 
 
 def test_words_become_a_deliverable():
@@ -183,7 +183,8 @@ def test_a_violated_requirement_is_reported():
     choice = decided("coverage +-1 dB")
     other = Invented([(0, 0, 1.0), (DIFFRACTION, 1, 3.0)]).trace(np.zeros((30, 3)), FULL)
     probe = Probe(other, FULL, np.array([2.4e9]), 0.125, np.zeros((1, 3)), SpectrumSettings())
-    verdict = auto.verify(choice, AutoSettings(), probe).verdict
+    errors = probe.errors(choice.effects, AutoSettings().required)
+    verdict = auto.verify(choice, AutoSettings(), errors).verdict
     assert verdict is not None and not verdict.kept and verdict.met == 0.0
 
 
