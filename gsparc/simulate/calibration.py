@@ -74,11 +74,10 @@ class Calibration:
 
 def used_materials(tracer: RayTracer) -> dict[str, Material]:
     """Materials of the scene's surfaces, as the tracer has them."""
-    return {name: _read(one) for name, one in sorted(tracer.surfaces().items())}
-
-
-def _read(material: Any) -> Material:
-    return Material(float(material.relative_permittivity[0]), float(material.conductivity[0]))
+    return {
+        name: Material(float(one.relative_permittivity[0]), float(one.conductivity[0]))
+        for name, one in sorted(tracer.surfaces().items())
+    }
 
 
 def apply(tracer: RayTracer, materials: Mapping[str, Material]) -> None:

@@ -30,6 +30,16 @@ class Paths:
     mechanisms: np.ndarray
     order: np.ndarray
 
+    @staticmethod
+    def of(
+        receivers: int, owner: np.ndarray, gain: np.ndarray, delay: np.ndarray, direction: np.ndarray,
+        mechanisms: np.ndarray, order: np.ndarray,
+    ) -> Paths:  # fmt: skip
+        """Of paths in any order; `owner` (P,) is the receiver of each, the rest as of this class."""
+        rank = np.lexsort((delay, owner))
+        offsets = starts(np.bincount(owner, minlength=receivers))
+        return Paths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
+
     def __len__(self) -> int:
         return len(self.offsets) - 1
 

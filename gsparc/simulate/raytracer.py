@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +23,7 @@ import torch
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, PropagationEffects
-from gsparc.simulate.paths import ARRAYS, Paths, join
+from gsparc.simulate.paths import Paths, join
 from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
@@ -291,7 +291,7 @@ class RayTracer(Engine):
 
     def triangles(self) -> np.ndarray:
         """(n, 3, 3) [m] of all objects."""
-        return np.concatenate([corners for corners in self._objects().values()])
+        return np.concatenate([*self._objects().values()])
 
     def box(self) -> np.ndarray:
         """(2, 3) lower and upper corner of everything [m]."""
@@ -328,13 +328,13 @@ class RayTracer(Engine):
         return height, (hit.shape == shape).numpy()
 
     def _ground(self) -> str | None:
-        widest, size = None, 0.0
+        level = {}  # area of each object that is mostly level
         for name, corners in self._objects().items():
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            level, area = np.abs(normal[:, 2]).sum(), np.linalg.norm(normal, axis=1).sum()
-            if level > GROUND_LEVEL * area and level > size:
-                widest, size = name, float(level)
-        return widest
+            size = float(np.abs(normal[:, 2]).sum())
+            if size > GROUND_LEVEL * np.linalg.norm(normal, axis=1).sum():
+                level[name] = size
+        return max(level, key=level.__getitem__, default=None)
 
     def has_open_sky(self, area: np.ndarray) -> bool:
         """Whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low."""
@@ -393,27 +393,24 @@ def _collect(found: Any, receivers: int) -> Paths:
     if len(sight) and sight.max() > 1:
         row = int(sight.argmax())
         raise RuntimeError(f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true")
-    rank = np.lexsort((delay, owner))
-    offsets = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=receivers))])
-    arrays: Mapping[str, np.ndarray] = {
-        "gain": gain, "delay": delay, "direction": direction, "mechanisms": mechanisms, "order": order
-    }  # fmt: skip
-    return Paths(offsets, *(arrays[name][rank] for name in ARRAYS))
+    return Paths.of(receivers, owner, gain, delay, direction, mechanisms, order)
 
 
 def _load(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None) -> Any:
     import sionna.rt as rt
+
+    def scatters(itu: str) -> float:
+        return MATERIALS.get(itu, OTHERS)[1] if scattering is None else scattering
 
     if isinstance(source, (str, Path)):
         scene = _load_file(source)
         for material in scene.radio_materials.values():
             # Built-in scenes come with 0: diffuse reflection would silently contribute nothing.
             if float(material.scattering_coefficient[0]) == 0.0:
-                usual = MATERIALS.get(getattr(material, "itu_type", None) or "", OTHERS)[1]
-                material.scattering_coefficient = usual if scattering is None else scattering
+                material.scattering_coefficient = scatters(getattr(material, "itu_type", None) or "")
     else:
         scene = rt.load_scene()
-        _add(scene, source, scattering)
+        _add(scene, source, scatters)
     scene.frequency = float(carrier_hz)
     return scene
 
@@ -436,16 +433,16 @@ def _load_file(source: str | Path) -> Any:
     return rt.load_scene(getattr(rt.scene, str(source)))
 
 
-def _add(scene: Any, solids: Sequence[Solid], scattering: float | None) -> None:
+def _add(scene: Any, solids: Sequence[Solid], scatters: Callable[[str], float]) -> None:
     import mitsuba as mi
     import sionna.rt as rt
 
-    materials = {}
-    for name in sorted({solid.material for solid in solids}):
-        thickness, usual = MATERIALS.get(name, OTHERS)
-        materials[name] = rt.ITURadioMaterial(
-            f"itu-{name}", name, thickness, scattering_coefficient=usual if scattering is None else scattering
+    materials = {
+        name: rt.ITURadioMaterial(
+            f"itu-{name}", name, MATERIALS.get(name, OTHERS)[0], scattering_coefficient=scatters(name)
         )
+        for name in sorted({solid.material for solid in solids})
+    }
     objects = []
     for solid in solids:
         mesh = mi.Mesh(solid.name, vertex_count=len(solid.vertices), face_count=len(solid.faces))

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.effects import SPECULAR, PropagationEffects
-from gsparc.simulate.paths import Paths, starts
+from gsparc.simulate.paths import Paths
 from gsparc.simulate.survey import Engine
 
 WALLS = ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")
@@ -251,22 +251,16 @@ class ShoeboxEngine(Engine):
         seen = visible(self.room, mirrored, self.transmitter[None], receivers)
         if not effects.line_of_sight:
             seen[:, mirrored.order == 0] = False
-        way = mirrored.of(self.transmitter) - receivers[:, None]
+        owner, image = np.nonzero(seen)
+        way = mirrored.of(self.transmitter)[image] - receivers[owner]
         distance = np.linalg.norm(way, axis=-1)
-        delay = np.where(seen, distance / LIGHT, np.inf)
-        rank = np.argsort(delay, axis=1, kind="stable")
-        rows = np.arange(len(receivers))[:, None]
-        kept = seen[rows, rank]
-        gain = (mirrored.gain * self.wavelength / (4 * np.pi * distance))[rows, rank][kept]
-        order = np.broadcast_to(mirrored.order, seen.shape)[rows, rank][kept].astype(np.uint8)
-        return Paths(
-            starts(seen.sum(1)),
-            gain[:, None].astype(np.complex64),
-            delay[rows, rank][kept],
-            (way / distance[..., None])[rows, rank][kept].astype(np.float32),
-            np.where(order > 0, SPECULAR, 0).astype(np.uint8),
+        gain = mirrored.gain[image] * self.wavelength / (4 * np.pi * distance)
+        order = mirrored.order[image].astype(np.uint8)
+        return Paths.of(
+            len(receivers), owner, gain[:, None].astype(np.complex64), distance / LIGHT,
+            (way / distance[:, None]).astype(np.float32), np.where(order > 0, SPECULAR, 0).astype(np.uint8),
             order,
-        )
+        )  # fmt: skip
 
     def fingerprint(self) -> str:
         """Of the room."""

@@ -74,6 +74,10 @@ class Rays:
     delay: np.ndarray
     direction: np.ndarray
 
+    def at(self, users: np.ndarray) -> Rays:
+        """Those of some users (n,)."""
+        return Rays(self.gain[users], self.delay[users], self.direction[users])
+
     def response(self, array: np.ndarray, carrier_hz: float, frequency_hz: np.ndarray) -> np.ndarray:
         """Channels (U, A, K) complex128 at frequencies (K,) [Hz] of elements (A, 3) [m] about the base."""
         steering = np.exp(2j * np.pi * carrier_hz / LIGHT * (self.direction @ array.T))  # (U, P, A)

@@ -11,10 +11,8 @@ import numpy as np
 import torch
 
 from gsparc.locate.calibration import calibrated
-from gsparc.locate.cells import Cells
-from gsparc.locate.fingerprints.field import FingerprintField, learn
-from gsparc.locate.fingerprints.floors import cover_floors
-from gsparc.locate.fingerprints.likelihood import Levels, misfit
+from gsparc.locate.cells import Cells, cover_floors
+from gsparc.locate.fingerprints.field import FingerprintField, Levels, learn, misfit
 from gsparc.locate.fingerprints.rows import Fingerprints, How, parted
 from gsparc.locate.likelihood import Trust
 from gsparc.locate.locator import HELD_OUT, Located

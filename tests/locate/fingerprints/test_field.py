@@ -11,8 +11,7 @@ from access_points import invented
 from releases import real
 from scipy.stats import multivariate_normal
 
-from gsparc.locate.fingerprints.field import FingerprintField, learn
-from gsparc.locate.fingerprints.likelihood import HEARING, Levels, misfit
+from gsparc.locate.fingerprints.field import HEARING, FingerprintField, Levels, learn, misfit
 from gsparc.locate.fingerprints.rows import parted, read_fingerprints
 
 NAN = float("nan")

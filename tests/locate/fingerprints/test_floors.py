@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.locate.fingerprints.floors import MARGIN_M, cover_floors, floors
+from gsparc.locate.cells import MARGIN_M, cover_floors, floors
 
 
 def building(count: int = 300) -> np.ndarray:
