@@ -327,6 +327,10 @@ class RayTracer(Engine):
         shape = mi.ShapePtr(self.scene.objects[ground].mi_mesh)
         return height, (hit.shape == shape).numpy()
 
+    def height(self, across: np.ndarray) -> np.ndarray:
+        """Of the highest surface (n,) [m] at places (n, 2) [m], -inf where there is none."""
+        return self.surface(across)[0]
+
     def _ground(self) -> str | None:
         level = {}  # area of each object that is mostly level
         for name, corners in self._objects().items():
@@ -339,7 +343,7 @@ class RayTracer(Engine):
     def has_open_sky(self, area: np.ndarray) -> bool:
         """Whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low."""
         low, top = self.box()[:, 2]
-        height = self.surface(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))[0]
+        height = self.height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
         return bool((height[np.isfinite(height)] < (low + top) / 2).mean() > 0.05)
 
     def _hit(self, points: np.ndarray, direction: np.ndarray) -> Any:

@@ -60,7 +60,7 @@ def places():
     return place(60, np.array(CONFERENCE.area_m), CONFERENCE.height_m, clear_of(conference_room()), seed=0)
 
 
-def test_one_thread_gives_the_same_bits_twice():
+def test_one_thread_is_deterministic():
     """Of several threads the faster one's candidate stays: a hundredth of receivers differed by rounding."""
     where = place(800, np.array(CONFERENCE.area_m), CONFERENCE.height_m, clear_of(conference_room()), seed=0)
     before = torch.get_num_threads()
@@ -90,7 +90,7 @@ def test_line_of_sight_is_friis(room, places):
     np.testing.assert_allclose(paths.direction, towards, atol=1e-4)
 
 
-def test_our_channels_are_the_solvers_own(room, places):
+def test_channels_are_the_solver_s(room, places):
     """Carrier phase and all: `paths.cfr` with absolute delays."""
     import mitsuba as mi
 
@@ -120,7 +120,7 @@ def test_attribution_equals_a_run_without(room, places):
     assert set(np.unique(whole.mechanisms)) <= {0, BITS["specular"], BITS["refraction"], 5}
 
 
-def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
+def test_cut_off_paths_are_traced_again(places, monkeypatch):
     """The solver shares its limit among receivers and drops the rest without a word."""
     enough = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK).trace(places[:20], PLAIN)
     monkeypatch.setattr(raytracer, "CANDIDATES_PER_RECEIVER", 4)
@@ -134,7 +134,7 @@ def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
     assert starved.retried == tries  # the buffer stays enlarged
 
 
-def test_chains_do_not_cost_each_other_their_place(places):
+def test_chains_share_no_hash(places):
     """All chains of a call share a hash table: with edges on, a tenth of the paths was lost, and single
     reflections, which every seed finds, differed by 2e-3 for 60 receivers and 3e-2 for 100."""
     room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, Sampling(samples=100_000, batch=100))
@@ -184,7 +184,7 @@ def test_polarisation_edges_and_scattering_are_recorded(room, places):
     assert (paths.order[paths.mechanisms == 0] == 0).all() and paths.order.max() == 2
 
 
-def test_receivers_keep_out_of_things():
+def test_receivers_keep_out_of_objects():
     solids = conference_room()
     places = place(2000, np.array(CONFERENCE.area_m), (0.1, 2.0), clear_of(solids), seed=1)
     for solid in solids:
@@ -194,7 +194,7 @@ def test_receivers_keep_out_of_things():
     assert (places > 0).all() and (places < SIZE).all()
 
 
-def test_built_in_materials_are_completed_and_receivers_are_outdoors():
+def test_shipped_materials_scatter_and_receivers_are_outdoors():
     canyon = SceneSettings(
         name="canyon", builtin="simple_street_canyon", transmitter_m=(-33, 0, 12), height_m=(1.2, 1.8),
         area_m=((-60, -45), (60, 45)), num_receivers=30, carrier_hz=3.5e9, bandwidth_hz=100e6, subcarriers=4,
@@ -210,7 +210,7 @@ def test_built_in_materials_are_completed_and_receivers_are_outdoors():
         build(replace(canyon, builtin="muenchen"), QUICK)
 
 
-def test_a_shipped_scene_needs_no_more_than_its_name():
+def test_shipped_scene_needs_only_its_name():
     """Area, transmitter and sky are found; materials scatter; nobody stands on roofs."""
     city = from_config({**settings("etoile"), "num_receivers": 30})
     survey = build(city, QUICK)
@@ -226,7 +226,7 @@ def test_a_shipped_scene_needs_no_more_than_its_name():
     )
 
 
-def test_a_town_off_a_map_with_sectors_in_degrees(tmp_path):
+def test_town_with_sectors_in_degrees(tmp_path):
     """The sector that looks at receivers is heard best there; files of maps carry degrees."""
     pytest.importorskip("osmnx", reason="osmnx is not installed: make sionna")
     masts = [{"name": "m", "position_m": [0, 11], "height_m": 20, "sectors": 3, "downtilt_deg": 10}]
@@ -246,7 +246,7 @@ def test_a_town_off_a_map_with_sectors_in_degrees(tmp_path):
     assert np.ptp(latitude) < 0.003 and abs(np.median(longitude) + 30) < 0.001
 
 
-def test_a_scene_of_ones_own_by_path(tmp_path):
+def test_scene_file_of_the_user(tmp_path):
     import sionna.rt as rt
 
     own = replace(CONFERENCE, builder=None, xml=str(rt.scene.floor_wall), area_m=((-3, -3), (3, 3)),
@@ -277,7 +277,7 @@ def test_auto_in_the_conference_room(tmp_path):
     assert spectra.site.convergence_error == pytest.approx(outcome.convergence.spectrum_nmse)
 
 
-def test_killed_by_the_system_and_resumed(tmp_path):
+def test_killed_run_is_resumed(tmp_path):
     """SIGKILL between shards of two transmitters: nothing finished is lost, every pair is made once."""
     out = tmp_path / "room.h5"
     command = [

@@ -26,12 +26,7 @@ SCENE = SceneSettings(
 MIRROR = PropagationEffects(
     refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
 )
-SEARCH = [
-    "model.search.sources=9",
-    "model.search.rows=30",
-    "model.search.candidates=1000",
-    "model.search.steps=5",
-]
+SEARCH = [f"model.search.{setting}" for setting in ("sources=9", "rows=30", "candidates=1000", "steps=5")]
 ROAD = {"spectrum": ["experiment=sionna", *SEARCH], "csi": ["dataset=sionna", "model=complex_gp"]}
 
 
@@ -46,7 +41,7 @@ def box(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", ROAD)
-def test_a_simulation_with_fewer_effects_is_tested_on_the_full_one(kind, box, tmp_path):
+def test_fewer_effects_are_tested_on_the_full_simulation(kind, box, tmp_path):
     simulate(Campaign(SCENE, dataclasses.replace(MIRROR, depth=0), spectrum=SPECTRUM), tmp_path / "los.h5")
     alone, whole = (
         load({"name": "sionna", "file": str(path), "target": kind}) for path in (tmp_path / "los.h5", box)
@@ -69,7 +64,7 @@ def test_a_simulation_with_fewer_effects_is_tested_on_the_full_one(kind, box, tm
         with_true_targets(alone, dataclasses.replace(whole, release_split=None), "dataset.truth=x")
 
 
-def test_what_the_truth_hears_is_tested_though_the_training_file_heard_nothing(box):
+def test_outages_are_the_truth_s(box):
     whole = load({"name": "sionna", "file": str(box), "target": "rssi"})
     test = whole.release_split[1]
     deaf = np.zeros(len(whole), bool)
@@ -82,7 +77,7 @@ def test_what_the_truth_hears_is_tested_though_the_training_file_heard_nothing(b
 
 
 @pytest.mark.parametrize("kind", ROAD)
-def test_a_simulated_dataset_is_trained_and_compared_like_any_other(kind, box, tmp_path):
+def test_simulated_dataset_is_trained_like_any_other(kind, box, tmp_path):
     settings = [*ROAD[kind], f"dataset.file={box}", f"dataset.target={kind}", "threads=1", "logger=none"]
     facts, objects = train(compose(*settings), tmp_path / "run")
     stored = json.loads((tmp_path / "run" / "summary.json").read_text())
