@@ -109,13 +109,13 @@ class Locator:
     def locate(self, heard: Snapshots) -> list[Located]:
         """Each of n snapshots on its own."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
-        found = []
+        results = []
         for number in range(len(heard)):
             started = time.perf_counter()
             posterior = self.look(heard.at(np.array([number]))).by(self.trust)
-            one = Located.of(posterior, self.trust.level, posterior.peak())
-            found.append(replace(one, seconds=time.perf_counter() - started))
-        return found
+            located = Located.of(posterior, self.trust.level, posterior.peak())
+            results.append(replace(located, seconds=time.perf_counter() - started))
+        return results
 
 
 def trusted(
@@ -136,21 +136,23 @@ def trusted(
     """
     groups: list[tuple[Locator, Snapshots]] = []
     rng = np.random.default_rng(context.seed)
-    cut = cut_inside(data, fold, context.split, folds, context.seed).folds
-    for number, inner in enumerate(cut):
-        log.info("group %d of %d: trained without %d rows", number + 1, len(cut), len(inner.test))
+    inner_folds = cut_inside(data, fold, context.split, folds, context.seed).folds
+    for number, inner in enumerate(inner_folds):
+        log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
         method = for_links(make, data)
         method.fit(data, inner, context.within(f"group{number}"))
-        known = np.union1d(inner.train, inner.val)
-        own = Locator.of(method, data, known, locator.unknown, locator.trust, cells, locator.share)
+        rows = np.union1d(inner.train, inner.val)
+        without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)
-        chosen = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        groups.append((own, heard.at(chosen)))
+        drawn = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
+        groups.append((without, heard.at(drawn)))
     places = np.concatenate([heard.place for _, heard in groups])
 
     def looks(trust: Trust) -> list[Looked]:
         return [
-            own.look(heard.at(np.array([row])), trust) for own, heard in groups for row in range(len(heard))
+            without.look(heard.at(np.array([row])), trust)
+            for without, heard in groups
+            for row in range(len(heard))
         ]
 
     trust = calibrated(looks(locator.trust), places, locator.share, locator.trust)
@@ -171,17 +173,17 @@ def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
     Raises:
         ValueError: it was learned for other settings.
     """
-    found = extra.get(KEY)
-    if found is None:
+    stored = extra.get(KEY)
+    if stored is None:
         log.warning("locate: never calibrated, areas are as wide as the model's own variances say")
         return Trust(level=share)
-    before, promised = Unknown(**found["unknown"]), found["share"]
+    before, promised = Unknown(**stored["unknown"]), stored["share"]
     if (before, promised) != (unknown, share):
-        said = f"share={promised}, phase_known={before.phase_known}, offset_db={before.offset_db}"
+        settings = f"share={promised}, phase_known={before.phase_known}, offset_db={before.offset_db}"
         raise ValueError(
-            f"the model was calibrated with {said}: `gsparc locate` calibrates it for other settings"
+            f"the model was calibrated with {settings}: `gsparc locate` calibrates it for other settings"
         )
-    return Trust(**found["trust"])
+    return Trust(**stored["trust"])
 
 
 def in_world(located: Located, origin: np.ndarray) -> Located:

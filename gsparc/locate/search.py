@@ -66,23 +66,23 @@ def looked(
         of_coarse: its misfit at these.
         unknown, trust: see there.
     """
-    cells, found = coarse, of_coarse
+    cells, current = coarse, of_coarse
     for _ in range(LEVELS):
-        some = likeliest(_log_density(found, cells, trust), cells.size, KEPT)
-        wide = cells.edge[some].max(1)
-        some, wide = some[wide > trust.spread], wide[wide > trust.spread]
-        if not len(some) or (len(some) >= ENOUGH and wide.max() < 1.01 * wide.min()):
+        likely = likeliest(_log_density(current, cells, trust), cells.size, KEPT)
+        wide = cells.edge[likely].max(1)
+        likely, wide = likely[wide > trust.spread], wide[wide > trust.spread]
+        if not len(likely) or (len(likely) >= ENOUGH and wide.max() < 1.01 * wide.min()):
             break
-        chosen = some[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
+        chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
         finer = cells.at(chosen).halved()
         more = misfit(heard, field.at(torch.from_numpy(finer.centre)), unknown)
         rest = np.setdiff1d(np.arange(len(cells)), chosen)
         cells = cells.at(rest).with_others(finer)
-        found = found.at(torch.from_numpy(rest)) + more
-    return Looked(cells, found)
+        current = current.at(torch.from_numpy(rest)) + more
+    return Looked(cells, current)
 
 
-def _log_density(found: Misfit, cells: Cells, trust: Trust) -> np.ndarray:
+def _log_density(misfit: Misfit, cells: Cells, trust: Trust) -> np.ndarray:
     """(G,) of one snapshot, of total mass 1."""
-    log_like, log_size = trust.log_likelihood(found)[0], torch.from_numpy(np.log(cells.size))
+    log_like, log_size = trust.log_likelihood(misfit)[0], torch.from_numpy(np.log(cells.size))
     return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))

@@ -45,12 +45,12 @@ class Deliverable:
         Raises:
             ValueError: none of these.
         """
-        found = REQUIREMENT.fullmatch(text.strip())
-        if not (found and 0 < quantile < 1):
+        match = REQUIREMENT.fullmatch(text.strip())
+        if not (match and 0 < quantile < 1):
             expected = "'coverage +-1 dB', 'csi -20 dB' or 'spectrum skill 0.9'"
             raise ValueError(f"effects.deliverable={text!r}: expected {expected}")
-        kind = found[1].lower()
-        number = float(found[2] or DEFAULTS[kind])
+        kind = match[1].lower()
+        number = float(match[2] or DEFAULTS[kind])
         if kind == "spectrum" and not 0 < number < 1:
             raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
         tolerance = {"coverage": abs(number), "csi": -abs(number), "spectrum": round(1 - number, 6)}[kind]

@@ -289,11 +289,11 @@ def allowed_failures(first: int, all_: int, quantile: float, confidence: float) 
     return int(early), late
 
 
-def price(some: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
-    """Expected time of tracing with `some` and a share of the rays, 1 with everything."""
-    off = [name for name in full.on if name not in some.on]
-    off += ["polarisation"] if full.polarisation and not some.polarisation else []
-    bounces = 1 - BOUNCES + BOUNCES * some.depth / max(full.depth, 1)
+def price(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
+    """Expected time of tracing with some effects and a share of the rays, 1 with everything."""
+    off = [name for name in full.on if name not in effects.on]
+    off += ["polarisation"] if full.polarisation and not effects.polarisation else []
+    bounces = 1 - BOUNCES + BOUNCES * effects.depth / max(full.depth, 1)
     return bounces * math.prod(1 - PRICE[name] for name in off) * (1 - RAYS + RAYS * rays)
 
 
@@ -301,13 +301,13 @@ def _cheapest(
     sets: list[PropagationEffects], holds: Callable[[PropagationEffects], bool], full: PropagationEffects
 ) -> PropagationEffects:
     """The cheapest set that meets the requirement; of sets with similar prices, the smallest."""
-    found: list[PropagationEffects] = []
+    enough: list[PropagationEffects] = []
     for effects in sets:
-        if found and price(effects, full) > (1 + SIMILAR) * price(found[0], full):
+        if enough and price(effects, full) > (1 + SIMILAR) * price(enough[0], full):
             break
         if holds(effects):
-            found.append(effects)
-    return min(found, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
+            enough.append(effects)
+    return min(enough, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
 
 
 def _row(name: str, probe: Probe, less: PropagationEffects | Paths, required: Deliverable) -> EffectRow:

@@ -106,8 +106,8 @@ class Replay:
         self.tracer, self._count = tracer, len(receivers)
         self._parts: list[tuple[dict[str, Any], Any]] = []
         first = 0
-        for found, count in tracer.solutions(receivers, effects):
-            self._parts.append(_kept(tracer, found, effects, first))
+        for solution, count in tracer.solutions(receivers, effects):
+            self._parts.append(_field_arguments(tracer, solution, effects, first))
             first += count
 
     def powers(self) -> np.ndarray:
@@ -145,8 +145,10 @@ class Replay:
         apply(self.tracer, {name: Material.of(pair) for name, pair in materials.items()})  # without gradients
         lost = ~np.isfinite(gradient)
         if lost.any():
-            said = "%d of %d slopes by materials are not finite: these do not move in this step"
-            log.warning(said, int(lost.sum()), len(gradient))
+            log.warning(
+                "%d of %d slopes by materials are not finite: these do not move in this step",
+                int(lost.sum()), len(gradient),
+            )  # fmt: skip
         return value, np.where(lost, 0.0, gradient)
 
     def _powers(self) -> Any:
@@ -169,13 +171,13 @@ class Replay:
         return total
 
 
-def _kept(
-    tracer: RayTracer, found: Any, effects: PropagationEffects, first: int
+def _field_arguments(
+    tracer: RayTracer, solution: Any, effects: PropagationEffects, first: int
 ) -> tuple[dict[str, Any], Any]:
     """Arguments of the field calculator, and the receivers of the paths, from `first` on."""
     import mitsuba as mi
 
-    scene, buffer = tracer.scene, found._paths_buffer
+    scene, buffer = tracer.scene, solution._paths_buffer
     sources, turned, *_ = scene.sources(True, True)
     targets, facing, *_ = scene.targets(True, True)
     arguments = {
@@ -221,13 +223,14 @@ def calibrate(
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal spent, best
         spent += 1
-        held = [0.0, 0.0]
+        gain, scale = 0.0, 0.0
 
         def slopes(level: np.ndarray) -> tuple[float, np.ndarray]:
             # Of largest likelihood gain and scale have no slope: that of the rest is the whole one.
+            nonlocal gain, scale
             missed, by_level = measured_db[reached] - level[reached], np.zeros(len(level))
-            held[:] = gain_and_scale(missed)
-            value, by_level[reached] = student(held[0] - missed, held[1])
+            gain, scale = gain_and_scale(missed)
+            value, by_level[reached] = student(gain - missed, scale)
             return value, by_level
 
         value, by_material = replay.decibels(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
@@ -235,7 +238,7 @@ def calibrate(
         # Of a row: the search begins with a step as long as the gradient.
         value = (value + 0.5 * float(away @ away)) / len(traced)
         if value < best[0]:
-            best = (value, x.copy(), held[0], held[1])
+            best = (value, x.copy(), gain, scale)
         return value, (by_material + away / deviation) / len(traced)
 
     bounds = [(c - RANGE * d, c + RANGE * d) for c, d in zip(centre, deviation, strict=True)]

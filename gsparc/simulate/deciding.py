@@ -312,8 +312,8 @@ class Decider:
 def _until_clear(rows: np.ndarray, judge: Callable[[np.ndarray, bool], Judgement | None]) -> Judgement:
     """What is judged by the first rows, or by all of them where those leave something open."""
     first = auto.first_look(len(rows))
-    found = judge(rows[:first], first == len(rows))
-    if found is None:
-        found = judge(rows, True)
-    assert found is not None  # the last look decides
-    return found
+    judgement = judge(rows[:first], first == len(rows))
+    if judgement is None:
+        judgement = judge(rows, True)
+    assert judgement is not None  # the last look decides
+    return judgement

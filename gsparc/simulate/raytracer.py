@@ -169,9 +169,9 @@ class RayTracer(Engine):
         beneath = np.append(self.transmitter[:2], self._lowest - 1.0)
         parts, first = [], 0
         for count, size in calls(len(receivers), self.sampling.batch):
-            some = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
-            found = self.solutions(some, effects, seed)
-            part = join([_collect(solution, number) for solution, number in found])
+            filled = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
+            solved = self.solutions(filled, effects, seed)
+            part = join([_collect(solution, number) for solution, number in solved])
             parts.append(part.take(np.arange(count)))
             first += count
         return join(parts)
@@ -195,9 +195,9 @@ class RayTracer(Engine):
         # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
         batch = max(self.sampling.batch, len(receivers))
         limit = min(CANDIDATES_PER_RECEIVER * boost * batch, LARGEST_BUFFER)
-        found = self._solve(receivers, effects, seed, limit)
-        if found is not None:
-            yield found, len(receivers)
+        solution = self._solve(receivers, effects, seed, limit)
+        if solution is not None:
+            yield solution, len(receivers)
             return
         self.retried += 1
         if limit < LARGEST_BUFFER:
@@ -233,7 +233,7 @@ class RayTracer(Engine):
             return buffer
 
         solver._candidate_generator = counted
-        found = solver(
+        solution = solver(
             self.scene,
             max_depth=effects.depth,
             samples_per_src=self.sampling.samples,
@@ -246,7 +246,7 @@ class RayTracer(Engine):
             edge_diffraction=effects.edge_diffraction,
             seed=seed,
         )
-        return None if int(stored[-1].numpy().max()) >= limit else found
+        return None if int(stored[-1].numpy().max()) >= limit else solution
 
     def _place_ends(self, receivers: np.ndarray, ports: int) -> None:
         """Place transmitter and receivers in the scene."""
@@ -304,11 +304,11 @@ class RayTracer(Engine):
 
     def _objects(self) -> dict[str, np.ndarray]:
         """Triangles (n, 3, 3) of each object."""
-        found = {}
+        triangles = {}
         for name, thing in self.scene.objects.items():
             vertices = thing.mi_mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
-            found[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
-        return found
+            triangles[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
+        return triangles
 
     def surface(self, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Highest surface (n,) [m] at places (n, 2) [m], -inf where there is none, and whether it is ground.
@@ -361,9 +361,9 @@ def _lattice(points: int) -> Any:
     import drjit as dr
     from sionna.rt.utils.fibonacci import fibonacci_lattice
 
-    found = fibonacci_lattice(points)
-    dr.eval(found)
-    return found
+    lattice = fibonacci_lattice(points)
+    dr.eval(lattice)
+    return lattice
 
 
 def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
@@ -377,9 +377,9 @@ def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
 
 
-def _collect(found: Any, receivers: int) -> Paths:
+def _collect(solution: Any, receivers: int) -> Paths:
     """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest list."""
-    buffer = found._paths_buffer
+    buffer = solution._paths_buffer
     owner = buffer.target_indices.numpy().astype(np.int64)
     gain = np.stack([one[0].numpy() for one in buffer.a], axis=1).astype(np.complex64)
     delay = buffer.tau.numpy().astype(np.float64)

@@ -82,15 +82,15 @@ class Shards:
         """Arrays of `names` (n, ...) at rows (n,), all of them in finished shards; no others are kept."""
         parts = []
         for number in self.numbers():
-            held = self.get(number, ROWS)[ROWS]
-            mine = np.flatnonzero(np.isin(held, rows))
+            stored = self.get(number, ROWS)[ROWS]
+            mine = np.flatnonzero(np.isin(stored, rows))
             if len(mine):
                 shard = self.get(number, *names)
-                parts.append((held[mine], *(shard[name][mine] for name in names)))
-        held, *found = (np.concatenate(one) for one in zip(*parts, strict=True))
-        at = np.argsort(held)
-        at = at[np.searchsorted(held[at], rows)]
-        return [one[at] for one in found]
+                parts.append((stored[mine], *(shard[name][mine] for name in names)))
+        stored, *arrays = (np.concatenate(one) for one in zip(*parts, strict=True))
+        at = np.argsort(stored)
+        at = at[np.searchsorted(stored[at], rows)]
+        return [one[at] for one in arrays]
 
     def remove(self) -> None:
         """After the dataset is written."""

@@ -81,9 +81,9 @@ class FingerprintField:
     def moments(self, places: Tensor) -> Levels:
         """Of places (B, 3) float64 [m]."""
         at = torch.from_numpy(stretched(places.detach().double().numpy(), self.vertical))
-        found = self.process.answer(at)
-        heard, level = (found.mean.unflatten(1, (2, -1)) + self.mean).unbind(1)
-        variance = found.left.float()[:, None] * self.variance
+        answer = self.process.answer(at)
+        heard, level = (answer.mean.unflatten(1, (2, -1)) + self.mean).unbind(1)
+        variance = answer.left.float()[:, None] * self.variance
         return Levels(self.base + above(heard, level), variance, calibrated(heard, self.odds).sigmoid())
 
 
@@ -123,33 +123,33 @@ def learn(
     at = stretched(places, vertical)
     process = given(prior, Values.of(at, outputs), seed)
     del outputs
-    mean, (found, left) = mean.unflatten(0, (2, -1)), process.left_out()
+    mean, (left_out, left) = mean.unflatten(0, (2, -1)), process.left_out()
     place = torch.from_numpy(np.unique(at, axis=0, return_inverse=True)[1].reshape(-1))
-    own, times = torch.zeros(len(base)), heard.sum(0)
+    squares, times = torch.zeros(len(base)), heard.sum(0)
     for rows in torch.arange(len(level)).split(PLACES):
-        said = found[place[rows]].unflatten(1, (2, -1)) + mean
-        error = torch.nan_to_num(level[rows] - base - above(*said.unbind(1)))
-        own += (error.square() / left[place[rows], None].float()).sum(0)
-    common = (own.sum() / times.sum()).clamp_min(LEAST_DB2)
-    variance = (own + PRIOR_ROWS * common) / (times + PRIOR_ROWS)
-    some = torch.from_numpy(np.sort(np.random.default_rng(seed).permutation(len(level))[:ROWS]))
-    odds, sensitivity = hearing(found[place[some], : len(base)] + mean[0], heard[some])
+        predicted = left_out[place[rows]].unflatten(1, (2, -1)) + mean
+        error = torch.nan_to_num(level[rows] - base - above(*predicted.unbind(1)))
+        squares += (error.square() / left[place[rows], None].float()).sum(0)
+    common = (squares.sum() / times.sum()).clamp_min(LEAST_DB2)
+    variance = (squares + PRIOR_ROWS * common) / (times + PRIOR_ROWS)
+    drawn = torch.from_numpy(np.sort(np.random.default_rng(seed).permutation(len(level))[:ROWS]))
+    odds, sensitivity = hearing(left_out[place[drawn], : len(base)] + mean[0], heard[drawn])
     return FingerprintField(process, mean, base, variance, odds, sensitivity, vertical)
 
 
-def hearing(said: Tensor, heard: Tensor) -> tuple[tuple[float, float], float]:
+def hearing(predicted: Tensor, heard: Tensor) -> tuple[tuple[float, float], float]:
     """Slope and intercept of log odds, and the deviation of a row's shift, most likely by rows (n, P).
 
     Args:
-        said: what the process says of 0 and 1 at places left out.
+        predicted: what the process says of 0 and 1 at places left out.
         heard: bool.
     """
     odds = (1.0, 0.0)
     if 0 < heard.sum() < heard.numel():
-        entries = calibrated(said, odds).reshape(-1, 1), heard.reshape(-1)
+        entries = calibrated(predicted, odds).reshape(-1, 1), heard.reshape(-1)
         fitted = LogisticRegression(C=1e3).fit(*entries)
         odds = float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
-    shift, here = calibrated(said, odds), heard.float()  # rows at their own places: the diagonal
+    shift, here = calibrated(predicted, odds), heard.float()  # rows at their own places: the diagonal
     return odds, max(SENSITIVITIES, key=lambda one: float(shifted(shift, here, one).diagonal().sum()))
 
 
@@ -179,6 +179,6 @@ def misfit(levels: Tensor, at: Levels, offset: float | None, sensitivity: float 
         sensitivity: deviation of what it adds to all log odds of hearing.
     """
     near, mean = levels.float() - MIDDLE_DBM, at.mean.float() - MIDDLE_DBM
-    found = of_levels(near, mean, at.variance.float(), offset or 0.0)
+    levels_misfit = of_levels(near, mean, at.variance.float(), offset or 0.0)
     here = torch.isfinite(near).float()
-    return replace(found, silent=HEARING * shifted(torch.logit(at.heard.float()), here, sensitivity))
+    return replace(levels_misfit, silent=HEARING * shifted(torch.logit(at.heard.float()), here, sensitivity))
