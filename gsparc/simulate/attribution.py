@@ -49,7 +49,7 @@ class Deliverable:
         if not (match and 0 < quantile < 1):
             expected = "'coverage +-1 dB', 'csi -20 dB' or 'spectrum skill 0.9'"
             raise ValueError(f"effects.deliverable={text!r}: expected {expected}")
-        kind = match[1].lower()
+        kind: Any = match[1].lower()
         number = float(match[2] or DEFAULTS[kind])
         if kind == "spectrum" and not 0 < number < 1:
             raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
