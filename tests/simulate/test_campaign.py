@@ -14,6 +14,7 @@ import cloudpickle
 import h5py
 import numpy as np
 import pytest
+from crashes import small_campaign
 
 from gsparc.commands.check import main as check
 from gsparc.commands.simulate_pictures import effect_shares, floor_plan
@@ -31,27 +32,17 @@ from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.report import choice_table, figures, verdict
 from gsparc.simulate.scenes.build import SceneSettings, build
-from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.shoebox import Room, ShoeboxEngine, trace
-from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
+from gsparc.simulate.spectrum import ArraySettings
 
-SCENE = SceneSettings(
-    name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),
-    num_receivers=60, carrier_hz=2.4e9, bandwidth_hz=40e6, subcarriers=4,
-    room={"size_m": [6, 5, 3], "reflection": -0.6, "boxes_m": [[[2.6, 2.2, 0], [3.0, 2.6, 3]]]},
-)  # fmt: skip
-MIRROR = PropagationEffects(
-    refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
-)
-SMALL = SpectrumSettings(height=18, width=36, rows=4, columns=4)
-
-
+BOX = small_campaign(60)
+SCENE, MIRROR, SMALL = BOX.scene, BOX.effects, BOX.spectrum
 FEW_PROBES = AutoSettings(probes=16, held_back=20, full=PropagationEffects(depth=4))
 
 
 def plan(**changes):
-    return Campaign(**{"scene": SCENE, "effects": MIRROR, "spectrum": SMALL, "shard": 16, **changes})
+    return replace(BOX, **{"shard": 16, **changes})
 
 
 def arrays(path):
