@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -16,10 +16,10 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.locate.calibration import calibrated, levelled
-from gsparc.locate.cells import Cells, cover
+from gsparc.locate.cells import Cells, cover  # noqa: F401 (a predictor covers its site with it)
 from gsparc.locate.likelihood import Trust
-from gsparc.locate.posterior import Posterior
-from gsparc.locate.search import Looked, Unknown, looked, misfit
+from gsparc.locate.posterior import Posterior, likeliest
+from gsparc.locate.search import Looked, Unknown, misfit
 from gsparc.locate.site_field import Moments, SiteField
 from gsparc.locate.snapshots import Snapshots, snapshots
 from gsparc.models.method import Method
@@ -30,7 +30,10 @@ log = logging.getLogger(__name__)
 
 MOST = 3_000  # cells of the coarse grid
 HELD_OUT = 200  # snapshots that trust is learned from, drawn evenly
-BOX = partial(cover, most=MOST, around=False)  # one can stand anywhere in the box of trained places
+HALVED = 16  # cells that are halved at a time
+KEPT = 0.9  # of the mass: cells beyond it stay as they are
+LEVELS = 8  # halvings of a cell
+ENOUGH = 32  # cells of one size that hold this mass need not be halved
 KEY = "locate"  # in a checkpoint's `extra`
 
 
@@ -80,7 +83,7 @@ class Locator:
     @classmethod
     def of(
         cls, method: Method, data: Measurements, rows: np.ndarray, unknown: Unknown, trust: Trust,
-        cells: Callable[[np.ndarray], Cells] = BOX, share: float = 0.9,
+        cells: Callable[[np.ndarray], Cells], share: float,
     ) -> Self:  # fmt: skip
         """Of a method that was trained on rows (n,).
 
@@ -101,10 +104,23 @@ class Locator:
         """Computed once: most of the time of the first snapshot."""
         return self.field.at(torch.from_numpy(self.cells.centre))
 
-    def look(self, heard: Snapshots, trust: Trust | None = None) -> Looked:
-        """One snapshot's misfit where it matters under a trust, the locator's own unless it is given."""
-        coarse = misfit(heard, self._coarse, self.unknown)
-        return looked(self.field, heard, self.cells, coarse, self.unknown, trust or self.trust)
+    def look(self, heard: Snapshots, trust: Trust) -> Looked:
+        """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
+        current = Looked(self.cells, misfit(heard, self._coarse, self.unknown))
+        for _ in range(LEVELS):
+            cells = current.cells
+            likely = likeliest(current.log_density(trust), cells.size, KEPT)
+            wide = cells.edge[likely].max(1)
+            likely, wide = likely[wide > trust.spread], wide[wide > trust.spread]
+            if not len(likely) or (len(likely) >= ENOUGH and wide.max() < 1.01 * wide.min()):
+                break
+            chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
+            finer = cells.at(chosen).halved()
+            more = misfit(heard, self.field.at(torch.from_numpy(finer.centre)), self.unknown)
+            rest = np.setdiff1d(np.arange(len(cells)), chosen)
+            others = current.misfit.at(torch.from_numpy(rest))
+            current = Looked(cells.at(rest).with_others(finer), others + more)
+        return current
 
     def locate(self, heard: Snapshots) -> list[Located]:
         """Each of n snapshots on its own."""
@@ -112,7 +128,7 @@ class Locator:
         results = []
         for number in range(len(heard)):
             started = time.perf_counter()
-            posterior = self.look(heard.at(np.array([number]))).by(self.trust)
+            posterior = self.look(heard.at(np.array([number])), self.trust).by(self.trust)
             located = Located.of(posterior, self.trust.level, posterior.peak())
             results.append(replace(located, seconds=time.perf_counter() - started))
         return results

@@ -179,15 +179,12 @@ class Choice:
         )
 
 
-def decide(
-    probe: Probe, settings: AutoSettings, explain: Callable[[Probe], Mapping[str, str]], last: bool = True
-) -> Choice | None:
+def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | None:
     """The cheapest effects that meet the requirement; None where more probes are needed to say.
 
     Args:
         probe: receivers traced with everything: the first look's, or all probes.
         settings: requirement and confidence.
-        explain: prior reasons by effect.
         last: whether these are all probes, so that an effect that is not clearly out stays in.
 
     Raises:
@@ -212,12 +209,18 @@ def decide(
 
     removable = tuple(row.effect for row in rows if row.failures <= most)
     sets = sorted(combinations(full, removable), key=lambda effects: price(effects, full))
-    chosen, why, table = _cheapest(sets, holds, full), explain(probe), []
+    chosen, table = _cheapest(sets, holds, full), []
     for row in rows:
         effect, _, depth = row.effect.partition(" > ")
         kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, effect))
-        table.append(replace(row, kept=kept, reason=why.get(effect, "")))
+        table.append(replace(row, kept=kept))
     return Choice(chosen, str(required), tuple(table), len(probe.reached))
+
+
+def explained(choice: Choice, reasons: Mapping[str, str]) -> Choice:
+    """The choice with expectations from physics, by effect."""
+    table = (replace(row, reason=reasons.get(row.effect.split(" > ")[0], "")) for row in choice.table)
+    return replace(choice, table=tuple(table))
 
 
 def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice:

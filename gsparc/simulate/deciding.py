@@ -228,10 +228,9 @@ class Decider:
 
         def judge(rows: np.ndarray, last: bool) -> Choice | None:
             log.info("auto: %d probes with %s", len(rows), traced.effects)
-            return auto.decide(
-                self._probe(traced, rows), self.settings,
-                lambda probe: reasons(probe, distances[rows], materials), last,
-            )  # fmt: skip
+            probe = self._probe(traced, rows)
+            choice = auto.decide(probe, self.settings, last)
+            return choice and auto.explained(choice, reasons(probe, distances[rows], materials))
 
         return _until_clear(probes, judge)
 

@@ -64,7 +64,7 @@ def decided(deliverable, record=RECORD):
     paths = heard(20, record)
     probe = probe_of(paths, paths, np.linspace(2.4e9, 2.48e9, 26))
     settings = AutoSettings(deliverable=deliverable, probes=20, held_back=20, full=FULL)
-    choice = auto.decide(probe, settings, lambda probe: {"diffuse": "smooth"})
+    choice = auto.decide(probe, settings)
     return auto.verify(choice, settings, probe.errors(choice.effects, settings.required))
 
 
@@ -93,7 +93,7 @@ def test_coverage_drops_what_is_below_a_decibel():
     assert rows["refraction"].share == pytest.approx(0.6 / 2.18, rel=1e-4)
     assert rows["refraction"].error == pytest.approx(-10 * np.log10(1 - 0.6 / 2.18), rel=1e-4)
     assert rows["refraction"].kept and not rows["diffuse"].kept and not rows["depth > 1"].kept
-    assert rows["diffuse"].reason == "smooth"
+    assert auto.explained(choice, {"diffuse": "smooth"}).table[5].reason == "smooth"
     assert choice.verdict is not None and choice.verdict.kept and choice.verdict.met == 1.0
 
 
@@ -113,16 +113,16 @@ def test_effects_dropped_together_are_judged_together():
 def test_first_look_decides_only_what_is_clear():
     """Nothing outside on 64 probes is enough; one outside is not, and is neither clearly in."""
     settings = AutoSettings(full=FULL)
-    choice = auto.decide(probe_of(heard(64)), settings, lambda probe: {}, last=False)
+    choice = auto.decide(probe_of(heard(64)), settings, last=False)
     assert choice is not None and choice.probes == 64
     assert set(choice.effects.on) == {"line_of_sight", "specular", "refraction"}
     unclear = probe_of(with_odd_receiver(heard(64)))
-    assert auto.decide(unclear, settings, lambda probe: {}, last=False) is None
+    assert auto.decide(unclear, settings, last=False) is None
 
 
 def test_one_odd_receiver_does_not_keep_everything():
     """A single probe in a corner once kept every effect of a whole room."""
-    choice = auto.decide(probe_of(with_odd_receiver(heard(128))), AutoSettings(full=FULL), lambda probe: {})
+    choice = auto.decide(probe_of(with_odd_receiver(heard(128))), AutoSettings(full=FULL))
     assert not choice.effects.diffuse and choice.effects.specular
 
 
