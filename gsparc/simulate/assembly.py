@@ -116,9 +116,6 @@ def assemble(
     return Assembled(data, power, whole["delay_spread"], facts)
 
 
-Arrays = Mapping[str, np.ndarray]
-
-
 def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
     """What the shards hold of all rows, in their order."""
     counts = np.zeros(rows, dtype=np.int64)
@@ -140,7 +137,11 @@ def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
 
 
 def _arrays(
-    campaign: Campaign, survey: Survey, effects: PropagationEffects, whole: Arrays, paths: Paths
+    campaign: Campaign,
+    survey: Survey,
+    effects: PropagationEffects,
+    whole: Mapping[str, np.ndarray],
+    paths: Paths,
 ) -> dict[str, np.ndarray]:
     scene, wavelength = campaign.scene, survey.engine.wavelength
     spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]

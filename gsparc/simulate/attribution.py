@@ -125,43 +125,43 @@ class Probe:
         """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
-    def shares(self, kept: PropagationEffects | Paths) -> np.ndarray:
+    def shares(self, remaining: PropagationEffects | Paths) -> np.ndarray:
         """Share of each receiver's power that is lost (R,), negative where more arrives.
 
         Args:
-            kept: effects, here and below; or another trace of these receivers, of fewer rays.
+            remaining: effects, here and below; or another trace of these receivers, of fewer rays.
         """
         full = self._power.sum((0, 1))
-        if isinstance(kept, Paths):
-            rest = kept.received_power()
+        if isinstance(remaining, Paths):
+            rest = remaining.received_power()
         else:
-            ports = len(self._power) if kept.polarisation else 1
-            rest = self._power[:ports, kept.allows(*self._kinds[0].T)].sum((0, 1))
+            ports = len(self._power) if remaining.polarisation else 1
+            rest = self._power[:ports, remaining.allows(*self._kinds[0].T)].sum((0, 1))
         return 1 - rest / np.where(full > 0, full, 1)
 
-    def nmse(self, kept: PropagationEffects | Paths) -> np.ndarray:
+    def nmse(self, remaining: PropagationEffects | Paths) -> np.ndarray:
         """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
         full = self._channels.sum(0)
-        if isinstance(kept, Paths):
-            rest = self._responses(kept)
+        if isinstance(remaining, Paths):
+            rest = self._responses(remaining)
         else:
-            rest = self._channels[kept.allows(*self._kinds[0].T)].sum(0)
-            rest = rest if kept.polarisation else rest[:, : len(self.elements)]
+            rest = self._channels[remaining.allows(*self._kinds[0].T)].sum(0)
+            rest = rest if remaining.polarisation else rest[:, : len(self.elements)]
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
         energy = (np.abs(full) ** 2).sum((1, 2))
         return error / np.where(energy > 0, energy, 1)
 
-    def errors(self, kept: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
+    def errors(self, remaining: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
         """The deliverable's error at each receiver (R,), in the unit of its tolerance."""
         least = 10 ** (-SILENCE_DB / 10)
         if deliverable.kind == "coverage":
-            return np.abs(10 * np.log10(np.maximum(1 - self.shares(kept), least)))
+            return np.abs(10 * np.log10(np.maximum(1 - self.shares(remaining), least)))
         if deliverable.kind == "csi":
-            return 10 * np.log10(np.maximum(self.nmse(kept), least))
+            return 10 * np.log10(np.maximum(self.nmse(remaining), least))
         full, near = self._images
-        rest = kept if isinstance(kept, Paths) else self.paths.under(kept)
-        image = full if kept == self.effects else self._render(rest)
+        rest = remaining if isinstance(remaining, Paths) else self.paths.under(remaining)
+        image = full if remaining == self.effects else self._render(rest)
         error, nearest = (((other - full) ** 2).mean((1, 2)) for other in (image, near))
         return error / np.maximum(nearest, 1e-12)
 

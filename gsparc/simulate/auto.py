@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,8 +13,6 @@ from scipy.stats import binom
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths
-
-log = logging.getLogger(__name__)
 
 # Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
 # street canyon and in the conference room (docs/results/simulate.md). It ranks sets of effects; what a choice

@@ -163,8 +163,8 @@ class Decider:
 
     def decide(self) -> Decision:
         """Look the decision up, or take it and store it."""
-        begin, (probes, held) = time.perf_counter(), self._groups()
-        count = len(probes) + len(held)
+        begin, (probes, held_back) = time.perf_counter(), self._groups()
+        count = len(probes) + len(held_back)
         if self.settings.reuse and self._stored.exists():
             choice = Choice.from_dict(json.loads(self._stored.read_text(encoding="utf-8")))
             if not (choice.untried and self._may_pay(choice, len(self.survey) - count, count)):
@@ -172,18 +172,18 @@ class Decider:
                 choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
                 return Decision(choice, *self._simulated(choice, len(self.survey)))
         size = self.campaign.sampling.part if self.survey.engine.random else 1
-        traced = Traced(self.survey, self.full, np.concatenate([probes, held]), size)
+        traced = Traced(self.survey, self.full, np.concatenate([probes, held_back]), size)
         choice, changed = self._choose(traced, probes), None
         if choice.effects == self.full:
             log.info("auto: every effect is needed")
         else:
             log.info("auto: %s; verifying on held-back receivers", choice.effects)
-            choice, changed = self._verify(traced, choice, held)
+            choice, changed = self._verify(traced, choice, held_back)
             if choice.verdict is not None and not choice.verdict.kept:
                 log.info("auto: held-back receivers refute it; everything is needed")
                 choice = auto.everything(choice, self.full)
         if self.settings.rays < 1 and self.survey.engine.random:
-            choice, changed = self._fewer_rays(traced, choice, changed, probes, held)
+            choice, changed = self._fewer_rays(traced, choice, changed, probes, held_back)
         choice = replace(choice, **traced.costs())
         effects, samples = self._simulated(choice, len(self.survey) - len(traced.rows))
         choice = replace(choice, seconds=time.perf_counter() - begin)
@@ -235,7 +235,12 @@ class Decider:
         return _until_clear(probes, judge)
 
     def _fewer_rays(
-        self, traced: Traced, choice: Choice, changed: Changed | None, probes: np.ndarray, held: np.ndarray
+        self,
+        traced: Traced,
+        choice: Choice,
+        changed: Changed | None,
+        probes: np.ndarray,
+        held_back: np.ndarray,
     ) -> tuple[Choice, Changed | None]:
         """Whether a share of the rays is enough: probes, then held-back rows, with the choice and those.
 
@@ -244,13 +249,17 @@ class Decider:
         """
         survey, sampling = self.survey, self.campaign.sampling
         if len(survey) - len(traced.rows) > sampling.batch:
-            traced.paths(held[: auto.first_look(len(held))])  # rows of the file, which say what one costs
+            traced.paths(
+                held_back[: auto.first_look(len(held_back))]
+            )  # rows of the file, which say what one costs
         choice = replace(choice, **traced.costs())
         if not self._may_pay(choice, len(survey) - len(traced.rows), len(traced.rows)):
             return replace(choice, untried=True), changed
         samples = max(round(self.settings.rays * sampling.samples), 1)
         log.info("auto: probes with %d rays", samples)
-        fewer = Traced(survey.thinned(samples), choice.effects, np.concatenate([probes, held]), sampling.part)
+        fewer = Traced(
+            survey.thinned(samples), choice.effects, np.concatenate([probes, held_back]), sampling.part
+        )
 
         def judge(rows: np.ndarray, last: bool) -> Choice | None:
             probe = self._probe(traced, rows)
@@ -259,13 +268,13 @@ class Decider:
         thinned = _until_clear(probes, judge)
         if thinned.samples is None:
             return thinned, changed
-        verified, errors = self._verify(traced, thinned, held, fewer)
+        verified, errors = self._verify(traced, thinned, held_back, fewer)
         if verified.verdict is not None and not verified.verdict.kept:
             return replace(auto.without_fewer_rays(thinned), verdict=choice.verdict), changed
         return verified, errors
 
     def _verify(
-        self, traced: Traced, choice: Choice, held: np.ndarray, fewer: Traced | None = None
+        self, traced: Traced, choice: Choice, held_back: np.ndarray, fewer: Traced | None = None
     ) -> tuple[Choice, Changed]:
         """On the first half of the held-back rows, and on all where that does not prove the requirement."""
         required = self.settings.required
@@ -279,7 +288,7 @@ class Decider:
                 return None
             return auto.verify(choice, self.settings, heard), Changed(rows, errors)
 
-        return _until_clear(held, judge)
+        return _until_clear(held_back, judge)
 
     def _probe(self, traced: Traced, rows: np.ndarray) -> Probe:
         """Rows traced with everything, and their nearest others where the requirement is about spectra."""

@@ -80,8 +80,8 @@ class PropagationEffects:
             order: (P,) number of interactions.
         """
         bits = sum(bit for name, bit in BITS.items() if getattr(self, name))
-        kept = (mechanisms & ~np.array(bits, dtype=mechanisms.dtype)) == 0
-        return kept & (order <= self.depth) & (self.line_of_sight | (order > 0))
+        allowed = (mechanisms & ~np.array(bits, dtype=mechanisms.dtype)) == 0
+        return allowed & (order <= self.depth) & (self.line_of_sight | (order > 0))
 
     def __str__(self) -> str:
         extra = [f"depth {self.depth}"] + (["both polarisations"] if self.polarisation else [])
