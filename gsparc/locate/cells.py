@@ -67,8 +67,7 @@ def cover(
     """About `most` equal cells of the box of trained places (n, 3) [m].
 
     Args:
-        trained: local.
-        most: cells of the whole box.
+        trained, most: places [m, local], and cells of the whole box.
         around: whether only cells near trained places are kept, as in a building one walked through.
         open_at: whether one can stand at places (m, 3) [m, local], by a floor plan.
 

@@ -85,13 +85,7 @@ class Locator:
         cls, method: Method, data: Measurements, rows: np.ndarray, unknown: Unknown, trust: Trust,
         cells: Callable[[np.ndarray], Cells], share: float,
     ) -> Self:  # fmt: skip
-        """Of a method that was trained on rows (n,).
-
-        Args:
-            method: trained.
-            data, rows: what it learned from: where one can stand.
-            unknown, trust, share: see there.
-            cells: of a coarse grid where one can stand, from trained places (n, 3) [m, local].
+        """Of a method that was trained on rows (n,), with `cells` by their places (n, 3) [m, local].
 
         Raises:
             ValueError: both ends move, or the method states no variance.
@@ -140,15 +134,8 @@ def trusted(
 ) -> tuple[Trust, int]:  # fmt: skip
     """How far such a method is trusted, from training places that it left out, and their number.
 
-    The method is trained again without each of a few groups of training rows, cut as the test rows were.
-
-    Args:
-        make: an unfitted method of the same settings.
-        data, fold: what the locator's method learned from.
-        context: of each training.
-        locator: of the whole method.
-        folds: groups.
-        cells: see `Locator.of`.
+    The method is made and trained again without each of a few groups (`folds`) of its training rows, cut as
+    the test rows were; `locator` is that of the whole method, `cells` as of `Locator.of`.
     """
     groups: list[tuple[Locator, Snapshots]] = []
     rng = np.random.default_rng(context.seed)

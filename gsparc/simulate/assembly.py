@@ -74,12 +74,8 @@ def assemble(
 ) -> Assembled:
     """Put the shards, all of them there, together, write the file, drop the shards.
 
-    One shard is in memory at a time; what is large is put together on disk.
-
-    Args:
-        campaign, survey, effects, choice, convergence: what the file is of.
-        seconds: spent on anything but the shards, which know their own; both are the file's `simulate_s` [s].
-        shards: from where, and to which file.
+    One shard is in memory at a time; what is large is put together on disk. `seconds` [s] were spent on
+    anything but the shards, which know their own; both are the file's `simulate_s`.
 
     Raises:
         ValueError: nothing reaches any receiver.

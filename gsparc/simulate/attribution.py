@@ -202,10 +202,8 @@ def reasons(
 ) -> dict[str, str]:
     """Why an effect should or should not matter, by its name; absent where there is no short one.
 
-    Args:
-        probe: everything on.
-        distances: (R,) [m] between the ends.
-        materials: of the scene; `permittivity`, `thickness_m` and `scattering` are read where given.
+    Distances (R,) [m] are between the ends; of materials `permittivity`, `thickness_m` and `scattering` are
+    read where given.
     """
     wavelength, paths = probe.wavelength, probe.paths
     distance = float(np.median(distances))

@@ -235,12 +235,8 @@ def fewer_rays(
     """The choice with fewer rays, or without them; None where more probes are needed to say.
 
     Args:
-        choice: effects.
-        settings: requirement and confidence.
-        probe: receivers traced with everything: the first look's, or all probes.
-        traced: the same with the choice's effects and fewer rays.
-        samples: how many.
-        last: whether these are all probes.
+        choice, settings, probe, last: as of `decide`.
+        traced: the probe's receivers with the choice's effects and so many `samples`.
     """
     row = _row(f"rays > {samples}", probe, traced, settings.required)
     early, late = settings.allowed_failures(int(probe.reached.sum()), last)

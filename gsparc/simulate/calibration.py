@@ -94,12 +94,9 @@ def apply(tracer: RayTracer, materials: Mapping[str, Material]) -> None:
 
 
 class Replay:
-    """Paths of receivers, kept with what is needed to send fields along them again.
+    """Paths of receivers (R, 3) [m], world, with what is needed to send fields along them again.
 
-    Args:
-        tracer: of the scene; its present materials decide which paths are tried.
-        receivers: (R, 3) [m], world.
-        effects: that are traced.
+    The tracer's present materials decide which paths are tried.
     """
 
     def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: PropagationEffects) -> None:

@@ -34,9 +34,7 @@ class Outcome:
     """A finished dataset and what it cost.
 
     Attributes:
-        made: the file and facts about it.
-        survey: its rows.
-        effects: that were simulated.
+        made, survey, effects: the file, its rows, and what was simulated.
         choice, changed: of `auto`; else None.
         convergence: between two seeds; None where there are no rays.
         seconds: by stage [s].
@@ -53,10 +51,6 @@ class Outcome:
 
 def simulate(campaign: Campaign, out: Path) -> Outcome:
     """Make the dataset, or go on where an interrupted run stopped.
-
-    Args:
-        campaign: what is simulated.
-        out: the file.
 
     Raises:
         ValueError: `out` exists, or parts beside it belong to another simulation, or bad settings.
@@ -139,11 +133,7 @@ class _Tracing:
 def _trace_all(
     campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards
 ) -> float | None:
-    """Every shard that is not there yet.
-
-    Returns:
-        CPU seconds of a row, once compiled; None where too few were traced.
-    """
+    """Trace what is missing; CPU seconds of a row, once compiled, None where too few were traced."""
     left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
     parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]
     missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]

@@ -45,9 +45,7 @@ def convergence(
 ) -> Convergence | None:
     """Rows of a file beside the same under a second seed; None where none is asked for, or without rays.
 
-    Args:
-        campaign, survey, effects, shards: what was traced.
-        left_out: (n,) rows that were traced otherwise.
+    Rows `left_out` (n,) were traced otherwise.
     """
     count = min(campaign.check, int(CHECKED * len(survey)))
     if count == 0 or not survey.engine.random:

@@ -86,13 +86,7 @@ class Decision:
 
 
 class Traced:
-    """Rows traced with some effects, each once, and what they cost.
-
-    Args:
-        survey, effects: what is traced.
-        ahead: rows in the order in which they may be needed.
-        size: rows of a call, which is filled up with those.
-    """
+    """Rows traced with some effects, each once; calls of `size` are filled up with what is needed `ahead`."""
 
     def __init__(
         self, survey: Survey, effects: PropagationEffects, ahead: np.ndarray = NONE, size: int = 1
@@ -115,17 +109,14 @@ class Traced:
         at = np.argsort(self.rows)
         return join(self._parts).take(at[np.searchsorted(self.rows[at], rows)])
 
-    def costs(self) -> dict[str, float | None]:
-        """CPU seconds of a row once compiled, and of compiling (0 of an engine that compiles nothing).
-
-        The first part compiles: None where there is no other.
-        """
+    def timed(self, choice: Choice) -> Choice:
+        """The choice with CPU seconds of a row, and of compiling, which the first of several parts does."""
         if len(self._parts) < 2:
-            return {"row_all": None, "compiling": None}
+            return replace(choice, row_all=None, compiling=None)
         first = len(self._parts[0])
-        row = sum(self._costs[1:]) / (len(self.rows) - first)
-        compiling = max(self._costs[0] - first * row, 0.0) if self.survey.engine.random else 0.0
-        return {"row_all": row, "compiling": compiling}
+        row_s = sum(self._costs[1:]) / (len(self.rows) - first)
+        compiling = max(self._costs[0] - first * row_s, 0.0) if self.survey.engine.random else 0.0
+        return replace(choice, row_all=row_s, compiling=compiling)
 
 
 def busy_s() -> float:
@@ -148,13 +139,7 @@ def pays(choice: Choice, rows: int, saved: float) -> bool:
 
 
 class Decider:
-    """Comes to the effects of one campaign.
-
-    Args:
-        campaign: what is simulated.
-        settings: the requirement.
-        survey: rows, traced with all rays.
-    """
+    """Comes to the effects of one campaign, whose survey is traced with all rays."""
 
     def __init__(self, campaign: Campaign, settings: AutoSettings, survey: Survey) -> None:
         self.campaign, self.settings, self.survey = campaign, settings, survey
@@ -184,7 +169,7 @@ class Decider:
                 choice = auto.everything(choice, self.full)
         if self.settings.rays < 1 and self.survey.engine.random:
             choice, changed = self._fewer_rays(traced, choice, changed, probes, held_back)
-        choice = replace(choice, **traced.costs())
+        choice = traced.timed(choice)
         effects, samples = self._simulated(choice, len(self.survey) - len(traced.rows))
         choice = replace(choice, seconds=time.perf_counter() - begin)
         self.remember(choice)
@@ -252,7 +237,7 @@ class Decider:
             traced.paths(
                 held_back[: auto.first_look(len(held_back))]
             )  # rows of the file, which say what one costs
-        choice = replace(choice, **traced.costs())
+        choice = traced.timed(choice)
         if not self._may_pay(choice, len(survey) - len(traced.rows), len(traced.rows)):
             return replace(choice, untried=True), changed
         samples = max(round(self.settings.rays * sampling.samples), 1)

@@ -70,11 +70,10 @@ class RayTracer(Engine):
 
     Args:
         source: objects built in code, the name of one of Sionna's scenes, or the path of an XML file.
-        transmitter: (3,) [m].
+        transmitter, antenna: (3,) [m], and what it radiates.
         carrier_hz: [Hz].
         sampling: effort of the solver.
         scattering: scattering coefficient of all materials instead of `MATERIALS`; None for those.
-        antenna: of the transmitter.
 
     Attributes:
         scene: Sionna's (`sionna.rt.Scene`).
@@ -155,12 +154,7 @@ class RayTracer(Engine):
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
     def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
-        """Paths from the transmitter to receivers (R, 3) [m].
-
-        Args:
-            receivers: world coordinates.
-            effects: what is computed.
-            seed: of the rays instead of `sampling.seed`.
+        """Paths from the transmitter to receivers (R, 3) [m], world; the seed is `sampling.seed` unless given.
 
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.

@@ -27,7 +27,7 @@ class Shards:
 
     Args:
         out: the dataset's file.
-        plan: everything that decides what the shards hold; a folder made by another plan is refused.
+        plan: everything that decides what the shards hold.
 
     Raises:
         ValueError: the folder belongs to another simulation.

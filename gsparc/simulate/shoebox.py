@@ -111,10 +111,8 @@ def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray
     """Whether each observer sees each image of a source, exactly: (S, I) bool.
 
     The straight line from the observer to the image runs through mirrored copies of the room; it is
-    blocked when it meets a copy of an occluder in one of them (unfolding).
-
-    Args:
-        source, observer: (S, 3) [m] inside the room, broadcast against each other.
+    blocked when it meets a copy of an occluder in one of them (unfolding). Source and observer are (S, 3) [m]
+    inside the room, broadcast against each other.
     """
     source, observer = np.broadcast_arrays(np.atleast_2d(source), np.atleast_2d(observer))
     seen = np.ones((len(observer), len(images.cell)), dtype=bool)
@@ -219,13 +217,7 @@ def trace(
 
 
 class ShoeboxEngine(Engine):
-    """A shoebox room with one transmitter as an `Engine`: line of sight and mirror reflections.
-
-    Args:
-        room: walls and absorbing boxes.
-        transmitter: (3,) [m].
-        carrier_hz: [Hz].
-    """
+    """A shoebox room with one transmitter (3,) [m] as an `Engine`: line of sight and mirror reflections."""
 
     name = "gsparc-shoebox"
     random = False

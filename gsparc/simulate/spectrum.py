@@ -93,13 +93,8 @@ def spectra(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Spectra (R, H, W) float32, and what each was divided by (R,) (its own unit: amplitude or power).
 
-    Only paths from above the horizon are received. A receiver without any is black, divided by 1.
-
-    Args:
-        paths: of R receivers, world axes as the receivers' axes.
-        settings: the definition.
-        frequency_hz: (K,) subcarriers, the snapshots of the Bartlett spectrum [Hz].
-        wavelength: at the carrier [m].
+    Only paths from above the horizon are received; world axes are the receivers'. A receiver without any is
+    black, divided by 1. The subcarriers (K,) [Hz] are the snapshots of the Bartlett spectrum.
     """
     above = paths.select(paths.direction[:, 2] >= 0)
     images = np.empty((len(paths), settings.height, settings.width), dtype=np.float32)

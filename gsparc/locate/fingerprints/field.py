@@ -156,10 +156,7 @@ def hearing(predicted: Tensor, heard: Tensor) -> tuple[tuple[float, float], floa
 def shifted(odds: Tensor, here: Tensor, deviation: float) -> Tensor:
     """Log probability (m, B) that of P access points those `here` (m, P), 0 or 1, are heard and no others.
 
-    Args:
-        odds: (B, P) log odds, to all of which a row adds one normal variable of `deviation`.
-        here: float32.
-        deviation: 0 or more.
+    To all log odds (B, P) a row adds one normal variable of a `deviation` of 0 or more; `here` is float32.
     """
     at, weight = np.polynomial.hermite_e.hermegauss(NODES if deviation > 0 else 1)
     shift, share = (
@@ -173,8 +170,7 @@ def misfit(levels: Tensor, at: Levels, offset: float | None, sensitivity: float 
     """Of m fingerprints at places, in single precision; what is heard and what not is its `silent`.
 
     Args:
-        levels: (m, P) [dBm], NaN where silent.
-        at: of B places.
+        levels, at: (m, P) [dBm], NaN where silent; of B places.
         offset: deviation of what the device adds to all levels [dB]; None or 0: it adds nothing.
         sensitivity: deviation of what it adds to all log odds of hearing.
     """

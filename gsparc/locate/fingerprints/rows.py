@@ -146,12 +146,10 @@ def parted(
     """Training and test rows (n,), (m,), sorted; a pure function of its arguments.
 
     Args:
-        rows: see there.
-        how: `released`: as the file says; `random`: rows; `places`: all rows of cubes of `side_m`; `blocks`:
-            of squares of floor, all floors alike; `walks`: whole ones; `later`: campaigns after the first.
-        side_m: see `how` [m].
+        how: `released`: as the file says; `random`: rows; `places`: all rows of cubes of `side_m` [m];
+            `blocks`: of squares of floor, all floors alike; `walks`: whole ones; `later`: campaigns after the
+            first.
         share: held out, of rows, places, squares or walks.
-        seed: of draws.
 
     Raises:
         DataError: there is no such split, or one part of it is empty.

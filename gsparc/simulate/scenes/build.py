@@ -149,9 +149,8 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
 
     Args:
         stated: the name of a scene that comes with Sionna or is built here, or the path of an extract of
-            OpenStreetMap (*.osm) or of a scene file (*.xml); None: the one that a simulated file names.
-        provenance: of the measurements.
-        carrier_hz: that materials are taken at [Hz].
+            OpenStreetMap (*.osm) or of a scene file (*.xml); None: the one that the provenance names.
+        provenance, carrier_hz: of the measurements; materials are taken at that carrier [Hz].
 
     Raises:
         ValueError: no scene is known, or not one that a ray tracer loads.

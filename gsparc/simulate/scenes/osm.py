@@ -61,9 +61,7 @@ class Town:
 def read_town(path: str | Path, carrier_hz: float) -> Town:
     """Buildings and streets of an extract.
 
-    Args:
-        path: *.osm.
-        carrier_hz: the ground's model is of 1 to 10 GHz; else it is of concrete [Hz].
+    The ground's model is of 1 to 10 GHz; at other carriers [Hz] it is of concrete.
 
     Raises:
         ValueError: no such file, not OSM's XML, or no building in it.
