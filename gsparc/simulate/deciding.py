@@ -144,31 +144,31 @@ class Decider:
     def __init__(self, campaign: Campaign, settings: AutoSettings, survey: Survey) -> None:
         self.campaign, self.settings, self.survey = campaign, settings, survey
         self.full = survey.engine.supported(settings.full)
+        self.probes, self.held_back = self._groups()
         self._stored = platform_cache() / "scenes" / f"{self._key()}.json"
 
     def decide(self) -> Decision:
         """Look the decision up, or take it and store it."""
-        begin, (probes, held_back) = time.perf_counter(), self._groups()
-        count = len(probes) + len(held_back)
+        begin, both = time.perf_counter(), np.concatenate([self.probes, self.held_back])
         if self.settings.reuse and self._stored.exists():
             choice = Choice.from_dict(json.loads(self._stored.read_text(encoding="utf-8")))
-            if not (choice.untried and self._may_pay(choice, len(self.survey) - count, count)):
+            if not (choice.untried and self._may_pay(choice, len(self.survey) - len(both), len(both))):
                 log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
                 choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
                 return Decision(choice, *self._simulated(choice, len(self.survey)))
         size = self.campaign.sampling.part if self.survey.engine.random else 1
-        traced = Traced(self.survey, self.full, np.concatenate([probes, held_back]), size)
-        choice, changed = self._choose(traced, probes), None
+        traced = Traced(self.survey, self.full, both, size)
+        choice, changed = self._choose(traced), None
         if choice.effects == self.full:
             log.info("auto: every effect is needed")
         else:
             log.info("auto: %s; verifying on held-back receivers", choice.effects)
-            choice, changed = self._verify(traced, choice, held_back)
+            choice, changed = self._verify(traced, choice)
             if choice.verdict is not None and not choice.verdict.kept:
                 log.info("auto: held-back receivers refute it; everything is needed")
                 choice = auto.everything(choice, self.full)
         if self.settings.rays < 1 and self.survey.engine.random:
-            choice, changed = self._fewer_rays(traced, choice, changed, probes, held_back)
+            choice, changed = self._fewer_rays(traced, choice, changed)
         choice = traced.timed(choice)
         effects, samples = self._simulated(choice, len(self.survey) - len(traced.rows))
         choice = replace(choice, seconds=time.perf_counter() - begin)
@@ -182,7 +182,7 @@ class Decider:
             partial.write_text(json.dumps(asdict(choice), indent=1), encoding="utf-8")
 
     def _simulated(self, choice: Choice, rows: int) -> tuple[PropagationEffects, int | None]:
-        """PropagationEffects and rays of the choice, or everything where that is cheaper for so many rows."""
+        """Effects and rays of the choice, or everything where that is cheaper for so many rows."""
         rays = 1.0 if choice.samples is None else choice.samples / self.campaign.sampling.samples
         price = auto.price(choice.effects, self.full, rays)
         if (choice.effects == self.full and rays == 1) or pays(choice, rows, 1 - price):
@@ -207,7 +207,7 @@ class Decider:
         turn = np.floor(np.arange(1, len(chosen) + 1) * share) > np.floor(np.arange(len(chosen)) * share)
         return chosen[turn], chosen[~turn]
 
-    def _choose(self, traced: Traced, probes: np.ndarray) -> Choice:
+    def _choose(self, traced: Traced) -> Choice:
         """By the first look and, where it leaves something open, the last."""
         materials, distances = self.survey.engine.materials(), self.survey.distances()
 
@@ -217,15 +217,10 @@ class Decider:
             choice = auto.decide(probe, self.settings, last)
             return choice and auto.explained(choice, reasons(probe, distances[rows], materials))
 
-        return _until_clear(probes, judge)
+        return _until_clear(self.probes, judge)
 
     def _fewer_rays(
-        self,
-        traced: Traced,
-        choice: Choice,
-        changed: Changed | None,
-        probes: np.ndarray,
-        held_back: np.ndarray,
+        self, traced: Traced, choice: Choice, changed: Changed | None
     ) -> tuple[Choice, Changed | None]:
         """Whether a share of the rays is enough: probes, then held-back rows, with the choice and those.
 
@@ -233,34 +228,29 @@ class Decider:
         file: the same rows are there with all rays.
         """
         survey, sampling = self.survey, self.campaign.sampling
-        if len(survey) - len(traced.rows) > sampling.batch:
-            traced.paths(
-                held_back[: auto.first_look(len(held_back))]
-            )  # rows of the file, which say what one costs
+        if len(survey) - len(traced.rows) > sampling.batch:  # rows of the file, which say what one costs
+            traced.paths(self.held_back[: auto.first_look(len(self.held_back))])
         choice = traced.timed(choice)
         if not self._may_pay(choice, len(survey) - len(traced.rows), len(traced.rows)):
             return replace(choice, untried=True), changed
         samples = max(round(self.settings.rays * sampling.samples), 1)
         log.info("auto: probes with %d rays", samples)
-        fewer = Traced(
-            survey.thinned(samples), choice.effects, np.concatenate([probes, held_back]), sampling.part
-        )
+        both = np.concatenate([self.probes, self.held_back])
+        fewer = Traced(survey.thinned(samples), choice.effects, both, sampling.part)
 
         def judge(rows: np.ndarray, last: bool) -> Choice | None:
             probe = self._probe(traced, rows)
             return auto.fewer_rays(choice, self.settings, probe, fewer.paths(rows), samples, last)
 
-        thinned = _until_clear(probes, judge)
+        thinned = _until_clear(self.probes, judge)
         if thinned.samples is None:
             return thinned, changed
-        verified, errors = self._verify(traced, thinned, held_back, fewer)
+        verified, errors = self._verify(traced, thinned, fewer)
         if verified.verdict is not None and not verified.verdict.kept:
             return replace(auto.without_fewer_rays(thinned), verdict=choice.verdict), changed
         return verified, errors
 
-    def _verify(
-        self, traced: Traced, choice: Choice, held_back: np.ndarray, fewer: Traced | None = None
-    ) -> tuple[Choice, Changed]:
+    def _verify(self, traced: Traced, choice: Choice, fewer: Traced | None = None) -> tuple[Choice, Changed]:
         """On the first half of the held-back rows, and on all where that does not prove the requirement."""
         required = self.settings.required
 
@@ -273,7 +263,7 @@ class Decider:
                 return None
             return auto.verify(choice, self.settings, heard), Changed(rows, errors)
 
-        return _until_clear(held_back, judge)
+        return _until_clear(self.held_back, judge)
 
     def _probe(self, traced: Traced, rows: np.ndarray) -> Probe:
         """Rows traced with everything, and their nearest others where the requirement is about spectra."""
@@ -294,7 +284,7 @@ class Decider:
         about: dict[str, Any] = {
             "geometry": engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
             "materials": engine.materials(), "versions": engine.versions(), "scene": scene,
-            "asked": requirement, "antennas": [getattr(e, "antenna", None) for e in survey.engines], 
+            "asked": requirement, "antennas": [getattr(e, "antenna", None) for e in survey.engines],
             "samples": campaign.sampling.samples, "names": survey.names, "inputs": campaign.inputs(),
         }  # fmt: skip
         if self.settings.required.kind != "coverage":
