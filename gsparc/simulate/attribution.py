@@ -210,25 +210,26 @@ def reasons(
     sight = paths.per_receiver((paths.order == 0).astype(float)) > 0
     zone = f"first Fresnel zone {np.sqrt(wavelength * distance) / 2:.2g} m wide at {distance:.3g} m"
     rough = [m["scattering"] ** 2 for m in materials.values() if m.get("scattering")]
-    found = {
+    reasons = {
         "line_of_sight": f"{sight.mean():.0%} of the receivers see the transmitter",
         "diffraction": f"{zone}; {1 - sight.mean():.0%} shadowed",
         "diffuse": f"smooth below {wavelength / 8 * 1e3:.2g} mm of relief (Rayleigh)"
         + (f"; S^2 is {min(rough):.1%} to {max(rough):.1%} of a reflection" if rough else ""),
     }
-    losses = {name: _normal_incidence(m, wavelength) for name, m in materials.items() if _slab(m)}
+    # A conductor's permittivity is 1: its loss is not in this number.
+    slabs = {name: m for name, m in materials.items() if float(m.get("permittivity", 0.0)) > 1.01}
+    losses = {
+        name: _normal_incidence(m, wavelength)
+        for name, m in slabs.items()
+        if float(m.get("thickness_m", 0.0)) > 0
+    }
     if losses:
         through = {f"{loss:.1f} dB ({name})": loss for name, (_, loss) in losses.items()}
         clearest, densest = min(through, key=through.__getitem__), max(through, key=through.__getitem__)
-        found["refraction"] = f"a sheet costs {clearest} to {densest}"
+        reasons["refraction"] = f"a sheet costs {clearest} to {densest}"
         mirror = -10 * np.log10(np.median([10 ** (-loss / 10) for loss, _ in losses.values()]))
-        found["depth"] = f"a reflection costs about {mirror:.0f} dB"
-    return found
-
-
-def _slab(material: Mapping[str, Any]) -> bool:
-    # A conductor's permittivity is 1: its loss is not in this number.
-    return float(material.get("permittivity", 0.0)) > 1.01 and float(material.get("thickness_m", 0.0)) > 0
+        reasons["depth"] = f"a reflection costs about {mirror:.0f} dB"
+    return reasons
 
 
 def _normal_incidence(material: Mapping[str, Any], wavelength: float) -> tuple[float, float]:

@@ -154,7 +154,7 @@ class RayTracer(Engine):
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
     def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
-        """Paths from the transmitter to receivers (R, 3) [m], world, by rays of a seed, `sampling.seed` if None.
+        """Paths from the transmitter to receivers (R, 3) [m], world; `seed` in place of `sampling.seed`.
 
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
