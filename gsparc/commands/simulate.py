@@ -21,16 +21,15 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.console import open_console
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.effects import from_config as effects_from_config
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.scenes.solid import write_mesh
-from gsparc.simulate.settings import Campaign, CsiSettings
-from gsparc.simulate.spectrum import SpectrumSettings
-from gsparc.simulate.survey import HasTriangles
+from gsparc.simulate.settings import Campaign
+from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 log = logging.getLogger(__name__)
 
@@ -46,13 +45,13 @@ def campaign(config: DictConfig) -> Campaign:
     settings = plain(config)
     return Campaign(
         scene_from_config(settings["scene"]), _effects(settings["effects"]), Sampling(**settings["sampling"]),
-        SpectrumSettings(**settings["spectrum"]), CsiSettings(**settings["csi"]),
+        SpectrumSettings(**settings["spectrum"]), ArraySettings(**settings["csi"]),
         shard=int(settings["shard"]), check=int(settings["check"]), check_seed=int(settings["check_seed"]),
         weakest_db=float(settings["weakest_db"]), measurement=str(settings["measurement"]),
     )  # fmt: skip
 
 
-def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
+def _effects(config: dict[str, Any]) -> PropagationEffects | AutoSettings:
     if "full" not in config:
         return effects_from_config(config)
     return AutoSettings(**{**config, "full": effects_from_config(config["full"])})
@@ -74,8 +73,9 @@ def task(config: DictConfig) -> Outcome | None:
         outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
-    if isinstance(outcome.survey.engine, HasTriangles):
-        write_mesh(outcome.survey.engine.triangles(), run_dir / "scene.obj")
+    triangles = outcome.survey.engine.triangles()
+    if len(triangles):
+        write_mesh(triangles, run_dir / "scene.obj")
     console = open_console()
     if outcome.choice is not None:
         pictures.effect_shares(outcome.choice, run_dir / "effects.png")

@@ -12,7 +12,6 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import bounded, draw_stations, draw_walls, legend_below
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
-from gsparc.simulate.survey import HasTriangles
 
 
 def floor_plan(outcome: Outcome, path: Path) -> None:
@@ -28,7 +27,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     extent = np.ptp(places[:, :2], axis=0)
     high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 1.3
     figure, (axes,) = panels(5.4 * count, high, 1, count, grid=False)
-    reached = heard > 0
+    reached, triangles = heard > 0, survey.engine.triangles()
     size = float(np.clip(6000 / len(places), 2, 40))
     _map(axes[0], places[reached], 10 * np.log10(heard[reached]), "received power [dB]", size)
     _map(axes[1], places[reached], spread[reached] * 1e9, "delay spread [ns]", size)
@@ -46,8 +45,8 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
             axis.scatter(*dark, s=size, c="lightgrey", label="nothing arrives" if first else None)
         draw_stations(axis, survey.transmitters[:, :2], "transmitter" if first else None, color="r")
         left, right, south, north = axis.axis()
-        if isinstance(survey.engine, HasTriangles):
-            draw_walls(axis, survey.engine.triangles())
+        if len(triangles):
+            draw_walls(axis, triangles)
         bounded(axis, (left, south), (right, north), **({} if first else {"ylabel": ""}))
     legend_below(figure)  # beside the title it would cover the last effects
     figure.suptitle(f"{outcome.made.data.site.name}: {len(places)} receivers\n{outcome.effects}")

@@ -33,15 +33,15 @@ class Misfit:
 
     def __add__(self, other: Misfit) -> Misfit:
         """At the places of both, of the same snapshots."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ("squared", "size", "silent"))
-        squared, size, silent = (torch.cat(pair, 1) for pair in pairs)
+        squared, size, silent = (
+            torch.cat([getattr(self, name), getattr(other, name)], 1)
+            for name in ("squared", "size", "silent")
+        )
         return Misfit(squared, size, self.count, silent)
 
     def at(self, places: Tensor) -> Misfit:
         """At places (g,) by number."""
-        parts = (part[:, places] for part in (self.squared, self.size, self.silent))
-        squared, size, silent = parts
-        return Misfit(squared, size, self.count, silent)
+        return Misfit(self.squared[:, places], self.size[:, places], self.count, self.silent[:, places])
 
     def of(self, snapshot: int) -> Misfit:
         """Of one snapshot."""
@@ -117,9 +117,9 @@ def of_levels(
         floor: (n, P) levels [dB] below which a silent power lies, NaN of those that were heard.
     """
     heard, seen = _where(values)
-    told, precision, log_variance = _known(mean, variance)
-    weighed = told * precision
-    square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (told * weighed).T
+    known, precision, log_variance = _known(mean, variance)
+    weighed = known * precision
+    square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (known * weighed).T
     slope = heard @ precision.T - seen @ weighed.T
     shared = 1 + offset_db**2 * (seen @ precision.T)
     squared = (square - offset_db**2 * slope.square() / shared).clamp_min(0)
@@ -128,9 +128,9 @@ def of_levels(
     if floor is not None and not torch.isnan(floor).all():
         spread = (variance + offset_db**2).sqrt()
         parts = []
-        for some in floor.split(max(MOST // max(mean.numel(), 1), 1)):
-            chance = torch.special.log_ndtr((some[:, None] - mean) / spread)
-            counted = ~torch.isnan(some)[:, None] & ~torch.isnan(mean)  # silent, and with a prediction
+        for block in floor.split(max(MOST // max(mean.numel(), 1), 1)):
+            chance = torch.special.log_ndtr((block[:, None] - mean) / spread)
+            counted = ~torch.isnan(block)[:, None] & ~torch.isnan(mean)  # silent, and with a prediction
             parts.append(torch.where(counted, chance, torch.zeros_like(chance)).sum(2))
         silent = torch.cat(parts)
     return Misfit(squared, size, seen.sum(1), silent)

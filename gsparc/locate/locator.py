@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -16,10 +16,10 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.locate.calibration import calibrated, levelled
-from gsparc.locate.cells import Cells, cover
+from gsparc.locate.cells import Cells, cover  # noqa: F401 (a predictor covers its site with it)
 from gsparc.locate.likelihood import Trust
-from gsparc.locate.posterior import Posterior
-from gsparc.locate.search import Looked, Unknown, looked, misfit
+from gsparc.locate.posterior import Posterior, likeliest
+from gsparc.locate.search import Looked, Unknown, misfit
 from gsparc.locate.site_field import Moments, SiteField
 from gsparc.locate.snapshots import Snapshots, snapshots
 from gsparc.models.method import Method
@@ -30,7 +30,10 @@ log = logging.getLogger(__name__)
 
 MOST = 3_000  # cells of the coarse grid
 HELD_OUT = 200  # snapshots that trust is learned from, drawn evenly
-BOX = partial(cover, most=MOST, around=False)  # one can stand anywhere in the box of trained places
+HALVED = 16  # cells that are halved at a time
+KEPT = 0.9  # of the mass: cells beyond it stay as they are
+LEVELS = 8  # halvings of a cell
+ENOUGH = 32  # cells of one size that hold this mass need not be halved
 KEY = "locate"  # in a checkpoint's `extra`
 
 
@@ -80,15 +83,9 @@ class Locator:
     @classmethod
     def of(
         cls, method: Method, data: Measurements, rows: np.ndarray, unknown: Unknown, trust: Trust,
-        cells: Callable[[np.ndarray], Cells] = BOX, share: float = 0.9,
+        cells: Callable[[np.ndarray], Cells], share: float,
     ) -> Self:  # fmt: skip
-        """Of a method that was trained on rows (n,).
-
-        Args:
-            method: trained.
-            data, rows: what it learned from: where one can stand.
-            unknown, trust, share: see there.
-            cells: of a coarse grid where one can stand, from trained places (n, 3) [m, local].
+        """Of a method that was trained on rows (n,), with `cells` by their places (n, 3) [m, local].
 
         Raises:
             ValueError: both ends move, or the method states no variance.
@@ -101,21 +98,34 @@ class Locator:
         """Computed once: most of the time of the first snapshot."""
         return self.field.at(torch.from_numpy(self.cells.centre))
 
-    def look(self, heard: Snapshots, trust: Trust | None = None) -> Looked:
-        """One snapshot's misfit where it matters under a trust, the locator's own unless it is given."""
-        coarse = misfit(heard, self._coarse, self.unknown)
-        return looked(self.field, heard, self.cells, coarse, self.unknown, trust or self.trust)
+    def look(self, heard: Snapshots, trust: Trust) -> Looked:
+        """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
+        current = Looked(self.cells, misfit(heard, self._coarse, self.unknown))
+        for _ in range(LEVELS):
+            cells = current.cells
+            likely = likeliest(current.log_density(trust), cells.size, KEPT)
+            wide = cells.edge[likely].max(1)
+            likely, wide = likely[wide > trust.spread], wide[wide > trust.spread]
+            if not len(likely) or (len(likely) >= ENOUGH and wide.max() < 1.01 * wide.min()):
+                break
+            chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
+            finer = cells.at(chosen).halved()
+            more = misfit(heard, self.field.at(torch.from_numpy(finer.centre)), self.unknown)
+            rest = np.setdiff1d(np.arange(len(cells)), chosen)
+            others = current.misfit.at(torch.from_numpy(rest))
+            current = Looked(cells.at(rest).with_others(finer), others + more)
+        return current
 
     def locate(self, heard: Snapshots) -> list[Located]:
         """Each of n snapshots on its own."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
-        found = []
+        results = []
         for number in range(len(heard)):
             started = time.perf_counter()
-            posterior = self.look(heard.at(np.array([number]))).by(self.trust)
-            one = Located.of(posterior, self.trust.level, posterior.peak())
-            found.append(replace(one, seconds=time.perf_counter() - started))
-        return found
+            posterior = self.look(heard.at(np.array([number])), self.trust).by(self.trust)
+            located = Located.of(posterior, self.trust.level, posterior.peak())
+            results.append(replace(located, seconds=time.perf_counter() - started))
+        return results
 
 
 def trusted(
@@ -124,33 +134,28 @@ def trusted(
 ) -> tuple[Trust, int]:  # fmt: skip
     """How far such a method is trusted, from training places that it left out, and their number.
 
-    The method is trained again without each of a few groups of training rows, cut as the test rows were.
-
-    Args:
-        make: an unfitted method of the same settings.
-        data, fold: what the locator's method learned from.
-        context: of each training.
-        locator: of the whole method.
-        folds: groups.
-        cells: see `Locator.of`.
+    The method is made and trained again without each of a few groups (`folds`) of its training rows, cut as
+    the test rows were; `locator` is that of the whole method, `cells` as of `Locator.of`.
     """
     groups: list[tuple[Locator, Snapshots]] = []
     rng = np.random.default_rng(context.seed)
-    cut = cut_inside(data, fold, context.split, folds, context.seed).folds
-    for number, inner in enumerate(cut):
-        log.info("group %d of %d: trained without %d rows", number + 1, len(cut), len(inner.test))
+    inner_folds = cut_inside(data, fold, context.split, folds, context.seed).folds
+    for number, inner in enumerate(inner_folds):
+        log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
         method = for_links(make, data)
         method.fit(data, inner, context.within(f"group{number}"))
-        known = np.union1d(inner.train, inner.val)
-        own = Locator.of(method, data, known, locator.unknown, locator.trust, cells, locator.share)
+        rows = np.union1d(inner.train, inner.val)
+        without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)
-        chosen = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        groups.append((own, heard.at(chosen)))
+        drawn = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
+        groups.append((without, heard.at(drawn)))
     places = np.concatenate([heard.place for _, heard in groups])
 
     def looks(trust: Trust) -> list[Looked]:
         return [
-            own.look(heard.at(np.array([row])), trust) for own, heard in groups for row in range(len(heard))
+            without.look(heard.at(np.array([row])), trust)
+            for without, heard in groups
+            for row in range(len(heard))
         ]
 
     trust = calibrated(looks(locator.trust), places, locator.share, locator.trust)
@@ -171,17 +176,17 @@ def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
     Raises:
         ValueError: it was learned for other settings.
     """
-    found = extra.get(KEY)
-    if found is None:
+    stored = extra.get(KEY)
+    if stored is None:
         log.warning("locate: never calibrated, areas are as wide as the model's own variances say")
         return Trust(level=share)
-    before, promised = Unknown(**found["unknown"]), found["share"]
+    before, promised = Unknown(**stored["unknown"]), stored["share"]
     if (before, promised) != (unknown, share):
-        said = f"share={promised}, phase_known={before.phase_known}, offset_db={before.offset_db}"
+        settings = f"share={promised}, phase_known={before.phase_known}, offset_db={before.offset_db}"
         raise ValueError(
-            f"the model was calibrated with {said}: `gsparc locate` calibrates it for other settings"
+            f"the model was calibrated with {settings}: `gsparc locate` calibrates it for other settings"
         )
-    return Trust(**found["trust"])
+    return Trust(**stored["trust"])
 
 
 def in_world(located: Located, origin: np.ndarray) -> Located:

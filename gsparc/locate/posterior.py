@@ -47,9 +47,9 @@ class Posterior:
         """(G,) log mass by size of a cell, of total mass 1."""
         if not self.spread:
             return self.sharp
-        found = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
-        found = np.log(found + LEAST)
-        return np.asarray(found - logsumexp(found, b=self.cells.size))
+        density = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
+        logarithm = np.log(density + LEAST)
+        return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.size))
 
     @property
     def mass(self) -> np.ndarray:
@@ -72,9 +72,9 @@ class Posterior:
     @cached_property
     def _blurred(self) -> np.ndarray:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
-        some = np.zeros(len(self.cells), bool)
-        some[likeliest(self.sharp, self.cells.size, BLURRED)] = True
-        return some
+        blurred = np.zeros(len(self.cells), bool)
+        blurred[likeliest(self.sharp, self.cells.size, BLURRED)] = True
+        return blurred
 
     def _density(self, places: np.ndarray) -> np.ndarray:
         """Of the cells that are blurred, at places (m, 3)."""
@@ -82,13 +82,13 @@ class Posterior:
 
     def _parts(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What b blurred cells add to the density at places (m, b), their centres and precisions (b, d)."""
-        some, live = self._blurred, self.cells.edge.max(0) > 0
-        centre, edge = self.cells.centre[some][:, live], self.cells.edge[some][:, live]
+        live = self.cells.edge.max(0) > 0
+        centre, edge = (part[self._blurred][:, live] for part in (self.cells.centre, self.cells.edge))
         precision = 1 / (self.spread**2 + edge**2 / 12)
         middle = centre.mean(0)
         near, apart = centre - middle, places[:, live] - middle
         squared = apart**2 @ precision.T + (near**2 * precision).sum(1) - 2 * apart @ (near * precision).T
-        mass = np.exp(self.sharp[some]) * self.cells.size[some]
+        mass = np.exp(self.sharp[self._blurred]) * self.cells.size[self._blurred]
         weight = mass * np.sqrt(precision / (2 * np.pi)).prod(1)
         return np.exp(-0.5 * squared.clip(0)) * weight, centre, precision
 

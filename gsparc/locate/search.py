@@ -1,4 +1,4 @@
-"""From a coarse grid to fine cells where the likelihood has its mass."""
+"""Misfits of snapshots at cells, and what is known of a place by them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,9 @@ import torch
 from gsparc.locate import likelihood
 from gsparc.locate.cells import Cells
 from gsparc.locate.likelihood import Misfit, Trust
-from gsparc.locate.posterior import Posterior, likeliest
-from gsparc.locate.site_field import Moments, SiteField
+from gsparc.locate.posterior import Posterior
+from gsparc.locate.site_field import Moments
 from gsparc.locate.snapshots import Snapshots
-
-HALVED = 16  # cells that are halved at a time
-KEPT = 0.9  # of the mass: cells beyond it stay as they are
-LEVELS = 8  # halvings of a cell
-ENOUGH = 32  # cells of one size that hold this mass need not be halved
 
 
 @dataclass(frozen=True)
@@ -40,9 +35,14 @@ class Looked:
     cells: Cells
     misfit: Misfit
 
+    def log_density(self, trust: Trust) -> np.ndarray:
+        """(G,) of total mass 1."""
+        log_like, log_size = trust.log_likelihood(self.misfit)[0], torch.from_numpy(np.log(self.cells.size))
+        return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))
+
     def by(self, trust: Trust) -> Posterior:
         """What is known of the place."""
-        return Posterior(self.cells, _log_density(self.misfit, self.cells, trust), trust.spread)
+        return Posterior(self.cells, self.log_density(trust), trust.spread)
 
 
 def misfit(heard: Snapshots, there: Moments, unknown: Unknown) -> Misfit:
@@ -52,37 +52,3 @@ def misfit(heard: Snapshots, there: Moments, unknown: Unknown) -> Misfit:
     if heard.kind == "csi":
         return likelihood.of_channels(heard.values, there.mean, there.variance, unknown.phase_known)
     return likelihood.of_levels(heard.values, there.mean, there.variance, unknown.offset_db, heard.floor)
-
-
-def looked(
-    field: SiteField, heard: Snapshots, coarse: Cells, of_coarse: Misfit, unknown: Unknown, trust: Trust
-) -> Looked:
-    """Cells that are halved as long as few of them hold the mass.
-
-    Args:
-        field: asked about the middles of cells.
-        heard: one snapshot.
-        coarse: cells that cover where one can stand.
-        of_coarse: its misfit at these.
-        unknown, trust: see there.
-    """
-    cells, found = coarse, of_coarse
-    for _ in range(LEVELS):
-        some = likeliest(_log_density(found, cells, trust), cells.size, KEPT)
-        wide = cells.edge[some].max(1)
-        some, wide = some[wide > trust.spread], wide[wide > trust.spread]
-        if not len(some) or (len(some) >= ENOUGH and wide.max() < 1.01 * wide.min()):
-            break
-        chosen = some[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
-        finer = cells.at(chosen).halved()
-        more = misfit(heard, field.at(torch.from_numpy(finer.centre)), unknown)
-        rest = np.setdiff1d(np.arange(len(cells)), chosen)
-        cells = cells.at(rest).with_others(finer)
-        found = found.at(torch.from_numpy(rest)) + more
-    return Looked(cells, found)
-
-
-def _log_density(found: Misfit, cells: Cells, trust: Trust) -> np.ndarray:
-    """(G,) of one snapshot, of total mass 1."""
-    log_like, log_size = trust.log_likelihood(found)[0], torch.from_numpy(np.log(cells.size))
-    return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))

@@ -54,10 +54,10 @@ class SiteField:
         Raises:
             ValueError: the method states no variance.
         """
-        parts = [self._some(some) for some in places.split(CHUNK)]
+        parts = [self._chunk(chunk) for chunk in places.split(CHUNK)]
         return Moments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
 
-    def _some(self, places: Tensor) -> Moments:
+    def _chunk(self, places: Tensor) -> Moments:
         site, many = self.site, len(places) * self.count
         station = torch.arange(self.count).repeat(len(places))
         moving = places.float().repeat_interleave(self.count, 0)
@@ -74,12 +74,12 @@ class SiteField:
             station=None if site.stations is None else station,
         )  # fmt: skip
         with suited_threads(self.method, many):
-            found = self.method.answer(batch)
-        if found.variance is None:
+            prediction = self.method.answer(batch)
+        if prediction.variance is None:
             raise ValueError(
                 f"locate: {self.method.name} states no variance, and has no likelihood of a place"
             )
-        mean, variance = compared(found.mean), found.variance.double()[:, None]
+        mean, variance = compared(prediction.mean), prediction.variance.double()[:, None]
         if site.kind == "spectrum":
             return Moments(mean.double(), variance)
         if site.kind == "rssi":

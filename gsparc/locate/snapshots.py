@@ -48,31 +48,26 @@ def snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     """
     site = data.site
     rows = np.sort(np.asarray(rows))
-    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
     count = 1 if site.stations is None else len(site.stations)
-    number, visit = _groups(rows if data.place is None or count == 1 else data.place[rows], station)
-    keys, first, which = np.unique(np.c_[number, visit], axis=0, return_index=True, return_inverse=True)
+    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    place = rows if data.place is None or count == 1 else data.place[rows]
+    keys = np.c_[place, _repetition(np.c_[place, station])]
+    _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     which = which.reshape(-1)
-    silent = None if data.censored is None else data.censored[rows]
-    flat = compared(data.targets(rows))
-    own = flat.to(torch.complex128) if flat.is_complex() else flat.double()
+    measured = compared(data.targets(rows))
+    measured = measured.to(torch.complex128) if measured.is_complex() else measured.double()
     if site.kind == "rssi":
-        own = 10 * own.clamp_min(1e-30).log10()
+        measured = _decibels(measured)
+    silent = torch.from_numpy(np.zeros(len(rows), bool) if data.censored is None else data.censored[rows])
     if data.mask is not None:
-        mask = compared(torch.from_numpy(data.mask[rows]))
-        mask = mask if silent is None else mask | torch.from_numpy(silent)[:, None]
-        own = torch.where(mask, own, torch.full_like(own, np.nan))
-    each = own.shape[1]
-    values = torch.full((len(keys), count, each), np.nan, dtype=own.dtype)
-    values[which, station] = own
-    floor = None
-    if silent is not None and silent.any():
-        floor = torch.full_like(values, np.nan)
-        quiet = torch.from_numpy(silent)
-        floor[which[silent], station[silent]] = own[quiet]
-        values[which[silent], station[silent]] = np.nan
-        floor = floor.flatten(1)
-    return Snapshots(site.kind, values.flatten(1), floor, data.moving[rows][first], rows[first])
+        mask = compared(torch.from_numpy(data.mask[rows])) | silent[:, None]
+        measured = torch.where(mask, measured, torch.full_like(measured, np.nan))
+    values = torch.full((len(first), count, measured.shape[1]), np.nan, dtype=measured.dtype)
+    values[which, station] = measured
+    quiet = torch.zeros(values.shape, dtype=torch.bool)
+    quiet[which, station] = silent[:, None]
+    own = _without_silence(values.flatten(1), quiet.flatten(1) if silent.any() else None)
+    return Snapshots(site.kind, *own, data.moving[rows][first], rows[first])
 
 
 def of_values(
@@ -106,16 +101,9 @@ def of_values(
         raise ValueError("locate: there is a snapshot in which nothing was heard")
     scaled = heard.to(torch.complex128 if heard.is_complex() else torch.float64) / site.target_scale
     flat = (scaled if count is None or site.kind == "rssi" else scaled.flatten(0, 1)).contiguous()
-    own = (
-        10 * flat.clamp_min(1e-30).log10() if site.kind == "rssi" else compared(flat).reshape(len(heard), -1)
-    )
-    floor = None
-    if silent is not None:
-        quiet = torch.as_tensor(silent)
-        floor = torch.where(quiet, own, torch.full_like(own, np.nan))
-        own = torch.where(quiet, torch.full_like(own, np.nan), own)
-    nowhere = np.full((len(heard), 3), np.nan)
-    return Snapshots(site.kind, own, floor, nowhere, np.arange(len(heard)))
+    own = _decibels(flat) if site.kind == "rssi" else compared(flat).reshape(len(heard), -1)
+    parts = _without_silence(own, None if silent is None else torch.as_tensor(silent))
+    return Snapshots(site.kind, *parts, np.full((len(heard), 3), np.nan), np.arange(len(heard)))
 
 
 def compared(targets: Tensor) -> Tensor:
@@ -126,12 +114,22 @@ def compared(targets: Tensor) -> Tensor:
     return targets.flatten(1)
 
 
-def _groups(place: np.ndarray, station: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (m,) of places, and which visit of its station to its place each row is."""
-    order = np.lexsort((np.arange(len(place)), station, place))
-    key = np.c_[place, station][order]
-    fresh = np.r_[True, (key[1:] != key[:-1]).any(1)] if len(key) else np.zeros(0, bool)
-    begin = np.maximum.accumulate(np.where(fresh, np.arange(len(key)), 0))
-    visit = np.empty(len(place), np.int64)
-    visit[order] = np.arange(len(key)) - begin
-    return place, visit
+def _decibels(power: Tensor) -> Tensor:
+    return 10 * power.clamp_min(1e-30).log10()
+
+
+def _without_silence(values: Tensor, silent: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Values (n, P), NaN where `silent`, and the levels there, NaN elsewhere; None: everything was heard."""
+    if silent is None:
+        return values, None
+    gap = torch.full_like(values, np.nan)
+    return torch.where(silent, gap, values), torch.where(silent, values, gap)
+
+
+def _repetition(keys: np.ndarray) -> np.ndarray:
+    """How many rows before each (m,) have the same keys (m, k)."""
+    number = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(number, kind="stable")
+    earlier = np.empty(len(keys), np.int64)
+    earlier[order] = np.arange(len(keys)) - np.searchsorted(number[order], number[order])
+    return earlier

@@ -33,45 +33,45 @@ def speed(places: np.ndarray, seconds: np.ndarray, walk: np.ndarray) -> float:
     return float(np.median(gone[moved] / took[moved])) if moved.any() else 0.0
 
 
-def smoothed(alone: Sequence[Posterior], seconds: np.ndarray, metres_per_s: float) -> list[Posterior]:
+def smoothed(posteriors: Sequence[Posterior], seconds: np.ndarray, metres_per_s: float) -> list[Posterior]:
     """What is known of each place given all snapshots of a track, over its heaviest cells.
 
     Args:
-        alone: of each snapshot on its own, by an even prior.
+        posteriors: of each snapshot on its own, by an even prior.
         seconds: (n,) when each was heard.
         metres_per_s: a step of t seconds has the deviation `metres_per_s t / sqrt(2)` along an axis.
     """
     order = np.argsort(seconds, kind="stable")
-    some = [one.within(1.0)[:KEPT] for one in alone]
-    kept = [one.cells.at(chosen) for one, chosen in zip(alone, some, strict=True)]
-    mass = [one.mass[chosen] for one, chosen in zip(alone, some, strict=True)]
+    heaviest = [one.within(1.0)[:KEPT] for one in posteriors]
+    cells = [one.cells.at(chosen) for one, chosen in zip(posteriors, heaviest, strict=True)]
+    mass = [one.mass[chosen] for one, chosen in zip(posteriors, heaviest, strict=True)]
 
     def passed(over: list[np.ndarray], order: np.ndarray) -> None:
         """Multiplies masses `over` the cells of each snapshot by their density after all before it."""
         before = mass[order[0]]
         for start, end in pairwise(order):
-            cell = np.median(np.r_[kept[start].edge.max(1), kept[end].edge.max(1)])
+            cell = np.median(np.r_[cells[start].edge.max(1), cells[end].edge.max(1)])
             spread = max(metres_per_s * abs(seconds[end] - seconds[start]) / np.sqrt(2), cell / 2)
-            near = cdist(kept[end].centre, kept[start].centre, "sqeuclidean")
-            normal = (2 * np.pi * spread**2) ** ((kept[end].edge.max(0) > 0).sum() / 2)
+            near = cdist(cells[end].centre, cells[start].centre, "sqeuclidean")
+            normal = (2 * np.pi * spread**2) ** ((cells[end].edge.max(0) > 0).sum() / 2)
             step = np.exp(near / (-2 * spread**2)) @ (before / before.sum()) / normal
-            density = (1 - ANYWHERE) * step + ANYWHERE / alone[end].cells.size.sum()
+            density = (1 - ANYWHERE) * step + ANYWHERE / posteriors[end].cells.size.sum()
             over[end], before = over[end] * density, mass[end] * density
 
-    found = list(mass)
-    passed(found, order)
-    passed(found, order[::-1])
+    product = list(mass)
+    passed(product, order)
+    passed(product, order[::-1])
     return [
-        Posterior(cells, np.log(one / one.sum() / cells.size + 1e-300))
-        for cells, one in zip(kept, found, strict=True)
+        Posterior(some, np.log(one / one.sum() / some.size + 1e-300))
+        for some, one in zip(cells, product, strict=True)
     ]
 
 
-def as_looked(known: Posterior) -> Looked:
+def as_looked(posterior: Posterior) -> Looked:
     """The same for calibration: of a trust its temperature alone changes it."""
-    density = torch.from_numpy(known.log_density)[None]
+    density = torch.from_numpy(posterior.log_density)[None]
     none = torch.zeros_like(density)
-    return Looked(known.cells, Misfit(none, none, none[:, 0], density))
+    return Looked(posterior.cells, Misfit(none, none, none[:, 0], density))
 
 
 def followed(alone: Sequence[Located], trained: Snapshots, heard: Snapshots, level: float) -> list[Located]:

@@ -92,8 +92,8 @@ class World:
         rows = np.arange(len(self.users)) if rows is None else rows
         parts = []
         for some in np.array_split(rows, max(1, len(rows) // CHUNK)):
-            rays = Rays(self.rays.gain[some], self.rays.delay[some], self.rays.direction[some])
-            parts.append(rays.response(array(), CARRIER_HZ, frequency_hz).astype(np.complex64))
+            response = self.rays.at(some).response(array(), CARRIER_HZ, frequency_hz)
+            parts.append(response.astype(np.complex64))
         return np.concatenate(parts)
 
 
@@ -113,8 +113,7 @@ def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
     decoded = np.flatnonzero(power > noise * 10 ** (DECODED_DB / 10))[:count]
     if len(decoded) < count:
         raise ValueError(f"argos-sim: only {len(decoded)} of {count} users are decoded")
-    kept = Rays(rays.gain[decoded], rays.delay[decoded], rays.direction[decoded])
-    return World(users[decoded], kept, noise)
+    return World(users[decoded], rays.at(decoded), noise)
 
 
 def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:

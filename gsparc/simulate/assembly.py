@@ -14,7 +14,7 @@ from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import ARRAYS, Paths, starts
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
@@ -66,7 +66,7 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
 def assemble(
     campaign: Campaign,
     survey: Survey,
-    effects: Effects,
+    effects: PropagationEffects,
     choice: Choice | None,
     convergence: Convergence | None,
     seconds: float,
@@ -74,12 +74,8 @@ def assemble(
 ) -> Assembled:
     """Put the shards, all of them there, together, write the file, drop the shards.
 
-    One shard is in memory at a time; what is large is put together on disk.
-
-    Args:
-        campaign, survey, effects, choice, convergence: what the file is of.
-        seconds: spent on anything but the shards, which know their own; both are the file's `simulate_s` [s].
-        shards: from where, and to which file.
+    One shard is in memory at a time; what is large is put together on disk. `seconds` [s] were spent on
+    anything but the shards, which know their own; both are the file's `simulate_s`.
 
     Raises:
         ValueError: nothing reaches any receiver.
@@ -116,9 +112,6 @@ def assemble(
     return Assembled(data, power, whole["delay_spread"], facts)
 
 
-Arrays = Mapping[str, np.ndarray]
-
-
 def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
     """What the shards hold of all rows, in their order."""
     counts = np.zeros(rows, dtype=np.int64)
@@ -140,7 +133,11 @@ def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
 
 
 def _arrays(
-    campaign: Campaign, survey: Survey, effects: Effects, whole: Arrays, paths: Paths
+    campaign: Campaign,
+    survey: Survey,
+    effects: PropagationEffects,
+    whole: Mapping[str, np.ndarray],
+    paths: Paths,
 ) -> dict[str, np.ndarray]:
     scene, wavelength = campaign.scene, survey.engine.wavelength
     spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
@@ -197,7 +194,7 @@ def _ends(survey: Survey) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _provenance(campaign: Campaign, engine: Engine, effects: Effects) -> dict[str, Any]:
+def _provenance(campaign: Campaign, engine: Engine, effects: PropagationEffects) -> dict[str, Any]:
     """Attributes of the file: what it is and how it was made."""
     return {
         "name": campaign.scene.name,

@@ -1,4 +1,4 @@
-"""Contribution of each effect at each receiver, from the interaction record of one full simulation.
+"""Contribution of each propagation effect at each receiver, from the interactions of one full simulation.
 
 Nothing is traced again: without an effect the solver draws other rays, and the difference would include
 the solver's noise.
@@ -14,12 +14,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
 SILENCE_DB = 99.0  # error of a receiver that loses everything
 REQUIREMENT = re.compile(r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE)
+DEFAULTS = {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}  # where the text gives no number
 
 
 @dataclass(frozen=True)
@@ -44,19 +45,16 @@ class Deliverable:
         Raises:
             ValueError: none of these.
         """
-        found = REQUIREMENT.fullmatch(text.strip())
-        if not (found and 0 < quantile < 1):
+        match = REQUIREMENT.fullmatch(text.strip())
+        if not (match and 0 < quantile < 1):
             expected = "'coverage +-1 dB', 'csi -20 dB' or 'spectrum skill 0.9'"
             raise ValueError(f"effects.deliverable={text!r}: expected {expected}")
-        kind = found[1].lower()
-        number = float(found[2] or {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}[kind])
-        if kind == "coverage":
-            return Deliverable("coverage", abs(number), quantile)
-        if kind == "csi":
-            return Deliverable("csi", -abs(number), quantile)
-        if not 0 < number < 1:
+        kind: Any = match[1].lower()
+        number = float(match[2] or DEFAULTS[kind])
+        if kind == "spectrum" and not 0 < number < 1:
             raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
-        return Deliverable("spectrum", round(1 - number, 6), quantile)
+        tolerance = {"coverage": abs(number), "csi": -abs(number), "spectrum": round(1 - number, 6)}[kind]
+        return Deliverable(kind, tolerance, quantile)
 
     def __str__(self) -> str:
         share = f"for {self.quantile:.0%} of the receivers"
@@ -82,7 +80,7 @@ class Probe:
     """
 
     paths: Paths
-    effects: Effects
+    effects: PropagationEffects
     frequency_hz: np.ndarray
     wavelength: float
     elements: np.ndarray
@@ -93,17 +91,18 @@ class Probe:
     def _kinds(self) -> tuple[np.ndarray, np.ndarray]:
         """Kinds of paths, by interactions and order (C, 2), and the kind (P,) of each path.
 
-        Every question sums over kinds: paths are gone through once, however many sets of effects are asked.
+        Sums over kinds serve every set of effects: paths are gone through once.
         """
         kinds = np.stack([self.paths.mechanisms, self.paths.order], axis=1)
-        return np.unique(kinds, axis=0, return_inverse=True)
+        unique, which = np.unique(kinds, axis=0, return_inverse=True)
+        return unique, which.reshape(-1)
 
     @cached_property
     def _power(self) -> np.ndarray:
         """(ports, C, R)."""
         kinds, which = self._kinds
         power, count = np.abs(self.paths.gain.astype(np.complex128)) ** 2, len(self.paths)
-        cell = which.reshape(-1) * count + self.paths.owner
+        cell = which * count + self.paths.owner
         return np.stack([
             np.bincount(cell, weights=one, minlength=len(kinds) * count).reshape(-1, count) for one in power.T
         ])  # fmt: skip
@@ -112,9 +111,7 @@ class Probe:
     def _channels(self) -> np.ndarray:
         """(C, R, ports x M, K)."""
         kinds, which = self._kinds
-        parts = (self.paths.select(which.reshape(-1) == i) for i in range(len(kinds)))
-        asked = self.frequency_hz, self.elements, self.wavelength
-        return np.stack([part.responses(*asked) for part in parts])
+        return np.stack([self._responses(self.paths.select(which == kind)) for kind in range(len(kinds))])
 
     @cached_property
     def _images(self) -> tuple[np.ndarray, np.ndarray]:
@@ -128,79 +125,72 @@ class Probe:
         """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
-    def shares(self, kept: Effects | Paths) -> np.ndarray:
+    def shares(self, remaining: PropagationEffects | Paths) -> np.ndarray:
         """Share of each receiver's power that is lost (R,), negative where more arrives.
 
         Args:
-            kept: effects, here and below; or another trace of these receivers, of fewer rays.
+            remaining: effects, here and below; or another trace of these receivers, of fewer rays.
         """
         full = self._power.sum((0, 1))
-        if isinstance(kept, Paths):
-            rest = kept.received_power()
+        if isinstance(remaining, Paths):
+            rest = remaining.received_power()
         else:
-            ports = len(self._power) if kept.polarisation else 1
-            rest = self._power[:ports, self._allowed(kept)].sum((0, 1))
+            ports = len(self._power) if remaining.polarisation else 1
+            rest = self._power[:ports, remaining.allows(*self._kinds[0].T)].sum((0, 1))
         return 1 - rest / np.where(full > 0, full, 1)
 
-    def nmse(self, kept: Effects | Paths) -> np.ndarray:
+    def nmse(self, remaining: PropagationEffects | Paths) -> np.ndarray:
         """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
         full = self._channels.sum(0)
-        if isinstance(kept, Paths):
-            rest = kept.responses(self.frequency_hz, self.elements, self.wavelength)
+        if isinstance(remaining, Paths):
+            rest = self._responses(remaining)
         else:
-            rest = self._channels[self._allowed(kept)].sum(0)
-            rest = rest if kept.polarisation else rest[:, : len(self.elements)]
+            rest = self._channels[remaining.allows(*self._kinds[0].T)].sum(0)
+            rest = rest if remaining.polarisation else rest[:, : len(self.elements)]
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
         energy = (np.abs(full) ** 2).sum((1, 2))
         return error / np.where(energy > 0, energy, 1)
 
-    def errors(self, kept: Effects | Paths, deliverable: Deliverable) -> np.ndarray:
+    def errors(self, remaining: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
         """The deliverable's error at each receiver (R,), in the unit of its tolerance."""
+        least = 10 ** (-SILENCE_DB / 10)
         if deliverable.kind == "coverage":
-            remains = np.maximum(1 - self.shares(kept), 10 ** (-SILENCE_DB / 10))
-            return np.abs(10 * np.log10(remains))
+            return np.abs(10 * np.log10(np.maximum(1 - self.shares(remaining), least)))
         if deliverable.kind == "csi":
-            return 10 * np.log10(np.maximum(self.nmse(kept), 10 ** (-SILENCE_DB / 10)))
+            return 10 * np.log10(np.maximum(self.nmse(remaining), least))
         full, near = self._images
-        if isinstance(kept, Effects):
-            left = full if kept == self.effects else self._render(self.paths.under(kept))
-        else:
-            left = self._render(kept)
-        error, rival = (((image - full) ** 2).mean((1, 2)) for image in (left, near))
-        return error / np.maximum(rival, 1e-12)
+        rest = remaining if isinstance(remaining, Paths) else self.paths.under(remaining)
+        image = full if remaining == self.effects else self._render(rest)
+        error, nearest = (((other - full) ** 2).mean((1, 2)) for other in (image, near))
+        return error / np.maximum(nearest, 1e-12)
 
-    def _allowed(self, kept: Effects) -> np.ndarray:
-        return kept.allows(*self._kinds[0].T)
+    def _responses(self, paths: Paths) -> np.ndarray:
+        return paths.responses(self.frequency_hz, self.elements, self.wavelength)
 
     def _render(self, paths: Paths) -> np.ndarray:
         return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
 
 
-def removals(full: Effects) -> dict[str, Effects]:
+def removals(full: PropagationEffects) -> dict[str, PropagationEffects]:
     """What can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation."""
-    found = {name: less for name in full.on if (less := _without(full, name)) is not None}
-    found |= {f"depth > {depth}": replace(full, depth=depth) for depth in range(full.depth - 1, 0, -1)}
-    if full.polarisation:
-        found["polarisation"] = replace(full, polarisation=False)
-    return found
+    names = [*full.on, *(f"depth > {depth}" for depth in range(full.depth - 1, 0, -1))]
+    names += ["polarisation"] if full.polarisation else []
+    return {name: less for name in names if (less := _without(full, name)) is not None}
 
 
-def combinations(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
+def combinations(full: PropagationEffects, removable: tuple[str, ...]) -> list[PropagationEffects]:
     """Every set of switches that leaves out some of `removable` (names as in `removals`); `full` first."""
     sets = {full}
     for name in removable:
-        if name.startswith("depth > "):
-            sets |= {replace(s, depth=min(s.depth, int(name[8:]))) for s in sets}
-        elif name == "polarisation":
-            sets |= {replace(s, polarisation=False) for s in sets}
-        else:
-            sets |= {less for less in (_without(s, name) for s in sets) if less is not None}
+        sets |= {less for less in (_without(one, name) for one in sets) if less is not None}
     return sorted(sets, key=lambda s: (len(full.on) - len(s.on), full.depth - s.depth, not s.polarisation))
 
 
-def _without(effects: Effects, name: str) -> Effects | None:
+def _without(effects: PropagationEffects, name: str) -> PropagationEffects | None:
     """None when nothing would be left."""
+    if name.startswith("depth > "):
+        return replace(effects, depth=min(effects.depth, int(name[8:])))
     try:
         return effects.without(name)
     except ValueError:
@@ -212,35 +202,34 @@ def reasons(
 ) -> dict[str, str]:
     """Why an effect should or should not matter, by its name; absent where there is no short one.
 
-    Args:
-        probe: everything on.
-        distances: (R,) [m] between the ends.
-        materials: of the scene; `permittivity`, `thickness_m` and `scattering` are read where given.
+    Distances (R,) [m] are between the ends; of materials `permittivity`, `thickness_m` and `scattering` are
+    read where given.
     """
     wavelength, paths = probe.wavelength, probe.paths
     distance = float(np.median(distances))
     sight = paths.per_receiver((paths.order == 0).astype(float)) > 0
     zone = f"first Fresnel zone {np.sqrt(wavelength * distance) / 2:.2g} m wide at {distance:.3g} m"
     rough = [m["scattering"] ** 2 for m in materials.values() if m.get("scattering")]
-    found = {
+    reasons = {
         "line_of_sight": f"{sight.mean():.0%} of the receivers see the transmitter",
         "diffraction": f"{zone}; {1 - sight.mean():.0%} shadowed",
         "diffuse": f"smooth below {wavelength / 8 * 1e3:.2g} mm of relief (Rayleigh)"
         + (f"; S^2 is {min(rough):.1%} to {max(rough):.1%} of a reflection" if rough else ""),
     }
-    losses = {name: _normal_incidence(m, wavelength) for name, m in materials.items() if _slab(m)}
+    # A conductor's permittivity is 1: its loss is not in this number.
+    slabs = {name: m for name, m in materials.items() if float(m.get("permittivity", 0.0)) > 1.01}
+    losses = {
+        name: _normal_incidence(m, wavelength)
+        for name, m in slabs.items()
+        if float(m.get("thickness_m", 0.0)) > 0
+    }
     if losses:
         through = {f"{loss:.1f} dB ({name})": loss for name, (_, loss) in losses.items()}
         clearest, densest = min(through, key=through.__getitem__), max(through, key=through.__getitem__)
-        found["refraction"] = f"a sheet costs {clearest} to {densest}"
+        reasons["refraction"] = f"a sheet costs {clearest} to {densest}"
         mirror = -10 * np.log10(np.median([10 ** (-loss / 10) for loss, _ in losses.values()]))
-        found["depth"] = f"a reflection costs about {mirror:.0f} dB"
-    return found
-
-
-def _slab(material: Mapping[str, Any]) -> bool:
-    # A conductor's permittivity is 1: its loss is not in this number.
-    return float(material.get("permittivity", 0.0)) > 1.01 and float(material.get("thickness_m", 0.0)) > 0
+        reasons["depth"] = f"a reflection costs about {mirror:.0f} dB"
+    return reasons
 
 
 def _normal_incidence(material: Mapping[str, Any], wavelength: float) -> tuple[float, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,10 +11,8 @@ import numpy as np
 from scipy.stats import binom
 
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths
-
-log = logging.getLogger(__name__)
 
 # Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
 # street canyon and in the conference room (docs/results/simulate.md). It ranks sets of effects; what a choice
@@ -53,7 +50,7 @@ class AutoSettings:
     held_back: int = 128
     rays: float = 0.3
     reuse: bool = True
-    full: Effects = field(default_factory=lambda: Effects(depth=5))
+    full: PropagationEffects = field(default_factory=lambda: PropagationEffects(depth=5))
 
     def __post_init__(self) -> None:
         if self.probes < 16 or self.held_back < 16:
@@ -68,6 +65,11 @@ class AutoSettings:
     def required(self) -> Deliverable:
         """The requirement."""
         return Deliverable.parse(self.deliverable, self.quantile)
+
+    def allowed_failures(self, heard: int, last: bool) -> tuple[int, int]:
+        """`allowed_failures` where so many receivers are all, or those of the first look."""
+        first, all_ = (first_look(heard), heard) if last else (heard, round(heard / FIRST_LOOK))
+        return allowed_failures(first, all_, self.quantile, self.confidence)
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ class Choice:
         reused: whether it was taken over from an earlier run.
     """
 
-    effects: Effects
+    effects: PropagationEffects
     deliverable: str
     table: tuple[EffectRow, ...]
     probes: int
@@ -165,68 +167,65 @@ class Choice:
         verdict = None if stored["verdict"] is None else Verification(**stored["verdict"])
         table = tuple(EffectRow(**row) for row in stored["table"])
         return Choice(
-            **{**stored, "effects": Effects(**stored["effects"]), "table": table, "verdict": verdict}
+            **{
+                **stored,
+                "effects": PropagationEffects(**stored["effects"]),
+                "table": table,
+                "verdict": verdict,
+            }
         )
 
 
-def decide(
-    probe: Probe, settings: AutoSettings, explain: Callable[[Probe], Mapping[str, str]], last: bool = True
-) -> Choice | None:
+def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | None:
     """The cheapest effects that meet the requirement; None where more probes are needed to say.
 
     Args:
         probe: receivers traced with everything: the first look's, or all probes.
         settings: requirement and confidence.
-        explain: prior reasons by effect.
         last: whether these are all probes, so that an effect that is not clearly out stays in.
 
     Raises:
         ValueError: nothing reaches any of them.
     """
-    full, deliverable, reached = probe.effects, settings.required, probe.reached
-    if not reached.any():
+    full, required, heard = probe.effects, settings.required, int(probe.reached.sum())
+    if not heard:
         if not last:
             return None
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
-    early, late = _most(int(reached.sum()), last, settings)
+    early, late = settings.allowed_failures(heard, last)
     most = late if last else early
-    dropped = removals(full)
-    errors = {name: probe.errors(kept, deliverable)[reached] for name, kept in dropped.items()}
-    failures = {name: int((error > deliverable.tolerance).sum()) for name, error in errors.items()}
-    removable = tuple(name for name, failed in failures.items() if failed <= most)
-    if not last and any(most < failed <= late for failed in failures.values()):
+    rows = [_row(name, probe, less, required) for name, less in removals(full).items()]
+    if any(most < row.failures <= late for row in rows):
         return None
-    sets = sorted(combinations(full, removable), key=lambda some: price(some, full))
 
-    def holds(some: Effects) -> bool:
-        return bool((probe.errors(some, deliverable)[reached] > deliverable.tolerance).sum() <= most)
+    def holds(effects: PropagationEffects) -> bool:
+        errors = probe.errors(effects, required)[probe.reached]
+        return bool((errors > required.tolerance).sum() <= most)
 
-    chosen = _cheapest(sets, holds, full)
-    why, table = explain(probe), []
-    for name, less in dropped.items():
-        effect, _, depth = name.partition(" > ")
-        kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, name))
-        share = probe.shares(less)[reached]
-        row = _row(name, share, probe.nmse(less)[reached], errors[name], failures[name], kept)
-        table.append(replace(row, reason=why.get(effect, "")))
-    return Choice(chosen, str(deliverable), tuple(table), len(reached))
+    removable = tuple(row.effect for row in rows if row.failures <= most)
+    sets = sorted(combinations(full, removable), key=lambda effects: price(effects, full))
+    chosen, table = _cheapest(sets, holds, full), []
+    for row in rows:
+        effect, _, depth = row.effect.partition(" > ")
+        kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, effect))
+        table.append(replace(row, kept=kept))
+    return Choice(chosen, str(required), tuple(table), len(probe.reached))
 
 
-def verify(choice: Choice, settings: AutoSettings, held_back: Probe, traced: Paths | None = None) -> Choice:
-    """The choice with its verification on held-back receivers.
+def explained(choice: Choice, reasons: Mapping[str, str]) -> Choice:
+    """The choice with expectations from physics, by effect."""
+    table = (replace(row, reason=reasons.get(row.effect.split(" > ")[0], "")) for row in choice.table)
+    return replace(choice, table=tuple(table))
 
-    By path attribution in a full run, or by what is left of it, `traced` with fewer rays.
-    """
-    deliverable = settings.required
-    left = choice.effects if traced is None else traced
-    errors = held_back.errors(left, deliverable)[held_back.reached]
+
+def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice:
+    """The choice with its verification, by errors (n,) of the deliverable at held-back receivers."""
     if not len(errors):
         return choice
-    met = float((errors <= deliverable.tolerance).mean())
-    kept = met >= deliverable.quantile
-    verdict = Verification(len(errors), met, float(np.median(errors)), _p95(errors), kept)
+    met = float((errors <= settings.required.tolerance).mean())
+    verdict = Verification(len(errors), met, float(np.median(errors)), _p95(errors), met >= settings.quantile)
     return replace(choice, verdict=verdict)
 
 
@@ -236,26 +235,19 @@ def fewer_rays(
     """The choice with fewer rays, or without them; None where more probes are needed to say.
 
     Args:
-        choice: effects.
-        settings: requirement and confidence.
-        probe: receivers traced with everything: the first look's, or all probes.
-        traced: the same with the choice's effects and fewer rays.
-        samples: how many.
-        last: whether these are all probes.
+        choice, settings, probe, last: as of `decide`.
+        traced: the probe's receivers with the choice's effects and so many `samples`.
     """
-    deliverable, reached = settings.required, probe.reached
-    error = probe.errors(traced, deliverable)[reached]
-    failed = int((error > deliverable.tolerance).sum())
-    early, late = _most(len(error), last, settings)
-    if not last and failed == early + 1:  # with more, a second look would mostly be in vain, and it costs
+    row = _row(f"rays > {samples}", probe, traced, settings.required)
+    early, late = settings.allowed_failures(int(probe.reached.sum()), last)
+    if not last and row.failures == early + 1:  # with more, a second look would mostly be in vain
         return None
-    enough = failed <= (late if last else early)
-    share, nmse = np.abs(probe.shares(traced)[reached]), probe.nmse(traced)[reached]
-    row = _row(f"rays > {samples}", share, nmse, error, failed, not enough)
-    return replace(choice, table=(*choice.table, row), samples=samples if enough else None)
+    enough = row.failures <= (late if last else early)
+    table = (*choice.table, replace(row, kept=not enough))
+    return replace(choice, table=table, samples=samples if enough else None)
 
 
-def everything(choice: Choice, full: Effects) -> Choice:
+def everything(choice: Choice, full: PropagationEffects) -> Choice:
     """All effects, in place of a choice that held-back receivers refute; the verdict is on the latter."""
     table = tuple(replace(row, kept=True) for row in choice.table)
     return replace(choice, effects=full, refuted=str(choice.effects), table=table)
@@ -293,38 +285,34 @@ def allowed_failures(first: int, all_: int, quantile: float, confidence: float) 
     return int(early), late
 
 
-def price(some: Effects, full: Effects, rays: float = 1.0) -> float:
-    """Expected time of tracing with `some` and a share of the rays, 1 with everything."""
-    off = [name for name in full.on if name not in some.on]
-    off += ["polarisation"] if full.polarisation and not some.polarisation else []
-    bounces = 1 - BOUNCES + BOUNCES * some.depth / max(full.depth, 1)
+def price(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
+    """Expected time of tracing with some effects and a share of the rays, 1 with everything."""
+    off = [name for name in full.on if name not in effects.on]
+    off += ["polarisation"] if full.polarisation and not effects.polarisation else []
+    bounces = 1 - BOUNCES + BOUNCES * effects.depth / max(full.depth, 1)
     return bounces * math.prod(1 - PRICE[name] for name in off) * (1 - RAYS + RAYS * rays)
 
 
-def _most(heard: int, last: bool, settings: AutoSettings) -> tuple[int, int]:
-    """`allowed_failures` of so many receivers: the first look's, or all."""
-    first, all_ = (first_look(heard), heard) if last else (heard, round(heard / FIRST_LOOK))
-    return allowed_failures(first, all_, settings.quantile, settings.confidence)
-
-
-def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effects) -> Effects:
+def _cheapest(
+    sets: list[PropagationEffects], holds: Callable[[PropagationEffects], bool], full: PropagationEffects
+) -> PropagationEffects:
     """The cheapest set that meets the requirement; of sets with similar prices, the smallest."""
-    found: list[Effects] = []
-    for some in sets:
-        if found and price(some, full) > (1 + SIMILAR) * price(found[0], full):
+    enough: list[PropagationEffects] = []
+    for effects in sets:
+        if enough and price(effects, full) > (1 + SIMILAR) * price(enough[0], full):
             break
-        if holds(some):
-            found.append(some)
-    return min(found, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
+        if holds(effects):
+            enough.append(effects)
+    return min(enough, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
 
 
-def _row(
-    name: str, share: np.ndarray, nmse: np.ndarray, error: np.ndarray, failures: int, kept: bool
-) -> EffectRow:
-    """A row of the table, without a reason."""
+def _row(name: str, probe: Probe, less: PropagationEffects | Paths, required: Deliverable) -> EffectRow:
+    """What is lost with `less`, at receivers that something reaches; kept until it is clear."""
+    parts = np.abs(probe.shares(less)), probe.nmse(less), probe.errors(less, required)
+    share, nmse, error = (part[probe.reached] for part in parts)
     return EffectRow(
         name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
-        float(np.median(error)), _p95(error), failures, "", kept,
+        float(np.median(error)), _p95(error), int((error > required.tolerance).sum()), "", True,
     )  # fmt: skip
 
 

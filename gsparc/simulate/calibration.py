@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.raytracer import RayTracer
 
 log = logging.getLogger(__name__)
@@ -74,11 +74,10 @@ class Calibration:
 
 def used_materials(tracer: RayTracer) -> dict[str, Material]:
     """Materials of the scene's surfaces, as the tracer has them."""
-    return {name: _read(one) for name, one in sorted(tracer.surfaces().items())}
-
-
-def _read(material: Any) -> Material:
-    return Material(float(material.relative_permittivity[0]), float(material.conductivity[0]))
+    return {
+        name: Material(float(one.relative_permittivity[0]), float(one.conductivity[0]))
+        for name, one in sorted(tracer.surfaces().items())
+    }
 
 
 def apply(tracer: RayTracer, materials: Mapping[str, Material]) -> None:
@@ -95,20 +94,17 @@ def apply(tracer: RayTracer, materials: Mapping[str, Material]) -> None:
 
 
 class Replay:
-    """Paths of receivers, kept with what is needed to send fields along them again.
+    """Paths of receivers (R, 3) [m], world, with what is needed to send fields along them again.
 
-    Args:
-        tracer: of the scene; its present materials decide which paths are tried.
-        receivers: (R, 3) [m], world.
-        effects: that are traced.
+    The tracer's present materials decide which paths are tried.
     """
 
-    def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: Effects) -> None:
+    def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: PropagationEffects) -> None:
         self.tracer, self._count = tracer, len(receivers)
         self._parts: list[tuple[dict[str, Any], Any]] = []
         first = 0
-        for found, count in tracer.solutions(receivers, effects):
-            self._parts.append(_kept(tracer, found, effects, first))
+        for solution, count in tracer.solutions(receivers, effects):
+            self._parts.append(_field_arguments(tracer, solution, effects, first))
             first += count
 
     def powers(self) -> np.ndarray:
@@ -146,8 +142,10 @@ class Replay:
         apply(self.tracer, {name: Material.of(pair) for name, pair in materials.items()})  # without gradients
         lost = ~np.isfinite(gradient)
         if lost.any():
-            said = "%d of %d slopes by materials are not finite: these do not move in this step"
-            log.warning(said, int(lost.sum()), len(gradient))
+            log.warning(
+                "%d of %d slopes by materials are not finite: these do not move in this step",
+                int(lost.sum()), len(gradient),
+            )  # fmt: skip
         return value, np.where(lost, 0.0, gradient)
 
     def _powers(self) -> Any:
@@ -170,11 +168,13 @@ class Replay:
         return total
 
 
-def _kept(tracer: RayTracer, found: Any, effects: Effects, first: int) -> tuple[dict[str, Any], Any]:
+def _field_arguments(
+    tracer: RayTracer, solution: Any, effects: PropagationEffects, first: int
+) -> tuple[dict[str, Any], Any]:
     """Arguments of the field calculator, and the receivers of the paths, from `first` on."""
     import mitsuba as mi
 
-    scene, buffer = tracer.scene, found._paths_buffer
+    scene, buffer = tracer.scene, solution._paths_buffer
     sources, turned, *_ = scene.sources(True, True)
     targets, facing, *_ = scene.targets(True, True)
     arguments = {
@@ -220,13 +220,14 @@ def calibrate(
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal spent, best
         spent += 1
-        held = [0.0, 0.0]
+        gain, scale = 0.0, 0.0
 
         def slopes(level: np.ndarray) -> tuple[float, np.ndarray]:
             # Of largest likelihood gain and scale have no slope: that of the rest is the whole one.
+            nonlocal gain, scale
             missed, by_level = measured_db[reached] - level[reached], np.zeros(len(level))
-            held[:] = gain_and_scale(missed)
-            value, by_level[reached] = student(held[0] - missed, held[1])
+            gain, scale = gain_and_scale(missed)
+            value, by_level[reached] = student(gain - missed, scale)
             return value, by_level
 
         value, by_material = replay.decibels(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
@@ -234,7 +235,7 @@ def calibrate(
         # Of a row: the search begins with a step as long as the gradient.
         value = (value + 0.5 * float(away @ away)) / len(traced)
         if value < best[0]:
-            best = (value, x.copy(), held[0], held[1])
+            best = (value, x.copy(), gain, scale)
         return value, (by_material + away / deviation) / len(traced)
 
     bounds = [(c - RANGE * d, c + RANGE * d) for c, d in zip(centre, deviation, strict=True)]

@@ -15,9 +15,9 @@ from gsparc.data.executor import each
 from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.convergence import Convergence, compare
+from gsparc.simulate.convergence import Convergence, convergence
 from gsparc.simulate.deciding import Changed, Decision
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.scenes.build import build
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 
 STAGES = ("build", "decide", "trace", "converge", "write")
 PARTS = 3  # version of what a shard holds: those of another are refused
-CHECKED = 0.25  # largest share of the rows that is traced again
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,7 @@ class Outcome:
     """A finished dataset and what it cost.
 
     Attributes:
-        made: the file and facts about it.
-        survey: its rows.
-        effects: that were simulated.
+        made, survey, effects: the file, its rows, and what was simulated.
         choice, changed: of `auto`; else None.
         convergence: between two seeds; None where there are no rays.
         seconds: by stage [s].
@@ -45,7 +42,7 @@ class Outcome:
 
     made: Assembled
     survey: Survey
-    effects: Effects
+    effects: PropagationEffects
     choice: Choice | None
     changed: Changed | None
     convergence: Convergence | None
@@ -54,10 +51,6 @@ class Outcome:
 
 def simulate(campaign: Campaign, out: Path) -> Outcome:
     """Make the dataset, or go on where an interrupted run stopped.
-
-    Args:
-        campaign: what is simulated.
-        out: the file.
 
     Raises:
         ValueError: `out` exists, or parts beside it belong to another simulation, or bad settings.
@@ -69,44 +62,43 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     survey = build(campaign.scene, campaign.sampling)
     shards = Shards(out, {**asdict(campaign), "parts": PARTS, "inputs": campaign.inputs()})
     laps.append(time.perf_counter())
-    decision, effects, decided_s = None, campaign.effects, 0.0
+    effects, choice, changed, left_out = campaign.effects, None, None, deciding.NONE
     if isinstance(effects, AutoSettings):
-        decision = _choose(campaign, effects, survey, shards)
-        effects, decided_s = decision.effects, decision.choice.seconds
-    asked = campaign
-    if decision is not None and decision.samples is not None:
-        campaign = replace(campaign, sampling=replace(campaign.sampling, samples=decision.samples))
-        survey = survey.thinned(decision.samples)
+        decider = deciding.Decider(campaign, effects, survey)
+        decision = _decided(decider, shards)
+        effects, choice, changed = decision.effects, decision.choice, decision.changed
+        if decision.samples is not None:
+            campaign = replace(campaign, sampling=replace(campaign.sampling, samples=decision.samples))
+            survey = survey.thinned(decision.samples)
+            left_out = _decided_on(shards)  # these rows have more rays than the others
     effects = survey.engine.supported(effects)
     laps.append(time.perf_counter())
     row_s = _trace_all(campaign, survey, effects, shards)
-    choice = None if decision is None else decision.choice
-    if decision is not None and decision.as_chosen and row_s and isinstance(asked.effects, AutoSettings):
-        choice = replace(decision.choice, row_chosen=row_s)
-        deciding.Decider(asked, asked.effects, survey).remember(choice)
+    if choice is not None and decision.as_chosen and row_s:
+        choice = replace(choice, row_chosen=row_s)
+        decider.remember(choice)
     laps.append(time.perf_counter())
-    convergence = _converge(campaign, survey, effects, shards, campaign.sampling != asked.sampling)
+    error = convergence(campaign, survey, effects, shards, left_out)
     laps.append(time.perf_counter())
-    other_s = laps[1] - laps[0] + decided_s + laps[4] - laps[3]
-    made = assemble(campaign, survey, effects, choice, convergence, other_s, shards)
+    other_s = laps[1] - laps[0] + (0.0 if choice is None else choice.seconds) + laps[4] - laps[3]
+    made = assemble(campaign, survey, effects, choice, error, other_s, shards)
     laps.append(time.perf_counter())
     seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
-    changed = None if decision is None else decision.changed
-    return Outcome(made, survey, effects, choice, changed, convergence, seconds)
+    return Outcome(made, survey, effects, choice, changed, error, seconds)
 
 
-def _choose(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: Shards) -> Decision:
+def _decided(decider: deciding.Decider, shards: Shards) -> Decision:
     """The decision of `auto`, taken once; what it traced is the first shard."""
-    stored = shards.read_note("choice")
+    stored = shards.read_note()
     if stored is not None:
         return Decision.of(stored)
     # of a process that was killed before it noted by which decision it was made
     shards.path(0).unlink(missing_ok=True)
-    decision = deciding.Decider(campaign, settings, survey).decide()
+    decision = decider.decide()
     if decision.rows is not None and decision.paths is not None:
-        made = shard_arrays(decision.paths, campaign, survey.engine.wavelength)
+        made = shard_arrays(decision.paths, decider.campaign, decider.survey.engine.wavelength)
         shards.put(0, {**made, ROWS: decision.rows, SECONDS: np.array(0.0)})  # they are in the decision's
-    shards.write_note("choice", decision.note())
+    shards.write_note(decision.note())
     return decision
 
 
@@ -115,7 +107,7 @@ class _Tracing:
     """Traces and stores shards; where it is sent to, it builds the scene once, which cannot be pickled."""
 
     campaign: Campaign
-    effects: Effects
+    effects: PropagationEffects
     shards: Shards
     survey: Survey | None
     compiled: bool = False
@@ -138,12 +130,10 @@ class _Tracing:
         return math.nan if first else spent
 
 
-def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Shards) -> float | None:
-    """Every shard that is not there yet.
-
-    Returns:
-        CPU seconds of a row, once compiled; None where too few were traced.
-    """
+def _trace_all(
+    campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards
+) -> float | None:
+    """Trace what is missing; CPU seconds of a row, once compiled, None where too few were traced."""
     left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
     parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]
     missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]
@@ -157,23 +147,3 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Sha
 def _decided_on(shards: Shards) -> np.ndarray:
     """Rows (n,) that `auto` decided on, which have all rays."""
     return shards.get(0, ROWS)[ROWS] if shards.path(0).exists() else deciding.NONE
-
-
-def _converge(
-    campaign: Campaign, survey: Survey, effects: Effects, shards: Shards, fewer: bool
-) -> Convergence | None:
-    """The file's rows beside the same under a second seed; None for an engine without rays.
-
-    Args:
-        campaign, survey, effects, shards: what was traced.
-        fewer: whether rows that `auto` decided on have more rays than the others: these alone are compared.
-    """
-    count = min(campaign.check, int(CHECKED * len(survey)))
-    if count == 0 or not survey.engine.random:
-        return None
-    other = _decided_on(shards) if fewer else deciding.NONE
-    rows = survey.spread(count + len(other), campaign.scene.seed + 1)
-    rows = np.sort(rows[~np.isin(rows, other)][:count])
-    again = survey.trace(rows, effects, campaign.check_seed)
-    csi, images, peak, power = shards.of_rows(rows, "csi", "spectrum", "spectrum_peak", "received_power")
-    return compare(csi, images, peak, power, again, campaign, survey.engine.wavelength)

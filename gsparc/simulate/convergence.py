@@ -7,9 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.settings import Campaign
+from gsparc.simulate.shards import Shards
 from gsparc.simulate.spectrum import spectra
+from gsparc.simulate.survey import Survey
+
+CHECKED = 0.25  # largest share of the rows that is traced again
 
 
 @dataclass(frozen=True)
@@ -36,42 +40,36 @@ class Convergence:
         return {f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"}
 
 
-def compare(
-    csi: np.ndarray,
-    spectrum: np.ndarray,
-    peak: np.ndarray,
-    power: np.ndarray,
-    again: Paths,
-    campaign: Campaign,
-    wavelength: float,
-) -> Convergence:
-    """How far receivers of a file are from the same under another seed.
+def convergence(
+    campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards, left_out: np.ndarray
+) -> Convergence | None:
+    """Rows of a file beside the same under a second seed; None where none is asked for, or without rays.
 
-    Args:
-        csi: (n, A, K) of the file, without noise.
-        spectrum, peak, power: (n, H, W) uint8, (n,) and (n,) of the file.
-        again: the same receivers traced again.
-        campaign: band, arrays and spectra.
-        wavelength: at the carrier [m].
+    Rows `left_out` (n,) were traced otherwise.
     """
-    frequency = campaign.scene.frequency_hz
+    count = min(campaign.check, int(CHECKED * len(survey)))
+    if count == 0 or not survey.engine.random:
+        return None
+    rows = survey.spread(count + len(left_out), campaign.scene.seed + 1)
+    rows = np.sort(rows[~np.isin(rows, left_out)][:count])
+    again = survey.trace(rows, effects, campaign.check_seed)
+    csi, spectrum, peak, power = shards.of_rows(rows, "csi", "spectrum", "spectrum_peak", "received_power")
+    frequency, wavelength = campaign.scene.frequency_hz, survey.engine.wavelength
     other = again.responses(frequency, campaign.csi.elements(wavelength), wavelength)
     energy = max(float((np.abs(csi) ** 2).sum()), np.finfo(float).tiny)
-    nmse = float((np.abs(csi - other) ** 2).sum() / energy)
     # Each image by its own largest value, or all by the largest of these receivers.
     share = 1.0 if campaign.spectrum.normalisation == "max" else (peak / peak.max())[:, None, None]
     images = [spectrum / 255 * share, spectra(again, campaign.spectrum, frequency, wavelength)[0]]
     squared = ((images[0] - images[1]) ** 2).mean((1, 2))
     similar = [structural_similarity(a, b, data_range=1.0) for a, b in zip(*images, strict=True)]
     twice = np.stack([power, again.received_power()])
-    twice = twice[:, (twice > 0).all(0)]
-    apart = np.abs(np.diff(10 * np.log10(twice), axis=0))
+    apart = np.abs(np.diff(10 * np.log10(twice[:, (twice > 0).all(0)]), axis=0))
     return Convergence(
-        nmse,
-        float(squared.sum() / (images[0] ** 2).mean((1, 2)).sum()),
-        float(squared.mean()),
-        float(np.mean(-10 * np.log10(np.maximum(squared, 1e-12)))),
-        float(np.mean(similar)),
-        float(np.quantile(apart, 0.95)) if apart.size else 0.0,
-        len(squared),
+        nmse=float((np.abs(csi - other) ** 2).sum() / energy),
+        spectrum_nmse=float(squared.sum() / (images[0] ** 2).mean((1, 2)).sum()),
+        spectrum_mse=float(squared.mean()),
+        spectrum_psnr_db=float(np.mean(-10 * np.log10(np.maximum(squared, 1e-12)))),
+        spectrum_ssim=float(np.mean(similar)),
+        power_db=float(np.quantile(apart, 0.95)) if apart.size else 0.0,
+        receivers=len(squared),
     )

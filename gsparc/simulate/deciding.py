@@ -7,9 +7,9 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,13 +17,14 @@ from gsparc.data.files import platform_cache, whole_file
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Probe, reasons
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths, join
 from gsparc.simulate.scenes.receivers import neighbours
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.survey import Survey
 
 log = logging.getLogger(__name__)
+Judgement = TypeVar("Judgement")
 
 NONE = np.zeros(0, dtype=np.int64)
 TRIAL = 2  # how much more fewer rays are to save than their trial costs, because it may fail
@@ -58,7 +59,7 @@ class Decision:
     """
 
     choice: Choice
-    effects: Effects
+    effects: PropagationEffects
     samples: int | None = None
     changed: Changed | None = None
     rows: np.ndarray | None = None
@@ -80,31 +81,20 @@ class Decision:
         """Inverse of `note`."""
         rows, errors = note["changed"] or ([], [])
         changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
-        effects = Effects(**note["effects"])
+        effects = PropagationEffects(**note["effects"])
         return Decision(Choice.from_dict(note["choice"]), effects, note.get("samples"), changed)
 
 
 class Traced:
-    """Rows traced with everything, each once, and what they cost.
+    """Rows traced with some effects, each once; calls of `size` are filled up with what is needed `ahead`."""
 
-    Args:
-        survey, effects: what is traced.
-        ahead: rows in the order in which they may be asked for.
-        size: rows of a call, which is filled up with those.
-
-    Attributes:
-        cold: CPU seconds of the first group, which compiles; None before.
-        warm: of a row afterwards; None where there was one group only.
-        compiling: of compiling, by the difference; None likewise.
-    """
-
-    def __init__(self, survey: Survey, effects: Effects, ahead: np.ndarray = NONE, size: int = 1) -> None:
+    def __init__(
+        self, survey: Survey, effects: PropagationEffects, ahead: np.ndarray = NONE, size: int = 1
+    ) -> None:
         self.survey, self.effects, self._ahead, self._size = survey, effects, ahead, size
-        self.rows = np.zeros(0, dtype=np.int64)
+        self.rows = NONE
         self._parts: list[Paths] = []
-        self.cold: float | None = None
-        self._first = self._later = 0
-        self._spent = 0.0
+        self._costs: list[float] = []  # CPU seconds of each part
 
     def paths(self, rows: np.ndarray) -> Paths:
         """Paths of rows (n,); those not traced before are."""
@@ -114,25 +104,19 @@ class Traced:
             missing = np.concatenate([missing, waiting[: -len(missing) % self._size]])
             begin = busy_s()
             self._parts.append(self.survey.trace(missing, self.effects))
-            self.rows, cost = np.concatenate([self.rows, missing]), busy_s() - begin
-            if self.cold is None:
-                self.cold, self._first = cost, len(missing)
-            else:
-                self._spent, self._later = self._spent + cost, self._later + len(missing)
+            self._costs.append(busy_s() - begin)
+            self.rows = np.concatenate([self.rows, missing])
         at = np.argsort(self.rows)
         return join(self._parts).take(at[np.searchsorted(self.rows[at], rows)])
 
-    @property
-    def warm(self) -> float | None:
-        """CPU seconds of a row once compiled."""
-        return self._spent / self._later if self._later else None
-
-    @property
-    def compiling(self) -> float | None:
-        """CPU seconds of the first group beyond those of its rows; 0 of an engine that compiles nothing."""
-        if self.warm is None or self.cold is None:
-            return None
-        return max(self.cold - self._first * self.warm, 0.0) if self.survey.engine.random else 0.0
+    def timed(self, choice: Choice) -> Choice:
+        """The choice with CPU seconds of a row, and of compiling, which the first of several parts does."""
+        if len(self._parts) < 2:
+            return replace(choice, row_all=None, compiling=None)
+        first = len(self._parts[0])
+        row_s = sum(self._costs[1:]) / (len(self.rows) - first)
+        compiling = max(self._costs[0] - first * row_s, 0.0) if self.survey.engine.random else 0.0
+        return replace(choice, row_all=row_s, compiling=compiling)
 
 
 def busy_s() -> float:
@@ -155,43 +139,37 @@ def pays(choice: Choice, rows: int, saved: float) -> bool:
 
 
 class Decider:
-    """Comes to the effects of one campaign.
-
-    Args:
-        campaign: what is simulated.
-        settings: the requirement.
-        survey: rows, traced with all rays.
-    """
+    """Comes to the effects of one campaign, whose survey is traced with all rays."""
 
     def __init__(self, campaign: Campaign, settings: AutoSettings, survey: Survey) -> None:
         self.campaign, self.settings, self.survey = campaign, settings, survey
         self.full = survey.engine.supported(settings.full)
+        self.probes, self.held_back = self._groups()
         self._stored = platform_cache() / "scenes" / f"{self._key()}.json"
 
     def decide(self) -> Decision:
         """Look the decision up, or take it and store it."""
-        begin, (probes, held) = time.perf_counter(), self._groups()
-        asked = len(probes) + len(held)
+        begin, both = time.perf_counter(), np.concatenate([self.probes, self.held_back])
         if self.settings.reuse and self._stored.exists():
             choice = Choice.from_dict(json.loads(self._stored.read_text(encoding="utf-8")))
-            if not (choice.untried and self._may_pay(choice, len(self.survey) - asked, asked)):
+            if not (choice.untried and self._may_pay(choice, len(self.survey) - len(both), len(both))):
                 log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
                 choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
                 return Decision(choice, *self._simulated(choice, len(self.survey)))
         size = self.campaign.sampling.part if self.survey.engine.random else 1
-        traced = Traced(self.survey, self.full, np.concatenate([probes, held]), size)
-        choice, changed = self._look(traced, probes), None
+        traced = Traced(self.survey, self.full, both, size)
+        choice, changed = self._choose(traced), None
         if choice.effects == self.full:
             log.info("auto: every effect is needed")
         else:
             log.info("auto: %s; verifying on held-back receivers", choice.effects)
-            choice, changed = self._verify(traced, choice, held)
+            choice, changed = self._verify(traced, choice)
             if choice.verdict is not None and not choice.verdict.kept:
                 log.info("auto: held-back receivers refute it; everything is needed")
                 choice = auto.everything(choice, self.full)
         if self.settings.rays < 1 and self.survey.engine.random:
-            choice, changed = self._fewer_rays(traced, choice, changed, probes, held)
-        choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
+            choice, changed = self._fewer_rays(traced, choice, changed)
+        choice = traced.timed(choice)
         effects, samples = self._simulated(choice, len(self.survey) - len(traced.rows))
         choice = replace(choice, seconds=time.perf_counter() - begin)
         self.remember(choice)
@@ -203,7 +181,7 @@ class Decider:
         with whole_file(self._stored) as partial:
             partial.write_text(json.dumps(asdict(choice), indent=1), encoding="utf-8")
 
-    def _simulated(self, choice: Choice, rows: int) -> tuple[Effects, int | None]:
+    def _simulated(self, choice: Choice, rows: int) -> tuple[PropagationEffects, int | None]:
         """Effects and rays of the choice, or everything where that is cheaper for so many rows."""
         rays = 1.0 if choice.samples is None else choice.samples / self.campaign.sampling.samples
         price = auto.price(choice.effects, self.full, rays)
@@ -212,12 +190,12 @@ class Decider:
         log.info("auto: everything is simulated: for %d receivers, compiling anew costs more", rows)
         return self.full, None
 
-    def _may_pay(self, choice: Choice, rows: int, asked: int) -> bool:
-        """Whether trying fewer rays on rows that were asked can pay on so many others."""
+    def _may_pay(self, choice: Choice, rows: int, trial_rows: int) -> bool:
+        """Whether trying fewer rays on some rows can pay on so many others."""
         if choice.row_all is None or choice.compiling is None:
             return False
         all_, fewer = (auto.price(choice.effects, self.full, rays) for rays in (1.0, self.settings.rays))
-        trial = asked * fewer * choice.row_all + choice.compiling
+        trial = trial_rows * fewer * choice.row_all + choice.compiling
         return rows * (all_ - fewer) * choice.row_all > TRIAL * trial
 
     def _groups(self) -> tuple[np.ndarray, np.ndarray]:
@@ -229,22 +207,20 @@ class Decider:
         turn = np.floor(np.arange(1, len(chosen) + 1) * share) > np.floor(np.arange(len(chosen)) * share)
         return chosen[turn], chosen[~turn]
 
-    def _look(self, traced: Traced, probes: np.ndarray) -> Choice:
-        """The first look and, where it leaves something open, the last."""
-        materials = self.survey.engine.materials()
-        for rows, last in _looks(probes):
+    def _choose(self, traced: Traced) -> Choice:
+        """By the first look and, where it leaves something open, the last."""
+        materials, distances = self.survey.engine.materials(), self.survey.distances()
+
+        def judge(rows: np.ndarray, last: bool) -> Choice | None:
             log.info("auto: %d probes with %s", len(rows), traced.effects)
+            probe = self._probe(traced, rows)
+            choice = auto.decide(probe, self.settings, last)
+            return choice and auto.explained(choice, reasons(probe, distances[rows], materials))
 
-            def why(probe: Probe, rows: np.ndarray = rows) -> dict[str, str]:
-                return reasons(probe, self.survey.distances()[rows], materials)
-
-            choice = auto.decide(self._probe(traced, rows), self.settings, why, last)
-            if choice is not None:
-                return choice
-        raise AssertionError("the last look decides")
+        return _until_clear(self.probes, judge)
 
     def _fewer_rays(
-        self, traced: Traced, choice: Choice, changed: Changed | None, probes: np.ndarray, held: np.ndarray
+        self, traced: Traced, choice: Choice, changed: Changed | None
     ) -> tuple[Choice, Changed | None]:
         """Whether a share of the rays is enough: probes, then held-back rows, with the choice and those.
 
@@ -252,43 +228,42 @@ class Decider:
         file: the same rows are there with all rays.
         """
         survey, sampling = self.survey, self.campaign.sampling
-        if len(survey) - len(traced.rows) > sampling.batch:
-            traced.paths(held[: auto.first_look(len(held))])  # rows of the file, which say what one costs
-        choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
+        if len(survey) - len(traced.rows) > sampling.batch:  # rows of the file, which say what one costs
+            traced.paths(self.held_back[: auto.first_look(len(self.held_back))])
+        choice = traced.timed(choice)
         if not self._may_pay(choice, len(survey) - len(traced.rows), len(traced.rows)):
             return replace(choice, untried=True), changed
         samples = max(round(self.settings.rays * sampling.samples), 1)
         log.info("auto: probes with %d rays", samples)
-        fewer = Traced(survey.thinned(samples), choice.effects, np.concatenate([probes, held]), sampling.part)
-        for rows, last in _looks(probes):
+        both = np.concatenate([self.probes, self.held_back])
+        fewer = Traced(survey.thinned(samples), choice.effects, both, sampling.part)
+
+        def judge(rows: np.ndarray, last: bool) -> Choice | None:
             probe = self._probe(traced, rows)
-            found = auto.fewer_rays(choice, self.settings, probe, fewer.paths(rows), samples, last)
-            if found is not None:
-                break
-        assert found is not None  # the last look decides
-        if found.samples is None:
-            return found, changed
-        verified, errors = self._verify(traced, found, held, fewer)
+            return auto.fewer_rays(choice, self.settings, probe, fewer.paths(rows), samples, last)
+
+        thinned = _until_clear(self.probes, judge)
+        if thinned.samples is None:
+            return thinned, changed
+        verified, errors = self._verify(traced, thinned, fewer)
         if verified.verdict is not None and not verified.verdict.kept:
-            return replace(auto.without_fewer_rays(found), verdict=choice.verdict), changed
+            return replace(auto.without_fewer_rays(thinned), verdict=choice.verdict), changed
         return verified, errors
 
-    def _verify(
-        self, traced: Traced, choice: Choice, held: np.ndarray, fewer: Traced | None = None
-    ) -> tuple[Choice, Changed]:
+    def _verify(self, traced: Traced, choice: Choice, fewer: Traced | None = None) -> tuple[Choice, Changed]:
         """On the first half of the held-back rows, and on all where that does not prove the requirement."""
-        settings, required = self.settings, self.settings.required
-        for rows, _ in _looks(held):
+        required = self.settings.required
+
+        def judge(rows: np.ndarray, last: bool) -> tuple[Choice, Changed] | None:
             probe = self._probe(traced, rows)
-            kept = None if fewer is None else fewer.paths(rows)
-            choice = auto.verify(choice, settings, probe, kept)
-            errors = probe.errors(choice.effects if kept is None else kept, required)
-            failed = int((errors[probe.reached] > required.tolerance).sum())
-            heard = int(probe.reached.sum())
-            early, _ = auto.allowed_failures(heard, len(held), settings.quantile, settings.confidence)
-            if failed <= early:
-                break
-        return choice, Changed(rows, errors)
+            errors = probe.errors(choice.effects if fewer is None else fewer.paths(rows), required)
+            heard = errors[probe.reached]
+            early, _ = self.settings.allowed_failures(len(heard), last=False)
+            if not last and (heard > required.tolerance).sum() > early:
+                return None
+            return auto.verify(choice, self.settings, heard), Changed(rows, errors)
+
+        return _until_clear(self.held_back, judge)
 
     def _probe(self, traced: Traced, rows: np.ndarray) -> Probe:
         """Rows traced with everything, and their nearest others where the requirement is about spectra."""
@@ -305,11 +280,11 @@ class Decider:
         """Hash of geometry, materials, transmitters, where receivers are, band, solver and requirement."""
         campaign, survey, engine = self.campaign, self.survey, self.survey.engine
         scene = {name: value for name, value in asdict(campaign.scene).items() if name not in OWN}
-        asked = {name: value for name, value in asdict(self.settings).items() if name != "reuse"}
+        requirement = {name: value for name, value in asdict(self.settings).items() if name != "reuse"}
         about: dict[str, Any] = {
             "geometry": engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
             "materials": engine.materials(), "versions": engine.versions(), "scene": scene,
-            "asked": asked, "antennas": [getattr(e, "antenna", None) for e in survey.engines], 
+            "asked": requirement, "antennas": [getattr(e, "antenna", None) for e in survey.engines],
             "samples": campaign.sampling.samples, "names": survey.names, "inputs": campaign.inputs(),
         }  # fmt: skip
         if self.settings.required.kind != "coverage":
@@ -317,7 +292,11 @@ class Decider:
         return hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
-def _looks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, bool]]:
-    """The first rows, then all of them; and whether these are all."""
-    for count in (auto.first_look(len(rows)), len(rows)):
-        yield rows[:count], count == len(rows)
+def _until_clear(rows: np.ndarray, judge: Callable[[np.ndarray, bool], Judgement | None]) -> Judgement:
+    """What is judged by the first rows, or by all of them where those leave something open."""
+    first = auto.first_look(len(rows))
+    judgement = judge(rows[:first], first == len(rows))
+    if judgement is None:
+        judgement = judge(rows, True)
+    assert judgement is not None  # the last look decides
+    return judgement

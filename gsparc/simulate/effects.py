@@ -1,4 +1,4 @@
-"""Propagation effects as switches, and which of them a path needs."""
+"""Propagation effects of a simulator as switches, and which of them a path needs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MECHANISMS = ("line_of_sight", *BITS)
 
 
 @dataclass(frozen=True)
-class Effects:
+class PropagationEffects:
     """What is simulated; off means not computed.
 
     Attributes:
@@ -66,7 +66,7 @@ class Effects:
         """Names of the mechanisms that are computed."""
         return tuple(name for name in MECHANISMS if getattr(self, name))
 
-    def without(self, *names: str) -> Effects:
+    def without(self, *names: str) -> PropagationEffects:
         """The same with some switched off, and with what needs them."""
         needs = {"specular": "diffuse", "diffraction": "edge_diffraction"}
         off = {*names, *(needs[name] for name in names if name in needs)}
@@ -80,18 +80,18 @@ class Effects:
             order: (P,) number of interactions.
         """
         bits = sum(bit for name, bit in BITS.items() if getattr(self, name))
-        kept = (mechanisms & ~np.array(bits, dtype=mechanisms.dtype)) == 0
-        return kept & (order <= self.depth) & (self.line_of_sight | (order > 0))
+        allowed = (mechanisms & ~np.array(bits, dtype=mechanisms.dtype)) == 0
+        return allowed & (order <= self.depth) & (self.line_of_sight | (order > 0))
 
     def __str__(self) -> str:
         extra = [f"depth {self.depth}"] + (["both polarisations"] if self.polarisation else [])
         return ", ".join([name.replace("_", " ") for name in self.on] + extra)
 
 
-def from_config(config: Mapping[str, Any]) -> Effects:
+def from_config(config: Mapping[str, Any]) -> PropagationEffects:
     """Switches from the config group `effects`.
 
     Raises:
         ValueError: a switch that does not exist, or a contradiction.
     """
-    return Effects(**known_keys(config, Effects, "effects", "effect"))
+    return PropagationEffects(**known_keys(config, PropagationEffects, "effects", "effect"))

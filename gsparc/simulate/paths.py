@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,16 @@ class Paths:
     mechanisms: np.ndarray
     order: np.ndarray
 
+    @staticmethod
+    def of(
+        receivers: int, owner: np.ndarray, gain: np.ndarray, delay: np.ndarray, direction: np.ndarray,
+        mechanisms: np.ndarray, order: np.ndarray,
+    ) -> Paths:  # fmt: skip
+        """Of paths in any order; `owner` (P,) is the receiver of each, the rest as of this class."""
+        rank = np.lexsort((delay, owner))
+        offsets = starts(np.bincount(owner, minlength=receivers))
+        return Paths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
+
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
@@ -43,10 +53,10 @@ class Paths:
         """|gain|^2 summed over the ports (P,)."""
         return (np.abs(self.gain.astype(np.complex128)) ** 2).sum(1)
 
-    def select(self, kept: np.ndarray) -> Paths:
-        """Only the paths where `kept` (P,) bool is true; receivers stay."""
-        counts = np.bincount(self.owner[kept], minlength=len(self))
-        return Paths(starts(counts), *(getattr(self, name)[kept] for name in ARRAYS))
+    def select(self, selected: np.ndarray) -> Paths:
+        """Only the paths where `selected` (P,) bool is true; receivers stay."""
+        counts = np.bincount(self.owner[selected], minlength=len(self))
+        return Paths(starts(counts), *(getattr(self, name)[selected] for name in ARRAYS))
 
     def take(self, receivers: np.ndarray) -> Paths:
         """Receivers (n,) alone, in this order."""
@@ -55,10 +65,10 @@ class Paths:
         rows = first + np.arange(counts.sum())
         return Paths(starts(counts), *(getattr(self, name)[rows] for name in ARRAYS))
 
-    def under(self, effects: Effects) -> Paths:
+    def under(self, effects: PropagationEffects) -> Paths:
         """What remains of a full simulation under these switches."""
-        kept = self.select(effects.allows(self.mechanisms, self.order))
-        return kept if effects.polarisation else replace(kept, gain=kept.gain[:, :1])
+        selected = self.select(effects.allows(self.mechanisms, self.order))
+        return selected if effects.polarisation else replace(selected, gain=selected.gain[:, :1])
 
     def per_receiver(self, values: np.ndarray) -> np.ndarray:
         """Sums of `values` (P,) over the paths of each receiver (R,)."""
@@ -85,12 +95,12 @@ class Paths:
         ports = self.gain.shape[1]
         channels = np.zeros((len(self), ports * len(elements), len(frequency_hz)), dtype=np.complex128)
         for r, (start, stop) in enumerate(zip(self.offsets[:-1], self.offsets[1:], strict=True)):
-            some = slice(start, stop)
+            one = slice(start, stop)
             # cycles, not radians, and reduced in float64 before the exponential
-            tones = np.exp(-2j * np.pi * np.mod(np.outer(self.delay[some], frequency_hz), 1.0))
-            steered = np.exp(2j * np.pi / wavelength * (elements @ self.direction[some].T.astype(np.float64)))
+            tones = np.exp(-2j * np.pi * np.mod(np.outer(self.delay[one], frequency_hz), 1.0))
+            steered = np.exp(2j * np.pi / wavelength * (elements @ self.direction[one].T.astype(np.float64)))
             for port in range(ports):
-                block = (steered * self.gain[some, port]) @ tones
+                block = (steered * self.gain[one, port]) @ tones
                 channels[r, port * len(elements) : (port + 1) * len(elements)] = block
         return channels
 

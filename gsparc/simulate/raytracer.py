@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,11 +22,12 @@ import torch
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
-from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
-from gsparc.simulate.paths import ARRAYS, Paths, join
+from gsparc.simulate.effects import DIFFRACTION, EDGE, PropagationEffects
+from gsparc.simulate.paths import Paths, join
 from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
+from gsparc.simulate.survey import Engine
 
 log = logging.getLogger(__name__)
 
@@ -64,16 +65,15 @@ class Sampling:
         return math.ceil(self.batch / 3)
 
 
-class RayTracer:
+class RayTracer(Engine):
     """One scene with one transmitter, ready to trace.
 
     Args:
         source: objects built in code, the name of one of Sionna's scenes, or the path of an XML file.
-        transmitter: (3,) [m].
+        transmitter, antenna: (3,) [m], and what it radiates.
         carrier_hz: [Hz].
         sampling: effort of the solver.
         scattering: scattering coefficient of all materials instead of `MATERIALS`; None for those.
-        antenna: of the transmitter.
 
     Attributes:
         scene: Sionna's (`sionna.rt.Scene`).
@@ -105,7 +105,9 @@ class RayTracer:
         self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
         self._arrays: list[tuple[int, str]] = []  # what the scene's antennas are, shared by `at`
         self.retried = 0  # batches traced again because candidates were cut off
-        self._buffer_factor: dict[Effects, int] = {}  # enlargement of the candidate buffer by effects
+        self._buffer_factor: dict[
+            PropagationEffects, int
+        ] = {}  # enlargement of the candidate buffer by effects
 
     def at(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
         """The same scene with the transmitter elsewhere."""
@@ -118,10 +120,6 @@ class RayTracer:
         other = copy(self)
         other.sampling = replace(self.sampling, samples=samples)
         return other
-
-    def supported(self, effects: Effects) -> Effects:
-        """Everything."""
-        return effects
 
     def versions(self) -> dict[str, str]:
         """Versions of the solver's packages."""
@@ -155,13 +153,8 @@ class RayTracer:
         used = {thing.radio_material.name for thing in self.scene.objects.values()}
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
-        """Paths from the transmitter to receivers (R, 3) [m].
-
-        Args:
-            receivers: world coordinates.
-            effects: what is computed.
-            seed: of the rays instead of `sampling.seed`.
+    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
+        """Paths from the transmitter to receivers (R, 3) [m], world; `seed` in place of `sampling.seed`.
 
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
@@ -170,15 +163,15 @@ class RayTracer:
         beneath = np.append(self.transmitter[:2], self._lowest - 1.0)
         parts, first = [], 0
         for count, size in calls(len(receivers), self.sampling.batch):
-            some = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
-            found = self.solutions(some, effects, seed)
-            part = join([_collect(solution, number) for solution, number in found])
+            filled = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
+            solved = self.solutions(filled, effects, seed)
+            part = join([_collect(solution, number) for solution, number in solved])
             parts.append(part.take(np.arange(count)))
             first += count
         return join(parts)
 
     def solutions(
-        self, receivers: np.ndarray, effects: Effects, seed: int | None = None
+        self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None
     ) -> Iterator[tuple[Any, int]]:
         """Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
 
@@ -188,15 +181,17 @@ class RayTracer:
         for first in range(0, len(receivers), size):
             yield from self._batch(receivers[first : first + size], effects, rays)
 
-    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Iterator[tuple[Any, int]]:
+    def _batch(
+        self, receivers: np.ndarray, effects: PropagationEffects, seed: int
+    ) -> Iterator[tuple[Any, int]]:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
         boost = self._buffer_factor.get(effects, 1)
         # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
         batch = max(self.sampling.batch, len(receivers))
         limit = min(CANDIDATES_PER_RECEIVER * boost * batch, LARGEST_BUFFER)
-        found = self._solve(receivers, effects, seed, limit)
-        if found is not None:
-            yield found, len(receivers)
+        solution = self._solve(receivers, effects, seed, limit)
+        if solution is not None:
+            yield solution, len(receivers)
             return
         self.retried += 1
         if limit < LARGEST_BUFFER:
@@ -213,7 +208,7 @@ class RayTracer:
         for part in (receivers[:half], receivers[half:]):
             yield from self._batch(part, effects, seed)
 
-    def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Any | None:
+    def _solve(self, receivers: np.ndarray, effects: PropagationEffects, seed: int, limit: int) -> Any | None:
         """Sionna's paths, or None when the solver ran into `limit` and left some out."""
         import sionna.rt as rt
         from sionna.rt.path_solvers import sb_candidate_generator as shooting
@@ -232,7 +227,7 @@ class RayTracer:
             return buffer
 
         solver._candidate_generator = counted
-        found = solver(
+        solution = solver(
             self.scene,
             max_depth=effects.depth,
             samples_per_src=self.sampling.samples,
@@ -245,7 +240,7 @@ class RayTracer:
             edge_diffraction=effects.edge_diffraction,
             seed=seed,
         )
-        return None if int(stored[-1].numpy().max()) >= limit else found
+        return None if int(stored[-1].numpy().max()) >= limit else solution
 
     def _place_ends(self, receivers: np.ndarray, ports: int) -> None:
         """Place transmitter and receivers in the scene."""
@@ -290,7 +285,7 @@ class RayTracer:
 
     def triangles(self) -> np.ndarray:
         """(n, 3, 3) [m] of all objects."""
-        return np.concatenate([corners for corners in self._objects().values()])
+        return np.concatenate([*self._objects().values()])
 
     def box(self) -> np.ndarray:
         """(2, 3) lower and upper corner of everything [m]."""
@@ -303,11 +298,11 @@ class RayTracer:
 
     def _objects(self) -> dict[str, np.ndarray]:
         """Triangles (n, 3, 3) of each object."""
-        found = {}
+        triangles = {}
         for name, thing in self.scene.objects.items():
             vertices = thing.mi_mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
-            found[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
-        return found
+            triangles[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
+        return triangles
 
     def surface(self, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Highest surface (n,) [m] at places (n, 2) [m], -inf where there is none, and whether it is ground.
@@ -326,19 +321,23 @@ class RayTracer:
         shape = mi.ShapePtr(self.scene.objects[ground].mi_mesh)
         return height, (hit.shape == shape).numpy()
 
+    def height(self, across: np.ndarray) -> np.ndarray:
+        """Of the highest surface (n,) [m] at places (n, 2) [m], -inf where there is none."""
+        return self.surface(across)[0]
+
     def _ground(self) -> str | None:
-        widest, size = None, 0.0
+        level = {}  # area of each object that is mostly level
         for name, corners in self._objects().items():
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            level, area = np.abs(normal[:, 2]).sum(), np.linalg.norm(normal, axis=1).sum()
-            if level > GROUND_LEVEL * area and level > size:
-                widest, size = name, float(level)
-        return widest
+            size = float(np.abs(normal[:, 2]).sum())
+            if size > GROUND_LEVEL * np.linalg.norm(normal, axis=1).sum():
+                level[name] = size
+        return max(level, key=level.__getitem__, default=None)
 
     def has_open_sky(self, area: np.ndarray) -> bool:
         """Whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low."""
         low, top = self.box()[:, 2]
-        height = self.surface(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))[0]
+        height = self.height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
         return bool((height[np.isfinite(height)] < (low + top) / 2).mean() > 0.05)
 
     def _hit(self, points: np.ndarray, direction: np.ndarray) -> Any:
@@ -356,9 +355,9 @@ def _lattice(points: int) -> Any:
     import drjit as dr
     from sionna.rt.utils.fibonacci import fibonacci_lattice
 
-    found = fibonacci_lattice(points)
-    dr.eval(found)
-    return found
+    lattice = fibonacci_lattice(points)
+    dr.eval(lattice)
+    return lattice
 
 
 def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
@@ -372,9 +371,9 @@ def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
 
 
-def _collect(found: Any, receivers: int) -> Paths:
+def _collect(solution: Any, receivers: int) -> Paths:
     """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest list."""
-    buffer = found._paths_buffer
+    buffer = solution._paths_buffer
     owner = buffer.target_indices.numpy().astype(np.int64)
     gain = np.stack([one[0].numpy() for one in buffer.a], axis=1).astype(np.complex64)
     delay = buffer.tau.numpy().astype(np.float64)
@@ -392,27 +391,24 @@ def _collect(found: Any, receivers: int) -> Paths:
     if len(sight) and sight.max() > 1:
         row = int(sight.argmax())
         raise RuntimeError(f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true")
-    rank = np.lexsort((delay, owner))
-    offsets = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=receivers))])
-    arrays: Mapping[str, np.ndarray] = {
-        "gain": gain, "delay": delay, "direction": direction, "mechanisms": mechanisms, "order": order
-    }  # fmt: skip
-    return Paths(offsets, *(arrays[name][rank] for name in ARRAYS))
+    return Paths.of(receivers, owner, gain, delay, direction, mechanisms, order)
 
 
 def _load(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None) -> Any:
     import sionna.rt as rt
+
+    def scatters(itu: str) -> float:
+        return MATERIALS.get(itu, OTHERS)[1] if scattering is None else scattering
 
     if isinstance(source, (str, Path)):
         scene = _load_file(source)
         for material in scene.radio_materials.values():
             # Built-in scenes come with 0: diffuse reflection would silently contribute nothing.
             if float(material.scattering_coefficient[0]) == 0.0:
-                usual = MATERIALS.get(getattr(material, "itu_type", None) or "", OTHERS)[1]
-                material.scattering_coefficient = usual if scattering is None else scattering
+                material.scattering_coefficient = scatters(getattr(material, "itu_type", None) or "")
     else:
         scene = rt.load_scene()
-        _add(scene, source, scattering)
+        _add(scene, source, scatters)
     scene.frequency = float(carrier_hz)
     return scene
 
@@ -435,16 +431,16 @@ def _load_file(source: str | Path) -> Any:
     return rt.load_scene(getattr(rt.scene, str(source)))
 
 
-def _add(scene: Any, solids: Sequence[Solid], scattering: float | None) -> None:
+def _add(scene: Any, solids: Sequence[Solid], scatters: Callable[[str], float]) -> None:
     import mitsuba as mi
     import sionna.rt as rt
 
-    materials = {}
-    for name in sorted({solid.material for solid in solids}):
-        thickness, usual = MATERIALS.get(name, OTHERS)
-        materials[name] = rt.ITURadioMaterial(
-            f"itu-{name}", name, thickness, scattering_coefficient=usual if scattering is None else scattering
+    materials = {
+        name: rt.ITURadioMaterial(
+            f"itu-{name}", name, MATERIALS.get(name, OTHERS)[0], scattering_coefficient=scatters(name)
         )
+        for name in sorted({solid.material for solid in solids})
+    }
     objects = []
     for solid in solids:
         mesh = mi.Mesh(solid.name, vertex_count=len(solid.vertices), face_count=len(solid.faces))

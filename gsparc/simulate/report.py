@@ -32,8 +32,8 @@ def choice_table(choice: Choice) -> Table:
 
 def reasons(choice: Choice) -> list[str]:
     """Expectations from physics, one line per effect."""
-    found = {row.effect.split(" >")[0]: row.reason for row in choice.table if row.reason}
-    return [f"physics, {name.replace('_', ' ')}: {reason}" for name, reason in found.items()]
+    by_effect = {row.effect.split(" >")[0]: row.reason for row in choice.table if row.reason}
+    return [f"physics, {name.replace('_', ' ')}: {reason}" for name, reason in by_effect.items()]
 
 
 def verdict(choice: Choice) -> str:
@@ -46,13 +46,13 @@ def verdict(choice: Choice) -> str:
             f"; a receiver takes {choice.row_chosen * 1e3:.0f} CPU ms instead of {choice.row_all * 1e3:.0f} "
             f"({choice.saved:.0%} saved)"
         )
-    found = choice.verdict
-    if found is None:
+    checked = choice.verdict
+    if checked is None:
         return chosen
-    outcome = "met" if found.kept else f"NOT MET by less ({choice.refuted})"
+    outcome = "met" if checked.kept else f"NOT MET by less ({choice.refuted})"
     return (
-        f"{chosen}; requirement {outcome}: {found.met:.1%} of {found.receivers} held-back receivers are "
-        f"within tolerance (error {found.error:.2g} median, {found.error_p95:.2g} at 95 %)"
+        f"{chosen}; requirement {outcome}: {checked.met:.1%} of {checked.receivers} held-back receivers are "
+        f"within tolerance (error {checked.error:.2g} median, {checked.error_p95:.2g} at 95 %)"
     )
 
 

@@ -105,12 +105,7 @@ class RFIDStandIn:
 
 
 class RFIDSim(DataModule):
-    """`dataset=rfid_sim`: the stand-in as a dataset of its own, see `RFIDStandIn`.
-
-    Args:
-        name, batch_size: see `DataModule`.
-        stand_in: `count`, `seed` and `root` of the stand-in.
-    """
+    """`dataset=rfid_sim`: the stand-in, see `RFIDStandIn`, as a dataset of its own, see `DataModule`."""
 
     def __init__(self, name: str = "rfid_sim", batch_size: int = 16, **stand_in: Any) -> None:
         super().__init__(name, batch_size)

@@ -6,33 +6,11 @@ import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from gsparc.simulate.auto import AutoSettings
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.scenes.build import SceneSettings
-from gsparc.simulate.spectrum import SpectrumSettings
-
-
-@dataclass(frozen=True)
-class CsiSettings:
-    """The array that channels are stored for, in the receiver's xy plane.
-
-    Attributes:
-        rows, columns: elements; 1 x 1 is one antenna at the receiver's place.
-        spacing: in carrier wavelengths.
-    """
-
-    rows: int = 1
-    columns: int = 1
-    spacing: float = 0.5
-
-    def elements(self, wavelength: float) -> np.ndarray:
-        """Positions (M, 3) [m]."""
-        return SpectrumSettings(rows=self.rows, columns=self.columns, spacing=self.spacing).elements(
-            wavelength
-        )
+from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 
 @dataclass(frozen=True)
@@ -52,10 +30,10 @@ class Campaign:
     """
 
     scene: SceneSettings
-    effects: Effects | AutoSettings
+    effects: PropagationEffects | AutoSettings
     sampling: Sampling = field(default_factory=Sampling)
     spectrum: SpectrumSettings = field(default_factory=SpectrumSettings)
-    csi: CsiSettings = field(default_factory=CsiSettings)
+    csi: ArraySettings = field(default_factory=ArraySettings)
     shard: int = 400
     check: int = 128
     check_seed: int = 2

@@ -19,6 +19,7 @@ import numpy as np
 from gsparc.data.files import whole_file
 
 ROWS = "rows"  # of a shard: which rows of the dataset it holds
+NOTE = "choice.json"
 
 
 class Shards:
@@ -26,7 +27,7 @@ class Shards:
 
     Args:
         out: the dataset's file.
-        plan: everything that decides what the shards hold; a folder made by another plan is refused.
+        plan: everything that decides what the shards hold.
 
     Raises:
         ValueError: the folder belongs to another simulation.
@@ -45,13 +46,13 @@ class Shards:
         if not stored.exists():
             _write(stored, self.plan)
 
-    def write_note(self, name: str, content: Mapping[str, Any]) -> None:
+    def write_note(self, content: Mapping[str, Any]) -> None:
         """Store a decision, so that a resumed run does not decide again."""
-        _write(self.folder / f"{name}.json", json.dumps(content, indent=1))
+        _write(self.folder / NOTE, json.dumps(content, indent=1))
 
-    def read_note(self, name: str) -> dict[str, Any] | None:
+    def read_note(self) -> dict[str, Any] | None:
         """The stored decision, or None."""
-        path = self.folder / f"{name}.json"
+        path = self.folder / NOTE
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     @property
@@ -81,15 +82,15 @@ class Shards:
         """Arrays of `names` (n, ...) at rows (n,), all of them in finished shards; no others are kept."""
         parts = []
         for number in self.numbers():
-            held = self.get(number, ROWS)[ROWS]
-            mine = np.flatnonzero(np.isin(held, rows))
+            stored = self.get(number, ROWS)[ROWS]
+            mine = np.flatnonzero(np.isin(stored, rows))
             if len(mine):
                 shard = self.get(number, *names)
-                parts.append((held[mine], *(shard[name][mine] for name in names)))
-        held, *found = (np.concatenate(one) for one in zip(*parts, strict=True))
-        at = np.argsort(held)
-        at = at[np.searchsorted(held[at], rows)]
-        return [one[at] for one in found]
+                parts.append((stored[mine], *(shard[name][mine] for name in names)))
+        stored, *arrays = (np.concatenate(one) for one in zip(*parts, strict=True))
+        at = np.argsort(stored)
+        at = at[np.searchsorted(stored[at], rows)]
+        return [one[at] for one in arrays]
 
     def remove(self) -> None:
         """After the dataset is written."""

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.effects import SPECULAR, Effects
-from gsparc.simulate.paths import Paths, starts
+from gsparc.simulate.effects import SPECULAR, PropagationEffects
+from gsparc.simulate.paths import Paths
+from gsparc.simulate.survey import Engine
 
 WALLS = ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")
 
@@ -110,10 +111,8 @@ def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray
     """Whether each observer sees each image of a source, exactly: (S, I) bool.
 
     The straight line from the observer to the image runs through mirrored copies of the room; it is
-    blocked when it meets a copy of an occluder in one of them (unfolding).
-
-    Args:
-        source, observer: (S, 3) [m] inside the room, broadcast against each other.
+    blocked when it meets a copy of an occluder in one of them (unfolding). Source and observer are (S, 3) [m]
+    inside the room, broadcast against each other.
     """
     source, observer = np.broadcast_arrays(np.atleast_2d(source), np.atleast_2d(observer))
     seen = np.ones((len(observer), len(images.cell)), dtype=bool)
@@ -217,14 +216,8 @@ def trace(
     return Trace(csi, tx, rx, frequency, elements, mirrored, seen, variance)
 
 
-class ShoeboxEngine:
-    """A shoebox room with one transmitter as an `Engine`: line of sight and mirror reflections.
-
-    Args:
-        room: walls and absorbing boxes.
-        transmitter: (3,) [m].
-        carrier_hz: [Hz].
-    """
+class ShoeboxEngine(Engine):
+    """A shoebox room with one transmitter (3,) [m] as an `Engine`: line of sight and mirror reflections."""
 
     name = "gsparc-shoebox"
     random = False
@@ -236,7 +229,7 @@ class ShoeboxEngine:
         if not room.contains(self.transmitter):
             raise ValueError(f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box")
 
-    def supported(self, effects: Effects) -> Effects:
+    def supported(self, effects: PropagationEffects) -> PropagationEffects:
         """Line of sight and specular reflection; walls do not transmit, edges do not diffract."""
         return replace(
             effects.without("diffuse", "diffraction", "refraction"),
@@ -244,40 +237,26 @@ class ShoeboxEngine:
             depth=effects.depth if effects.specular else 0,
         )
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
         mirrored = images(self.room, effects.depth)
         seen = visible(self.room, mirrored, self.transmitter[None], receivers)
         if not effects.line_of_sight:
             seen[:, mirrored.order == 0] = False
-        way = mirrored.of(self.transmitter) - receivers[:, None]
+        owner, image = np.nonzero(seen)
+        way = mirrored.of(self.transmitter)[image] - receivers[owner]
         distance = np.linalg.norm(way, axis=-1)
-        delay = np.where(seen, distance / LIGHT, np.inf)
-        rank = np.argsort(delay, axis=1, kind="stable")
-        rows = np.arange(len(receivers))[:, None]
-        kept = seen[rows, rank]
-        gain = (mirrored.gain * self.wavelength / (4 * np.pi * distance))[rows, rank][kept]
-        order = np.broadcast_to(mirrored.order, seen.shape)[rows, rank][kept].astype(np.uint8)
-        return Paths(
-            starts(seen.sum(1)),
-            gain[:, None].astype(np.complex64),
-            delay[rows, rank][kept],
-            (way / distance[..., None])[rows, rank][kept].astype(np.float32),
-            np.where(order > 0, SPECULAR, 0).astype(np.uint8),
+        gain = mirrored.gain[image] * self.wavelength / (4 * np.pi * distance)
+        order = mirrored.order[image].astype(np.uint8)
+        return Paths.of(
+            len(receivers), owner, gain[:, None].astype(np.complex64), distance / LIGHT,
+            (way / distance[:, None]).astype(np.float32), np.where(order > 0, SPECULAR, 0).astype(np.uint8),
             order,
-        )
-
-    def thinned(self, samples: int) -> ShoeboxEngine:
-        """Itself: there are no rays."""
-        return self
+        )  # fmt: skip
 
     def fingerprint(self) -> str:
         """Of the room."""
         return sha256(repr(self.room).encode()).hexdigest()
-
-    def versions(self) -> dict[str, str]:
-        """Part of this package."""
-        return {}
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """Amplitude reflection coefficients of the walls."""

@@ -21,23 +21,39 @@ CHOICES = {"kind": ("bartlett", "beam"), "scale": ("amplitude", "power"), "norma
 
 
 @dataclass(frozen=True)
-class SpectrumSettings:
-    """One definition of a spectrum.
+class ArraySettings:
+    """A planar array in the receiver's xy plane.
+
+    Attributes:
+        rows, columns: elements; 1 x 1 is one antenna at the receiver's place.
+        spacing: in carrier wavelengths.
+    """
+
+    rows: int = 1
+    columns: int = 1
+    spacing: float = 0.5
+
+    def elements(self, wavelength: float) -> np.ndarray:
+        """Positions (M, 3) [m] of the elements about their middle."""
+        x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing * wavelength for n in (self.rows, self.columns))
+        return np.stack(np.meshgrid(x, y, 0.0, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class SpectrumSettings(ArraySettings):
+    """One definition of a spectrum, of the array of a `bartlett` one.
 
     Attributes:
         kind: `bartlett` or `beam`.
-        rows, columns: of the array in the receiver's xy plane.
-        spacing: of the elements, in carrier wavelengths.
         beam_deg: full width at half power of the beam kernel [deg].
         scale: what a pixel is: `power`, or `amplitude`, its square root.
         normalisation: each image divided by its largest value (`max`), or all by the largest of all (`none`).
         height, width: pixels; row i is i x 90/height degrees of elevation, column j j x 360/width of azimuth.
     """
 
-    kind: Literal["bartlett", "beam"] = "bartlett"
     rows: int = 8
     columns: int = 8
-    spacing: float = 0.5
+    kind: Literal["bartlett", "beam"] = "bartlett"
     beam_deg: float = 10.0
     scale: Literal["amplitude", "power"] = "amplitude"
     normalisation: Literal["max", "none"] = "max"
@@ -60,11 +76,6 @@ class SpectrumSettings:
         """Directions of the pixels: the upper hemisphere."""
         return SphereGrid.hemisphere(self.height, self.width)
 
-    def elements(self, wavelength: float) -> np.ndarray:
-        """Positions (M, 3) [m] of the array's elements about its middle."""
-        x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing * wavelength for n in (self.rows, self.columns))
-        return np.stack(np.meshgrid(x, y, 0.0, indexing="ij"), axis=-1).reshape(-1, 3)
-
     def near_field(self, wavelength: float) -> float:
         """Fraunhofer distance of the array, 2 D^2 / wavelength [m]; nearer, waves over it are not plane."""
         size = float(np.linalg.norm(np.ptp(self.elements(wavelength), axis=0)))
@@ -82,13 +93,8 @@ def spectra(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Spectra (R, H, W) float32, and what each was divided by (R,) (its own unit: amplitude or power).
 
-    Only paths from above the horizon are received. A receiver without any is black, divided by 1.
-
-    Args:
-        paths: of R receivers, world axes as the receivers' axes.
-        settings: the definition.
-        frequency_hz: (K,) subcarriers, the snapshots of the Bartlett spectrum [Hz].
-        wavelength: at the carrier [m].
+    Only paths from above the horizon are received; world axes are the receivers'. A receiver without any is
+    black, divided by 1. The subcarriers (K,) [Hz] are the snapshots of the Bartlett spectrum.
     """
     above = paths.select(paths.direction[:, 2] >= 0)
     images = np.empty((len(paths), settings.height, settings.width), dtype=np.float32)

@@ -17,6 +17,7 @@ import numpy as np
 from gsparc.data.schema import LIGHT
 
 SHRINK = 1e-6  # [m]; a reflection point on a wall does not lie inside the building
+STRONGEST = 64  # paths of a user
 LEAST_BEND = 0.1  # [rad]; Keller's coefficient has a pole on the shadow boundary
 
 
@@ -74,6 +75,10 @@ class Rays:
     delay: np.ndarray
     direction: np.ndarray
 
+    def at(self, users: np.ndarray) -> Rays:
+        """Those of some users (n,)."""
+        return Rays(self.gain[users], self.delay[users], self.direction[users])
+
     def response(self, array: np.ndarray, carrier_hz: float, frequency_hz: np.ndarray) -> np.ndarray:
         """Channels (U, A, K) complex128 at frequencies (K,) [Hz] of elements (A, 3) [m] about the base."""
         steering = np.exp(2j * np.pi * carrier_hz / LIGHT * (self.direction @ array.T))  # (U, P, A)
@@ -91,7 +96,7 @@ class _Route:
     gain: np.ndarray
 
 
-def trace(streets: Streets, users: np.ndarray, wavelength: float, strongest: int = 64) -> Rays:
+def trace(streets: Streets, users: np.ndarray, wavelength: float) -> Rays:
     """Paths from the base station to users (U, 3) [m]: direct, two reflections, scatterers and edges."""
     routes = list(_routes(streets, users, wavelength))
     gain = np.zeros((len(users), 2 * len(routes)), complex)
@@ -106,7 +111,7 @@ def trace(streets: Streets, users: np.ndarray, wavelength: float, strongest: int
             delay[at] = length / LIGHT
             flat = route.towards * (route.length / length)[:, None]
             direction[at] = np.concatenate([flat, (climb / length)[:, None]], axis=1)
-    keep = np.argsort(-np.abs(gain), axis=1)[:, :strongest]
+    keep = np.argsort(-np.abs(gain), axis=1)[:, :STRONGEST]
     rows = np.arange(len(users))[:, None]
     return Rays(gain[rows, keep], delay[rows, keep], direction[rows, keep])
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from gsparc.data.links.georeference import Georeference
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths, join
 from gsparc.simulate.scenes.receivers import spread
 
@@ -71,7 +71,7 @@ class Survey:
         ]
         return np.concatenate(rounds)[:count]
 
-    def trace(self, rows: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, rows: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Paths of rows (n,), in their order."""
         owner, place = np.divmod(rows, len(self.places))
         order = np.argsort(owner, kind="stable")
@@ -79,14 +79,6 @@ class Survey:
             self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
         ]
         return join(parts).take(np.argsort(order, kind="stable"))
-
-
-@runtime_checkable
-class HasTriangles(Protocol):
-    """Its objects are triangles."""
-
-    def triangles(self) -> np.ndarray:
-        """(n, 3, 3) [m] of all objects."""
 
 
 class Engine(Protocol):
@@ -104,20 +96,27 @@ class Engine(Protocol):
     wavelength: float
     random: bool
 
-    def supported(self, effects: Effects) -> Effects:
-        """These switches without what the engine cannot compute."""
-
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
-
-    def thinned(self, samples: int) -> Engine:
-        """The same with so many rays of a call, where there are any."""
-
-    def versions(self) -> dict[str, str]:
-        """Versions of the solver's packages."""
 
     def fingerprint(self) -> str:
         """Hash of the geometry, and of which material is where."""
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """Material properties of the scene, for provenance and physical expectations."""
+
+    def supported(self, effects: PropagationEffects) -> PropagationEffects:
+        """These switches without what the engine cannot compute."""
+        return effects
+
+    def thinned(self, samples: int) -> Self:
+        """The same with so many rays of a call, where there are any."""
+        return self
+
+    def versions(self) -> dict[str, str]:
+        """Versions of the solver's packages."""
+        return {}
+
+    def triangles(self) -> np.ndarray:
+        """(n, 3, 3) [m] of all objects, where they are triangles."""
+        return np.zeros((0, 3, 3))

@@ -9,7 +9,7 @@ from shoeboxes import scatter
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
@@ -23,7 +23,7 @@ def room_of_spectra(count: int = 160, **changes: float) -> Measurements:
     """`count` receivers over the floor; `changes` are of `SpectrumSettings`."""
     engine = ShoeboxEngine(ROOM, TRANSMITTER, 2.4e9)
     receivers = scatter(ROOM, count, seed=0) * [1, 1, 0.1] + [0, 0, 1.0]
-    paths = engine.trace(receivers, engine.supported(Effects(depth=2)))
+    paths = engine.trace(receivers, engine.supported(PropagationEffects(depth=2)))
     settings = dataclasses.replace(SETTINGS, **changes)
     pictures, _ = spectra(paths, settings, TONES, engine.wavelength)
     return from_arrays(

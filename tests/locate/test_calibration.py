@@ -31,7 +31,7 @@ def looked(values, cells):
     return [Looked(cells, found.of(number)) for number in range(len(values))]
 
 
-def test_areas_hold_the_share_that_was_promised():
+def test_areas_hold_the_promised_share():
     rng = np.random.default_rng(0)
     cells = cover(CORNERS, 900, False)
     (places, values), (others, tested) = (snapshots(count, rng, 3.0) for count in (150, 400))
@@ -48,7 +48,7 @@ def test_areas_hold_the_share_that_was_promised():
     assert np.mean(believed) < 0.7, "as the field itself says they would not"
 
 
-def test_too_few_places_promise_the_whole_area():
+def test_few_places_promise_the_whole_area():
     rng = np.random.default_rng(1)
     cells = cover(CORNERS, 100, False)
     places, values = snapshots(5, rng, 3.0)

@@ -15,7 +15,7 @@ def drawn(*shape: int) -> torch.Tensor:
     return torch.from_numpy(RNG.normal(size=shape))
 
 
-def test_an_unknown_offset_is_integrated_out_in_closed_form():
+def test_unknown_offset_is_integrated_out():
     values, mean, variance, offset = drawn(3, 5), drawn(4, 5), drawn(4, 5).exp(), 2.0
     found = of_levels(values, mean, variance, offset)
     for i in range(3):
@@ -28,13 +28,13 @@ def test_an_unknown_offset_is_integrated_out_in_closed_form():
             assert found.size[i, j] == pytest.approx(float(torch.logdet(dense)), rel=1e-9)
 
 
-def test_an_offset_of_the_device_moves_no_place():
+def test_device_offset_moves_no_place():
     values, mean, variance = drawn(2, 30), drawn(6, 30), torch.ones(6, 30).double()
     one, other = (of_levels(v, mean, variance, 100.0).squared for v in (values, values + 7.0))
     assert torch.allclose(one - one[:, :1], other - other[:, :1], atol=0.1)
 
 
-def test_missing_stations_say_nothing():
+def test_missing_stations_change_nothing():
     values, mean, variance = drawn(2, 4), drawn(5, 4), drawn(5, 4).exp()
     values[:, 1] = torch.nan
     fewer = [0, 2, 3]
@@ -46,7 +46,7 @@ def test_missing_stations_say_nothing():
     assert some.count.tolist() == [3.0, 3.0]
 
 
-def test_silence_speaks_for_places_of_weak_signals():
+def test_silence_favours_places_of_weak_signals():
     values = torch.full((1, 1), torch.nan).double()
     mean, variance = torch.tensor([[-100.0], [-60.0]]).double(), torch.full((2, 1), 9.0).double()
     found = of_levels(values, mean, variance, 0.0, torch.full((1, 1), -90.0).double())
@@ -55,7 +55,7 @@ def test_silence_speaks_for_places_of_weak_signals():
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_a_common_phase_is_turned_away_unless_it_is_known(known):
+def test_unknown_phase_is_removed(known):
     mean = torch.complex(drawn(4, 6), drawn(4, 6))
     values = mean[1:2] * np.exp(1.3j)
     found = of_channels(values, mean, torch.ones(4, 6).double(), known).squared[0]
@@ -70,7 +70,7 @@ def test_spectra_are_compared_pixel_by_pixel():
     assert torch.allclose(found, expected, rtol=1e-9)
 
 
-def test_a_heavy_tail_forgives_a_bad_snapshot():
+def test_heavy_tail_forgives_a_bad_snapshot():
     values, mean = torch.full((1, 20), 8.0).double(), torch.zeros(2, 20).double()
     mean[1] = 1.0
     found = of_levels(values, mean, torch.ones(2, 20).double())

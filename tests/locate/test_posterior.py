@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.locate.cells import cover
+from gsparc.locate.cells import MARGIN_M, cover, cover_floors, floors
 from gsparc.locate.posterior import Posterior
 
 PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0, 0, 1.5]
@@ -31,7 +31,7 @@ def test_halves_fill_the_whole():
     assert np.abs(one.centre - cells.centre[3]).max(0) == pytest.approx(cells.edge[3] / 4)
 
 
-def test_one_can_stand_near_trained_places_alone():
+def test_cells_near_trained_places():
     walked = PLACES[PLACES[:, 0] < 1.0]
     both = np.concatenate([walked, [[4.0, 2.0, 1.5]]])
     around = cover(both, 400, True)
@@ -40,14 +40,14 @@ def test_one_can_stand_near_trained_places_alone():
         cover(np.ones((5, 3)), 100, False)
 
 
-def test_one_can_stand_where_a_plan_is_open():
+def test_cells_where_a_plan_is_open():
     left = cover(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
     assert (left.centre[:, 0] < 2.0).all() and 150 < len(left) < 300
     with pytest.raises(ValueError, match="stand nowhere"):
         cover(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
 
 
-def test_the_likeliest_place_is_between_middles_of_cells():
+def test_peak_is_between_middles_of_cells():
     cells = cover(PLACES, 400, False)
     truth = np.array([2.037, 1.021])
     found = Posterior(cells, gaussians(cells, [truth], 0.3).sharp, 0.15)
@@ -66,14 +66,47 @@ def test_errors_of_recorded_places_widen_an_area():
     assert wide.at(place) == pytest.approx(wide.log_density[cells.holding(place)], abs=0.05)
 
 
-def test_an_area_of_a_known_density_holds_its_share():
+def test_area_of_a_known_density_holds_its_share():
     found = gaussians(cover(PLACES, 20_000, False), [[2.0, 1.0]])
     area = found.cells.size[found.within(0.9)].sum()
     assert area == pytest.approx(-2 * np.pi * 0.2**2 * np.log(0.1), rel=0.02)
     assert found.level(np.array([2.0, 1.0, 1.5])) < 0.01 and found.level(np.array([3.9, 1.9, 1.5])) > 0.99
 
 
-def test_two_places_that_look_alike_are_two_modes():
+def test_two_places_alike_are_two_modes():
     cells = cover(PLACES, 5_000, False)
     assert len(gaussians(cells, [[0.8, 1.0], [3.2, 1.0]], 0.1).modes(0.9)) == 2
     assert len(gaussians(cells, [[0.8, 1.0]], 0.1).modes(0.9)) == 1
+
+
+def building(count: int = 300) -> np.ndarray:
+    """Places on two floors of 40 x 20 m, the upper one only in its west half."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0, 1, (count, 3)) * [40, 20, 0.3]
+    upper = rng.random(count) < 0.5
+    places[upper] = places[upper] * [0.5, 1, 1] + [0, 0, 4]
+    return places
+
+
+def test_heights_are_grouped_by_floor():
+    height = building()[:, 2]
+    found = floors(height)
+    assert len(np.unique(found)) == 2 and (np.abs(found - height) < 0.3).all()
+    assert floors(np.array([3.0])).tolist() == [3.0] and len(np.unique(floors(np.zeros(5)))) == 1
+
+
+def test_floors_are_covered_once_and_finer_near_places():
+    places = building()
+    cells = cover_floors(places, around=False)
+    box = np.ptp(places[:, :2], axis=0) + 2 * MARGIN_M
+    assert np.isclose(cells.size.sum(), 2 * box.prod()) and len(cells) <= 8000
+    assert not cells.edge[:, 2].any() and len(np.unique(cells.centre[:, 2])) == 2
+    east = (cells.centre[:, 0] > 26) & (cells.centre[:, 2] > 2)  # where nobody was
+    assert cells.edge[east, 0].min() > cells.edge[~east, 0].min()
+    near = cover_floors(places, around=True)
+    assert len(near) < len(cells) and near.size.sum() < 0.85 * cells.size.sum()
+
+
+def test_single_place_has_cells():
+    cells = cover_floors(np.array([[1e6, 2e6, 5.0]]), around=False)
+    assert np.isclose(cells.size.sum(), (2 * MARGIN_M) ** 2) and (cells.centre[:, 2] == 5).all()

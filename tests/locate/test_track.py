@@ -23,7 +23,7 @@ def mean(known: Posterior) -> np.ndarray:
     return known.mass @ known.cells.centre
 
 
-def test_a_walk_is_placed_better_than_its_snapshots():
+def test_walk_is_placed_better_than_its_snapshots():
     rng, cells, seconds = np.random.default_rng(0), hall(), np.arange(30.0)
     true = np.c_[4 + 0.4 * seconds, np.full(30, 5.0), np.ones(30)]
     alone = [heard(cells, place + rng.normal(0, 2, 3) * [1, 1, 0]) for place in true]
@@ -37,7 +37,7 @@ def test_a_walk_is_placed_better_than_its_snapshots():
     assert all(np.isclose(one.mass.sum(), 1) for one in found)
 
 
-def test_it_is_the_sum_over_all_walks():
+def test_filter_is_the_sum_over_all_walks():
     """Three snapshots over few cells: every sequence of cells, weighed by hand."""
     cells = cover(np.array([[0.0, 0, 1], [6, 3, 1]]), 18, False)
     alone = [heard(cells, np.array(at), 1.5) for at in ([1.0, 1, 1], [3, 2, 1], [5, 1, 1])]
@@ -57,7 +57,7 @@ def test_it_is_the_sum_over_all_walks():
         np.testing.assert_allclose(one.mass, (by_hand / by_hand.sum())[some], rtol=1e-9)
 
 
-def test_a_jump_is_followed():
+def test_jump_is_tracked():
     cells = hall()
     there = [np.array([2.0, 5, 1])] * 5 + [np.array([18.0, 5, 1])] * 5
     found = smoothed([heard(cells, place, 1.0) for place in there], np.arange(10.0), 0.2)
@@ -71,7 +71,7 @@ def test_speed_is_of_steps_within_walks():
     assert speed(places[:1], seconds[:1], walk[:1]) == 0.0
 
 
-def test_a_temperature_alone_flattens_what_is_known():
+def test_only_the_temperature_flattens_a_posterior():
     known = heard(hall(), np.array([5.0, 5, 1]))
     same, flat = (as_looked(known).by(Trust(3.0, t, 2.0)) for t in (1.0, 0.25))
     np.testing.assert_allclose(same.log_density, known.log_density, atol=1e-9)

@@ -24,7 +24,7 @@ def test_free_space_is_friis() -> None:
     assert np.isclose(rays.delay[0, np.abs(rays.gain[0]).argmax()], 50 / LIGHT)
 
 
-def test_a_wall_is_an_image() -> None:
+def test_wall_makes_an_image() -> None:
     """A wall at y = 10 to 20: the user at (20, 0) hears the mirrored base at (0, 20) through it."""
     rays = trace(_street([[[-50, 10], [50, 20]]], ground=0.0), np.array([[20.0, 0.0, 5.0]]), 0.125)
     strength = np.sort(np.abs(rays.gain[0]))[::-1]
@@ -33,14 +33,14 @@ def test_a_wall_is_an_image() -> None:
     assert strength[2] == 0
 
 
-def test_a_building_blocks_and_its_corner_bends() -> None:
+def test_building_blocks_and_its_corner_diffracts() -> None:
     streets = _street([[[8, -10], [12, 2]]], ground=0.0)
     behind = trace(streets, np.array([[20.0, 4.0, 5.0]]), 0.125)
     assert streets.blocked(np.zeros((1, 2)), np.array([[20.0, 4.0]]))[0]
     assert 0 < np.abs(behind.gain).max() < 0.5 * 0.125 / (4 * np.pi * 20)
 
 
-def test_delay_spread_and_received_power_are_as_stated() -> None:
+def test_delay_spread_and_received_power() -> None:
     there = world(400, seed=0)
     power, delay = np.abs(there.rays.gain) ** 2, there.rays.delay
     share = power / power.sum(1, keepdims=True)

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, Effects, from_config
+from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, PropagationEffects, from_config
 from gsparc.simulate.paths import Paths, join
 
-EVERYTHING = Effects(depth=3)
+EVERYTHING = PropagationEffects(depth=3)
 
 
 def paths_of(mechanisms, order, owner=None, ports=1):
@@ -18,7 +18,7 @@ def paths_of(mechanisms, order, owner=None, ports=1):
     )  # fmt: skip
 
 
-def test_a_path_exists_only_when_all_its_mechanisms_and_its_depth_do():
+def test_path_needs_all_its_mechanisms_and_depth():
     found = paths_of([0, SPECULAR, SPECULAR | DIFFUSE, REFRACTION, EDGE], [0, 1, 2, 1, 1])
 
     def left(effects):
@@ -29,8 +29,8 @@ def test_a_path_exists_only_when_all_its_mechanisms_and_its_depth_do():
     assert left(EVERYTHING.without("specular")) == [True, False, False, True, True]
     assert left(EVERYTHING.without("diffuse")) == [True, True, False, True, True]
     assert left(EVERYTHING.without("diffraction")) == [True, True, True, True, False]
-    assert left(Effects(depth=1)) == [True, True, False, True, True]
-    assert left(Effects(depth=0)) == [True, False, False, False, False]
+    assert left(PropagationEffects(depth=1)) == [True, True, False, True, True]
+    assert left(PropagationEffects(depth=0)) == [True, False, False, False, False]
 
 
 @pytest.mark.parametrize("config, words", [
@@ -46,9 +46,9 @@ def test_contradictions_are_refused(config, words):
         from_config(config)
 
 
-def test_selecting_keeps_receivers_that_lose_everything():
+def test_receivers_that_lose_everything_stay():
     found = paths_of([0, SPECULAR, SPECULAR], [0, 1, 1], owner=[0, 0, 1])
-    less = found.under(Effects(depth=3).without("specular"))
+    less = found.under(PropagationEffects(depth=3).without("specular"))
     assert less.offsets.tolist() == [0, 1, 1] and less.received_power().tolist() == [1.0, 0.0]
     both = join([found, less])
     assert len(both) == 4 and both.received_power().tolist() == [2.0, 1.0, 1.0, 0.0]
@@ -57,16 +57,16 @@ def test_selecting_keeps_receivers_that_lose_everything():
 def test_one_polarisation_is_the_first_port():
     found = paths_of([0], [0], ports=2)
     assert found.received_power()[0] == 2.0
-    assert found.under(Effects(polarisation=False)).received_power()[0] == 1.0
+    assert found.under(PropagationEffects(polarisation=False)).received_power()[0] == 1.0
 
 
-def test_delay_spread_of_two_equal_paths_is_half_their_distance():
+def test_delay_spread_of_two_equal_paths():
     found = paths_of([0, SPECULAR], [0, 1])
     assert found.delay_spread()[0] == pytest.approx(0.5e-9)
     assert found.select(np.array([True, False])).delay_spread()[0] == 0.0
 
 
-def test_response_of_one_path_is_its_phase_over_tones_and_elements():
+def test_response_of_one_path():
     found = paths_of([0, SPECULAR], [0, 1]).select(np.array([False, True]))  # 1 ns, from +x
     tones, wavelength = np.array([2.4e9, 2.5e9]), 0.125
     elements = np.array([[0.0, 0, 0], [wavelength / 4, 0, 0]])

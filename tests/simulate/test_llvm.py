@@ -17,14 +17,14 @@ def forget():
     llvm.fault.cache_clear()
 
 
-def test_a_library_named_by_the_user_is_the_only_candidate(monkeypatch):
+def test_named_library_is_the_only_candidate(monkeypatch):
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
     assert llvm.candidates() == [Path("/nowhere/libLLVM.so")]
     monkeypatch.delenv(llvm.VARIABLE)
     assert Path("/nowhere/libLLVM.so") not in llvm.candidates()
 
 
-def test_a_library_that_kills_its_process_is_named_not_fatal(monkeypatch, tmp_path):
+def test_library_that_kills_its_process_is_reported(monkeypatch, tmp_path):
     """LLVM 15 imports and then aborts at the first solve."""
     library = tmp_path / "libLLVM-15.so"
     library.touch()
@@ -44,13 +44,13 @@ def test_no_good_library_names_file_fault_and_remedy(monkeypatch):
         assert words in str(raised.value)
 
 
-def test_without_sionna_the_remedy_is_named(monkeypatch):
+def test_missing_sionna_names_the_remedy(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, package=None: None)
     with pytest.raises(llvm.SimulatorMissing, match="make sionna"):
         llvm.prepare()
 
 
-def test_nothing_else_imports_the_ray_tracer():
+def test_imports_leave_the_ray_tracer_alone():
     """Only `gsparc.simulate` may, and even there not before it is asked to trace."""
     code = (
         "import sys, gsparc, gsparc.commands.train, gsparc.commands.evaluate, gsparc.data.load\n"
@@ -64,6 +64,6 @@ def test_nothing_else_imports_the_ray_tracer():
 
 @pytest.mark.slow
 @needs_sionna
-def test_a_working_library_is_found():
+def test_working_library_is_found():
     library = llvm.prepare()
     assert library.exists() and llvm.fault(library) is None

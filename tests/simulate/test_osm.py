@@ -28,7 +28,7 @@ def extract(corners=SQUARE, ids=None, tags=(("building", "yes"),)):
     return f'{HEAD}{nodes}<way id="9">{refs}{"".join(f"<tag k={k!r} v={v!r}/>" for k, v in tags)}</way></osm>'
 
 
-def test_the_town_is_extruded_in_metres():
+def test_town_is_extruded_in_metres():
     town = read_town(TOWN, 3.5e9)
     by_name = {solid.name: solid for solid in town.solids}
     assert set(by_name) == {
@@ -39,11 +39,6 @@ def test_the_town_is_extruded_in_metres():
     assert read_town(TOWN, 28e9).solids[0].material == "concrete"  # the soil's model ends at 10 GHz
     assert by_name["buildings_glass"].vertices[:, 2].max() == pytest.approx(27)  # 8 levels and 1 of the roof
     assert by_name["buildings_brick"].vertices[:, 2].max() == pytest.approx(18)
-    low, high = (
-        by_name["buildings_metal"].vertices[:, 2].min(),
-        by_name["buildings_metal"].vertices[:, 2].max(),
-    )
-    assert (low, high) == (0, 25)
     heights = np.unique(by_name["buildings_metal"].vertices[:, 2])
     np.testing.assert_allclose(heights, [0, 4, 5, 25])  # a canopy from 4 to 5 m
     assert np.ptp(town.box, axis=0) == pytest.approx([190, 200], abs=0.1)
@@ -69,7 +64,7 @@ def test_lengths_are_read_as_osm_writes_them():
     }  # fmt: skip
 
 
-def test_one_building_is_a_town(tmp_path):
+def test_one_building_suffices(tmp_path):
     (tmp_path / "one.osm").write_text(extract())
     assert len(read_town(tmp_path / "one.osm", 3.5e9).solids) == 2
 
@@ -104,7 +99,7 @@ def test_spoilt_extracts_are_refused_in_one_line(kind, tmp_path):
     assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
 
 
-def test_a_missing_extract_and_a_folder_are_refused(tmp_path):
+def test_missing_extract_and_folder_are_refused(tmp_path):
     for path in (tmp_path / "none.osm", tmp_path):
         with pytest.raises(ValueError, match="no such file"):
             read_town(path, 3.5e9)

@@ -1,11 +1,13 @@
-"""Transmitters with sectors, and receivers on a grid, along lines, trajectories and out of files."""
+"""Transmitters with sectors; receivers on a grid, along lines and out of files; objects as a mesh."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from gsparc.data.links.georeference import Georeference
+from gsparc.data.walls import area, read_walls
 from gsparc.simulate.scenes.receivers import Layout, place, receivers
+from gsparc.simulate.scenes.solid import box, write_mesh
 from gsparc.simulate.scenes.transmitters import stations
 
 AREA = np.array([[0.0, 0.0], [20.0, 10.0]])
@@ -49,19 +51,15 @@ def test_sectors_are_stations_at_equal_angles():
     ({"position_m": [0, 0, 1], "pattern": "horn"}, "horn: expected one of iso"),
     ({"position_m": [0, 0, 1], "sectors": 0}, "1 to 12"),
     ({"position_deg": [95.0, 0.0], "height_m": 2}, "outside -90 to 90"),
+    ({"name": "a", "position_m": [0, 0, 1]}, "'a' twice"),
 ])  # fmt: skip
-def test_transmitters_that_cannot_be_are_refused(entry, words):
+def test_bad_transmitters_are_refused(entry, words):
     with pytest.raises(ValueError, match=words) as raised:
-        stations([entry], lambda across: np.zeros(len(across)), SOMEWHERE)
+        stations([entry, entry], lambda across: np.zeros(len(across)), SOMEWHERE)
     assert "\n" not in str(raised.value)
 
 
-def test_two_transmitters_of_one_name_are_refused():
-    with pytest.raises(ValueError, match="'a' twice"):
-        stations([{"name": "a", "position_m": [0, 0, 1]}] * 2, None, None)
-
-
-def test_a_grid_leaves_out_what_stands_there():
+def test_grid_leaves_out_occupied_places():
     found = laid(kind="grid", spacing_m=2.0)
     assert len(found.places) == 11 * 6 - 4 and found.time_s is None
     assert (found.places[:, 2] >= 6).all() and (found.places[:, 2] <= 7).all()
@@ -69,13 +67,13 @@ def test_a_grid_leaves_out_what_stands_there():
         laid(kind="grid", spacing_m=2.0, inside="refuse")
 
 
-def test_a_trajectory_has_times():
+def test_trajectory_has_times():
     found = laid(kind="trajectory", points_m=[[0, 8], [10, 8], [10, 2]], speed_m_s=2.0, every_s=0.5)
     np.testing.assert_allclose(found.time_s, np.arange(17) * 0.5)
     np.testing.assert_allclose(found.places[[0, 10, 16], :2], [[0, 8], [10, 8], [10, 2]])
 
 
-def test_streets_and_lines_have_a_place_every_so_many_metres():
+def test_streets_and_lines_are_sampled_evenly():
     streets = [np.array([[-5.0, 9.0], [30.0, 9.0]]), np.array([[10.0, 0.0], [10.0, 8.0]])]
     found = laid(streets=streets, kind="streets", spacing_m=2.0)
     assert (found.places[:, :2] >= 0).all() and (found.places[:, 0] <= 20).all() and len(found.places) == 15
@@ -83,7 +81,7 @@ def test_streets_and_lines_have_a_place_every_so_many_metres():
     assert len(several.places) == 5 + 2
 
 
-def test_receivers_out_of_a_table_in_degrees_with_times(tmp_path):
+def test_receivers_of_a_table_in_degrees_with_times(tmp_path):
     east, north = np.array([6.0, 12.0, 18.0]), np.array([5.0, 5.0, 5.0])
     latitude, longitude = SOMEWHERE.to_degrees(np.stack([east, north], 1))
     rows = [f"{a:.8f},{b:.8f},1.5,{t}" for a, b, t in zip(latitude, longitude, (0, 2, 5), strict=True)]
@@ -100,7 +98,7 @@ def test_receivers_out_of_a_table_in_degrees_with_times(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".tsv", ".txt", ".CSV", ".parquet", ".npz"])
-def test_times_are_read_from_every_sort_of_table(suffix, tmp_path):
+def test_times_are_read_from_every_kind_of_table(suffix, tmp_path):
     """They were read from *.csv with commas alone."""
     file = tmp_path / f"walk{suffix}"
     table = pd.DataFrame({"x": [6.0, 12, 18], "y": 5.0, "z": 1.5, "time_s": [0, 2, 5]})
@@ -115,7 +113,7 @@ def test_times_are_read_from_every_sort_of_table(suffix, tmp_path):
 
 
 @pytest.mark.parametrize("cell, words", [("noon", "finite number"), ("", "line 3: no number")])
-def test_a_time_that_is_none_is_refused(cell, words, tmp_path):
+def test_bad_times_are_refused(cell, words, tmp_path):
     (tmp_path / "walk.tsv").write_text(f"x\ty\tz\ttime_s\n6\t5\t1\t0\n7\t5\t1\t{cell}\n")
     with pytest.raises(ValueError, match=words) as raised:
         laid(kind="file", file=str(tmp_path / "walk.tsv"))
@@ -136,15 +134,26 @@ def test_a_time_that_is_none_is_refused(cell, words, tmp_path):
     ({"kind": "file", "file": "nowhere.csv"}, "nowhere.csv"),
     ({"kind": "lines", "points_m": [[0, 0], [1, 1]]}, "fewer than two places"),
 ])  # fmt: skip
-def test_receivers_that_cannot_be_are_refused(settings, words):
+def test_bad_receivers_are_refused(settings, words):
     with pytest.raises(ValueError, match=words) as raised:
         laid(**settings)
     assert "\n" not in str(raised.value)
 
 
-def test_many_places_fit_where_few_are_allowed():
+def test_many_places_are_found_where_few_are_allowed():
     """Draws were 204,800 whatever was asked for: 100,000 did not fit where half is built on."""
     found = place(2_500, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0.2, 0)
     assert len(found) == 2_500 and (found[:, 0] < 0.2).all()
     with pytest.raises(ValueError, match="0 of 20 receivers"):
         place(20, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0, 0)
+
+
+def test_mesh_is_read_back_as_walls(tmp_path):
+    solid = box("hut", "brick", (1, 2, 0), (4, 4, 3), turn=0.3)
+    write_mesh(solid.vertices[solid.faces], tmp_path / "scene.obj")
+    walls = read_walls(tmp_path / "scene.obj")
+    assert len(walls) == 12
+    np.testing.assert_allclose(sum(map(area, walls.faces)), 2 * (6 + 9 + 6), atol=0.02)
+    corners = np.unique(np.concatenate(walls.faces), axis=0)
+    assert len(corners) == 8
+    np.testing.assert_allclose(np.sort(corners, 0), np.sort(solid.vertices, 0), atol=6e-4)

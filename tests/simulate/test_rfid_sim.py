@@ -34,7 +34,7 @@ def test_never_passes_for_the_release(tmp_path):
     assert [len(part) for part in data.release_split] == [16, 4]
 
 
-def test_hand_moves_like_the_real_one():
+def test_hand_moves_like_the_release_s():
     positions = hand_moved(600, seed=0)
     assert (positions >= HAND_BOX[0] - 1e-3).all() and (positions <= HAND_BOX[1] + 1e-3).all()
     step = np.linalg.norm(np.diff(positions, axis=0), axis=1)
@@ -50,7 +50,7 @@ def test_tags_sit_on_bright_pixels_like_the_real_ones(tmp_path):
     assert pixel.mean() / 255 > 0.6 and 0.3 < data.target.mean() / 255 < 0.5
 
 
-def test_grid_a_point_source_lands_on_its_pixel():
+def test_point_source_is_brightest_in_its_pixel():
     """A far point source at elevation i, azimuth j is brightest in row i, column j."""
     grid, array = SphereGrid.hemisphere(HEIGHT, WIDTH), planar_array()
     matrix = steering(array, grid, WAVELENGTH)
@@ -63,7 +63,4 @@ def test_grid_a_point_source_lands_on_its_pixel():
         image = bartlett(torch.from_numpy(h)[None], matrix).reshape(HEIGHT, WIDTH)
         assert divmod(int(image.argmax()), WIDTH) == (row, column)
         np.testing.assert_allclose(grid.directions(torch.float64)[row, column], direction, atol=1e-12)
-
-
-def test_wavelength_is_920_megahertz():
     assert abs(LIGHT / WAVELENGTH - 920e6) < 1e6

@@ -18,7 +18,7 @@ from gsparc.data.load import load
 from gsparc.simulate import llvm, raytracer
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
-from gsparc.simulate.effects import BITS, Effects
+from gsparc.simulate.effects import BITS, PropagationEffects
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import SceneSettings, build, from_config
 from gsparc.simulate.scenes.conference import SIZE, conference_room
@@ -32,7 +32,9 @@ pytestmark = pytest.mark.slow
 TOWN = Path(__file__).parents[2] / "examples" / "town.osm"
 TRANSMITTER = np.array([3.1, 6.2, 3.7])
 QUICK = Sampling(samples=20_000, batch=100)
-PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
+PLAIN = PropagationEffects(
+    diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2
+)
 CONFERENCE = SceneSettings(
     name="conference_room", builder="conference_room", transmitter_m=tuple(TRANSMITTER),
     area_m=((0.3, 0.3), (13.7, 9.7)), height_m=(1.1, 1.5), num_receivers=40,
@@ -58,7 +60,7 @@ def places():
     return place(60, np.array(CONFERENCE.area_m), CONFERENCE.height_m, clear_of(conference_room()), seed=0)
 
 
-def test_one_thread_gives_the_same_bits_twice():
+def test_one_thread_is_deterministic():
     """Of several threads the faster one's candidate stays: a hundredth of receivers differed by rounding."""
     where = place(800, np.array(CONFERENCE.area_m), CONFERENCE.height_m, clear_of(conference_room()), seed=0)
     before = torch.get_num_threads()
@@ -76,7 +78,9 @@ def test_one_thread_gives_the_same_bits_twice():
 
 
 def test_line_of_sight_is_friis(room, places):
-    paths = room.trace(places, Effects(**{**vars(PLAIN), "specular": False, "refraction": False, "depth": 0}))
+    paths = room.trace(
+        places, PropagationEffects(**{**vars(PLAIN), "specular": False, "refraction": False, "depth": 0})
+    )
     seen = np.diff(paths.offsets)
     assert set(seen) == {0, 1} and seen.mean() > 0.5
     distance = np.linalg.norm(places - TRANSMITTER, axis=1)[seen == 1]
@@ -86,7 +90,7 @@ def test_line_of_sight_is_friis(room, places):
     np.testing.assert_allclose(paths.direction, towards, atol=1e-4)
 
 
-def test_our_channels_are_the_solvers_own(room, places):
+def test_channels_are_the_solver_s(room, places):
     """Carrier phase and all: `paths.cfr` with absolute delays."""
     import mitsuba as mi
 
@@ -116,7 +120,7 @@ def test_attribution_equals_a_run_without(room, places):
     assert set(np.unique(whole.mechanisms)) <= {0, BITS["specular"], BITS["refraction"], 5}
 
 
-def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
+def test_cut_off_paths_are_traced_again(places, monkeypatch):
     """The solver shares its limit among receivers and drops the rest without a word."""
     enough = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK).trace(places[:20], PLAIN)
     monkeypatch.setattr(raytracer, "CANDIDATES_PER_RECEIVER", 4)
@@ -130,11 +134,11 @@ def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
     assert starved.retried == tries  # the buffer stays enlarged
 
 
-def test_chains_do_not_cost_each_other_their_place(places):
+def test_chains_share_no_hash(places):
     """All chains of a call share a hash table: with edges on, a tenth of the paths was lost, and single
     reflections, which every seed finds, differed by 2e-3 for 60 receivers and 3e-2 for 100."""
     room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, Sampling(samples=100_000, batch=100))
-    full = Effects(diffuse=False, polarisation=False, depth=3)
+    full = PropagationEffects(diffuse=False, polarisation=False, depth=3)
     first, second = (
         room.trace(places, full, seed)
         .under(replace(PLAIN, depth=1))
@@ -173,14 +177,14 @@ def test_other_places_compile_nothing(places):
 
 
 def test_polarisation_edges_and_scattering_are_recorded(room, places):
-    paths = room.trace(places[:10], Effects(depth=2))
+    paths = room.trace(places[:10], PropagationEffects(depth=2))
     assert paths.gain.shape[1] == 2 and np.abs(paths.gain[:, 1]).max() > 0
     for name, bit in BITS.items():
         assert ((paths.mechanisms & bit) > 0).any(), name
     assert (paths.order[paths.mechanisms == 0] == 0).all() and paths.order.max() == 2
 
 
-def test_receivers_keep_out_of_things():
+def test_receivers_keep_out_of_objects():
     solids = conference_room()
     places = place(2000, np.array(CONFERENCE.area_m), (0.1, 2.0), clear_of(solids), seed=1)
     for solid in solids:
@@ -190,7 +194,7 @@ def test_receivers_keep_out_of_things():
     assert (places > 0).all() and (places < SIZE).all()
 
 
-def test_built_in_materials_are_completed_and_receivers_are_outdoors():
+def test_shipped_materials_scatter_and_receivers_are_outdoors():
     canyon = SceneSettings(
         name="canyon", builtin="simple_street_canyon", transmitter_m=(-33, 0, 12), height_m=(1.2, 1.8),
         area_m=((-60, -45), (60, 45)), num_receivers=30, carrier_hz=3.5e9, bandwidth_hz=100e6, subcarriers=4,
@@ -206,7 +210,7 @@ def test_built_in_materials_are_completed_and_receivers_are_outdoors():
         build(replace(canyon, builtin="muenchen"), QUICK)
 
 
-def test_a_shipped_scene_needs_no_more_than_its_name():
+def test_shipped_scene_needs_only_its_name():
     """Area, transmitter and sky are found; materials scatter; nobody stands on roofs."""
     city = from_config({**settings("etoile"), "num_receivers": 30})
     survey = build(city, QUICK)
@@ -222,7 +226,7 @@ def test_a_shipped_scene_needs_no_more_than_its_name():
     )
 
 
-def test_a_town_off_a_map_with_sectors_in_degrees(tmp_path):
+def test_town_with_sectors_in_degrees(tmp_path):
     """The sector that looks at receivers is heard best there; files of maps carry degrees."""
     pytest.importorskip("osmnx", reason="osmnx is not installed: make sionna")
     masts = [{"name": "m", "position_m": [0, 11], "height_m": 20, "sectors": 3, "downtilt_deg": 10}]
@@ -242,7 +246,7 @@ def test_a_town_off_a_map_with_sectors_in_degrees(tmp_path):
     assert np.ptp(latitude) < 0.003 and abs(np.median(longitude) + 30) < 0.001
 
 
-def test_a_scene_of_ones_own_by_path(tmp_path):
+def test_scene_file_of_the_user(tmp_path):
     import sionna.rt as rt
 
     own = replace(CONFERENCE, builder=None, xml=str(rt.scene.floor_wall), area_m=((-3, -3), (3, 3)),
@@ -258,7 +262,7 @@ def test_a_scene_of_ones_own_by_path(tmp_path):
 
 
 def test_auto_in_the_conference_room(tmp_path):
-    asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
+    asked = AutoSettings(probes=16, held_back=16, full=PropagationEffects(depth=2))
     plan = Campaign(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
     outcome = simulate(plan, tmp_path / "room.h5")
     assert outcome.choice is not None and outcome.choice.verdict is not None
@@ -273,7 +277,7 @@ def test_auto_in_the_conference_room(tmp_path):
     assert spectra.site.convergence_error == pytest.approx(outcome.convergence.spectrum_nmse)
 
 
-def test_killed_by_the_system_and_resumed(tmp_path):
+def test_killed_run_is_resumed(tmp_path):
     """SIGKILL between shards of two transmitters: nothing finished is lost, every pair is made once."""
     out = tmp_path / "room.h5"
     command = [

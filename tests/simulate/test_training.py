@@ -1,11 +1,12 @@
 """`dataset=sionna` through the same door as every other: training, baselines, evaluation, a stored model."""
 
-import dataclasses
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from campaigns import compose
+from crashes import small_campaign
 
 import gsparc
 from gsparc.commands.train import train
@@ -13,41 +14,22 @@ from gsparc.data.datasets.sionna import with_true_targets
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.simulate.campaign import simulate
-from gsparc.simulate.effects import Effects
-from gsparc.simulate.scenes.build import SceneSettings
-from gsparc.simulate.settings import Campaign
-from gsparc.simulate.spectrum import SpectrumSettings
 
-SCENE = SceneSettings(
-    name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),
-    num_receivers=70, carrier_hz=2.4e9, bandwidth_hz=80e6, subcarriers=4,
-    room={"size_m": [6, 5, 3], "reflection": -0.5},
-)  # fmt: skip
-MIRROR = Effects(
-    refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
-)
-SEARCH = [
-    "model.search.sources=9",
-    "model.search.rows=30",
-    "model.search.candidates=1000",
-    "model.search.steps=5",
-]
+BOX = small_campaign(70)
+SEARCH = [f"model.search.{setting}" for setting in ("sources=9", "rows=30", "candidates=1000", "steps=5")]
 ROAD = {"spectrum": ["experiment=sionna", *SEARCH], "csi": ["dataset=sionna", "model=complex_gp"]}
-
-
-SPECTRUM = SpectrumSettings(height=18, width=36, rows=4, columns=4)
 
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
     path = tmp_path_factory.mktemp("simulated") / "box.h5"
-    simulate(Campaign(SCENE, MIRROR, spectrum=SPECTRUM), path)
+    simulate(BOX, path)
     return path
 
 
 @pytest.mark.parametrize("kind", ROAD)
-def test_a_simulation_with_fewer_effects_is_tested_on_the_full_one(kind, box, tmp_path):
-    simulate(Campaign(SCENE, dataclasses.replace(MIRROR, depth=0), spectrum=SPECTRUM), tmp_path / "los.h5")
+def test_fewer_effects_are_tested_on_the_full_simulation(kind, box, tmp_path):
+    simulate(replace(BOX, effects=replace(BOX.effects, depth=0)), tmp_path / "los.h5")
     alone, whole = (
         load({"name": "sionna", "file": str(path), "target": kind}) for path in (tmp_path / "los.h5", box)
     )
@@ -62,19 +44,19 @@ def test_a_simulation_with_fewer_effects_is_tested_on_the_full_one(kind, box, tm
     assert not np.array_equal(data.target[test_rows], alone.target[test_rows])
     assert len({data.site.sha256, alone.site.sha256, whole.site.sha256}) == 3
     assert load({**config, "truth": config["file"]}).site.sha256 == alone.site.sha256
-    elsewhere = dataclasses.replace(whole, rx_position=whole.rx_position + 0.1)
+    elsewhere = replace(whole, rx_position=whole.rx_position + 0.1)
     with pytest.raises(DataError, match="other receivers"):
         with_true_targets(alone, elsewhere, "dataset.truth=x")
     with pytest.raises(DataError, match="same test rows"):
-        with_true_targets(alone, dataclasses.replace(whole, release_split=None), "dataset.truth=x")
+        with_true_targets(alone, replace(whole, release_split=None), "dataset.truth=x")
 
 
-def test_what_the_truth_hears_is_tested_though_the_training_file_heard_nothing(box):
+def test_outages_are_the_truth_s(box):
     whole = load({"name": "sionna", "file": str(box), "target": "rssi"})
     test = whole.release_split[1]
     deaf = np.zeros(len(whole), bool)
     deaf[[test[0], whole.release_split[0][0]]] = True
-    fewer = dataclasses.replace(whole, censored=deaf, mask=~deaf[:, None])
+    fewer = replace(whole, censored=deaf, mask=~deaf[:, None])
     mixed = with_true_targets(fewer, whole, "dataset.truth=x")
     assert not mixed.censored[test].any() and mixed.mask[test].all() and mixed.censored.sum() == 1
     back = with_true_targets(whole, fewer, "dataset.truth=x")
@@ -82,7 +64,7 @@ def test_what_the_truth_hears_is_tested_though_the_training_file_heard_nothing(b
 
 
 @pytest.mark.parametrize("kind", ROAD)
-def test_a_simulated_dataset_is_trained_and_compared_like_any_other(kind, box, tmp_path):
+def test_simulated_dataset_is_trained_like_any_other(kind, box, tmp_path):
     settings = [*ROAD[kind], f"dataset.file={box}", f"dataset.target={kind}", "threads=1", "logger=none"]
     facts, objects = train(compose(*settings), tmp_path / "run")
     stored = json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -8,17 +8,17 @@ from functools import partial
 
 import numpy as np
 
-from gsparc.locate.baselines import neighbours, network, probabilistic, process
-from gsparc.locate.baselines.interface import Locator
+from gsparc.locate.baselines.methods import Locator, kernel, neighbours, process
+from gsparc.locate.baselines.network import network
 from gsparc.locate.snapshots import Snapshots
 
 BASELINES: dict[str, Callable[[np.ndarray, np.ndarray], Locator]] = {
-    "nearest": partial(neighbours.fit, counts=(1,)),
-    "knn": partial(neighbours.fit, weighted=False),
-    "weighted_knn": neighbours.fit,
-    "kernel": probabilistic.fit,
-    "gp": process.fit,
-    "mlp": network.fit,
+    "nearest": partial(neighbours, counts=(1,)),
+    "knn": partial(neighbours, weights="uniform"),
+    "weighted_knn": neighbours,
+    "kernel": kernel,
+    "gp": process,
+    "mlp": network,
 }
 
 
@@ -44,7 +44,7 @@ def located_by(name: str, trained: Snapshots, heard: Snapshots) -> tuple[np.ndar
         ValueError: rows that cannot be learned from.
     """
     started = time.perf_counter()
-    found = BASELINES[name](features(trained), trained.place[:, :3])
+    locate = BASELINES[name](features(trained), trained.place[:, :3])
     fitted = time.perf_counter()
-    place = found.locate(features(heard)).place
+    place = locate(features(heard))
     return place, (time.perf_counter() - fitted) / max(len(heard), 1) * 1e3, fitted - started

@@ -11,10 +11,8 @@ import numpy as np
 import torch
 
 from gsparc.locate.calibration import calibrated
-from gsparc.locate.cells import Cells
-from gsparc.locate.fingerprints.field import FingerprintField, learn
-from gsparc.locate.fingerprints.floors import cover_floors
-from gsparc.locate.fingerprints.likelihood import Levels, misfit
+from gsparc.locate.cells import Cells, cover_floors
+from gsparc.locate.fingerprints.field import FingerprintField, Levels, learn, misfit
 from gsparc.locate.fingerprints.rows import Fingerprints, How, parted
 from gsparc.locate.likelihood import Trust
 from gsparc.locate.locator import HELD_OUT, Located
@@ -63,40 +61,40 @@ class FingerprintLocator:
 
     def look(self, rows: Fingerprints) -> Iterator[Looked]:
         """The misfit of each row at all cells, or what its whole walk says."""
-        alone = (
-            Looked(self.cells, found.of(number))
+        single = (
+            Looked(self.cells, misfits.of(number))
             for level in torch.from_numpy(rows.level).split(ROWS)
-            for found in [misfit(level, self.levels, self.offset_db, self.field.sensitivity)]
+            for misfits in [misfit(level, self.levels, self.offset_db, self.field.sensitivity)]
             for number in range(len(level))
         )
         if self.speed is None:
-            yield from alone
+            yield from single
             return
-        known = [one.by(SHARED) for one in alone]
+        posteriors = [one.by(SHARED) for one in single]
         for walk in np.unique(rows.walk):
-            own = np.flatnonzero(rows.walk == walk)
-            steps = smoothed([known[row] for row in own], rows.time_s[own], self.speed)
-            for row, step in zip(own, steps, strict=True):
-                known[row] = step
-        yield from map(as_looked, known)
+            members = np.flatnonzero(rows.walk == walk)
+            steps = smoothed([posteriors[row] for row in members], rows.time_s[members], self.speed)
+            for row, step in zip(members, steps, strict=True):
+                posteriors[row] = step
+        yield from map(as_looked, posteriors)
 
     def locate(self, rows: Fingerprints) -> list[Located]:
         """Each row."""
         start = time.perf_counter()
-        found = [
+        results = [
             Located.of(one.by(self.area), self.area.level, place(one.by(self.point)))
             for one in self.look(rows)
         ]
-        each = (time.perf_counter() - start) / max(len(found), 1)
-        return [replace(one, seconds=each) for one in found]
+        each = (time.perf_counter() - start) / max(len(results), 1)
+        return [replace(one, seconds=each) for one in results]
 
 
-def place(known: Posterior) -> np.ndarray:
+def place(posterior: Posterior) -> np.ndarray:
     """The mean (3,) [m] of the floor that has most mass, which errs less than the likeliest cell."""
-    mass, centre = known.mass, known.cells.centre
+    mass, centre = posterior.mass, posterior.cells.centre
     floor = np.unique(centre[:, 2], return_inverse=True)[1].reshape(-1)
-    own = floor == np.bincount(floor, mass).argmax()
-    return mass[own] @ centre[own] / mass[own].sum()
+    there = floor == np.bincount(floor, mass).argmax()
+    return mass[there] @ centre[there] / mass[there].sum()
 
 
 def trusted(
@@ -109,22 +107,23 @@ def trusted(
     (`how`, `side_m`, `held_out`: see `parted`). Areas are calibrated on them to hold a `share` of places; of
     three trusts that one makes the places whose mean error is least.
     """
-    held: list[Looked] = []
-    true = []
+    misfits: list[Looked] = []
+    true, track = [], locator.speed is not None
     for number in range(groups):
         train, test = parted(rows, how, side_m, held_out, seed + 1 + number)
-        track = locator.speed is not None
-        own = FingerprintLocator.of(rows.at(train), locator.offset_db, locator.around, track, locator.field)
-        few = np.random.default_rng(seed).permutation(len(test))[: -(-HELD_OUT // groups)]
-        looks = list(own.look(rows.at(test if track else test[few])))  # a walk is one
-        held += [looks[row] for row in few] if track else looks
-        true.append(rows.position[test[few]])
+        without = FingerprintLocator.of(
+            rows.at(train), locator.offset_db, locator.around, track, locator.field
+        )
+        drawn = np.random.default_rng(seed).permutation(len(test))[: -(-HELD_OUT // groups)]
+        looks = list(without.look(rows.at(test if track else test[drawn])))  # a walk is one
+        misfits += [looks[row] for row in drawn] if track else looks
+        true.append(rows.position[test[drawn]])
     places = np.concatenate(true)
 
     def error(trust: Trust) -> float:
-        return float(np.linalg.norm([place(one.by(trust)) for one in held] - places, axis=1).mean())
+        return float(np.linalg.norm([place(one.by(trust)) for one in misfits] - places, axis=1).mean())
 
-    area = calibrated(held, places, share, SHARED, blurred=False)
+    area = calibrated(misfits, places, share, SHARED, blurred=False)
     return replace(locator, point=min((SHARED, PLAIN, area), key=error), area=area), len(places)
 
 

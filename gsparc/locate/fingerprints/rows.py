@@ -66,10 +66,11 @@ class Fingerprints:
     def of_access_points(self, names: np.ndarray) -> Fingerprints:
         """Columns in the order of `names` (P,), as another campaign has them; NaN where they are not here."""
         column = {name: number for number, name in enumerate(self.access_point.tolist())}
-        found = np.array([column.get(name, -1) for name in names.tolist()])
-        if not (found >= 0).any():
+        columns = np.array([column.get(name, -1) for name in names.tolist()])
+        if not (columns >= 0).any():
             raise DataError(f"no access point of {some(list(names))} is among {some([*column])}")
-        return replace(self, level=np.where(found >= 0, self.level[:, found], np.nan), access_point=names)
+        level = np.where(columns >= 0, self.level[:, columns], np.nan)
+        return replace(self, level=level, access_point=names)
 
 
 def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
@@ -86,8 +87,8 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
     raw = _of_table(path, placed) if is_table(path) else read_raw(path)
     if not placed:
         raw.arrays.setdefault("position", np.full((len(raw.arrays.get("rss_dbm", ())), 3), np.nan))
-    held = check_layout(raw, path, LAYOUT if placed else UNPLACED)
-    level, position = held["rss_dbm"].astype(np.float32), held["position"].astype(np.float64)
+    checked = check_layout(raw, path, LAYOUT if placed else UNPLACED)
+    level, position = checked["rss_dbm"].astype(np.float32), checked["position"].astype(np.float64)
     count, dimensions = position.shape
     if dimensions not in (2, 3):
         raise DataError(f"{path}, position: expected 2 or 3 coordinates, found {dimensions}")
@@ -98,19 +99,19 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         row, column = wrong[0]
         what = f"{level[row, column]:g} in row {row}, column {column}; NaN stands for not heard"
         raise DataError(f"{path}, rss_dbm: expected {FAINTEST:g} to {LOUDEST:g} dBm, found {what}")
-    numbers = {kept: np.zeros(count, np.int64) for kept in NUMBERS.values()}
+    numbers = {field: np.zeros(count, np.int64) for field in NUMBERS.values()}
     for name in NUMBERS.keys() & raw.arrays:
         array = raw.arrays[name]
         if array.dtype.kind not in "iu" or array.shape not in ((), (count,)):
             raise DataError(f"{path}, {name}: expected {count} whole numbers, found {array.dtype}")
         numbers[NUMBERS[name]] = np.broadcast_to(array, count).astype(np.int64)
-    names = held.get("access_point", np.arange(level.shape[1])).astype(str)
+    names = checked.get("access_point", np.arange(level.shape[1])).astype(str)
     if len(np.unique(names)) < len(names):
         raise DataError(f"{path}, access_point: a name twice in {some(list(names))}; expected each once")
     return Fingerprints(
         level=level, position=np.pad(position, ((0, 0), (0, 3 - dimensions))), **numbers,
-        test=held.get("test", np.zeros(count, bool)),
-        time_s=held.get("time_s", np.zeros(count)).astype(np.float64),
+        test=checked.get("test", np.zeros(count, bool)),
+        time_s=checked.get("time_s", np.zeros(count)).astype(np.float64),
         access_point=names,
     )  # fmt: skip
 
@@ -131,7 +132,7 @@ def _of_table(path: Path, placed: bool) -> Raw:
     for name in (*names, *places, *(COLUMNS.keys() & set(frame.columns))):
         if frame[name].dtype.kind not in "iuf":
             raise DataError(f"{path}, column {name}: expected numbers, found {frame[name].iloc[0]!r}")
-    arrays = {kept: frame[name].to_numpy() for name, kept in COLUMNS.items() if name in frame}
+    arrays = {field: frame[name].to_numpy() for name, field in COLUMNS.items() if name in frame}
     height = STOREY_M * arrays.get("floor", np.zeros(len(frame)))
     level = frame[names].replace(SILENT, np.nan).to_numpy(np.float32)
     if places:
@@ -145,12 +146,10 @@ def parted(
     """Training and test rows (n,), (m,), sorted; a pure function of its arguments.
 
     Args:
-        rows: see there.
-        how: `released`: as the file says; `random`: rows; `places`: all rows of cubes of `side_m`; `blocks`:
-            of squares of floor, all floors alike; `walks`: whole ones; `later`: campaigns after the first.
-        side_m: see `how` [m].
+        how: `released`: as the file says; `random`: rows; `places`: all rows of cubes of `side_m` [m];
+            `blocks`: of squares of floor, all floors alike; `walks`: whole ones; `later`: campaigns after the
+            first.
         share: held out, of rows, places, squares or walks.
-        seed: of draws.
 
     Raises:
         DataError: there is no such split, or one part of it is empty.

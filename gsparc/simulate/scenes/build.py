@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,7 @@ from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
 from gsparc.simulate.scenes.receivers import Ground, clear_of, layout, receivers
-from gsparc.simulate.scenes.solid import Solid
-from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna, Transmitter, stations
+from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, stations
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.survey import Engine, Survey
 
@@ -85,10 +84,10 @@ class SceneSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        named = [k for k in SOURCES if getattr(self, k) is not None]
-        if len(named) != 1:
-            found = ", ".join(named) or "none"
-            raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {found}")
+        sources = [k for k in SOURCES if getattr(self, k) is not None]
+        if len(sources) != 1:
+            given = ", ".join(sources) or "none"
+            raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {given}")
         if self.transmitter_m is not None and self.transmitters is not None:
             raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
         if self.transmitters is not None and not self.transmitters:
@@ -130,21 +129,17 @@ def build(scene: SceneSettings, sampling: Sampling) -> Survey:
     """
     if scene.room is not None:
         return _shoebox(scene)
-    town = None if scene.file is None else read_town(scene.file, scene.carrier_hz)
+    tracer, town, allowed = _load(scene, sampling)
     for note in () if town is None else town.notes:
         log.info("%s: %s", scene.file, note)
-    source, solids = _source(scene, town)
-    tracer = RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering)
-    box = tracer.box()[:, :2] if town is None else town.box
-    area = _area(scene, box)
-    ground = _around(scene, tracer, area) if solids is None else Ground(solids)
-    georeference = None if town is None else town.georeference
-    masts = _masts(scene, tracer, ground, area, georeference)
-    streets = () if town is None else town.streets
-    how = layout(scene.receivers)
+    area = _area(scene, tracer.box()[:, :2] if town is None else town.box)
+    ground = _around(scene, tracer, area) if allowed is None else Ground(allowed)
+    georeference, streets = (None, ()) if town is None else (town.georeference, town.streets)
+    masts = _stated(scene, tracer.height, georeference) or [_in_the_middle(tracer, ground, area)]
     placed = receivers(
-        how, scene.num_receivers, area, scene.height_m, scene.seed, ground, streets, georeference
-    )
+        layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, ground, streets,
+        georeference,
+    )  # fmt: skip
     engines = [tracer.at(mast.position, mast.antenna) for mast in masts]
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
 
@@ -154,9 +149,8 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
 
     Args:
         stated: the name of a scene that comes with Sionna or is built here, or the path of an extract of
-            OpenStreetMap (*.osm) or of a scene file (*.xml); None: the one that a simulated file names.
-        provenance: of the measurements.
-        carrier_hz: that materials are taken at [Hz].
+            OpenStreetMap (*.osm) or of a scene file (*.xml); None: the one that the provenance names.
+        provenance, carrier_hz: of the measurements; materials are taken at that carrier [Hz].
 
     Raises:
         ValueError: no scene is known, or not one that a ray tracer loads.
@@ -194,10 +188,8 @@ def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarra
     Raises:
         ValueError, SimulatorMissing: see `build`.
     """
-    town = None if scene.file is None else read_town(scene.file, scene.carrier_hz)
-    tracer = RayTracer(_source(scene, town)[0], np.zeros(3), scene.carrier_hz, sampling, scene.scattering)
-    georeference = None if town is None else town.georeference
-    masts = _stated(scene, lambda across: tracer.surface(across)[0], georeference) or []
+    tracer, town, _ = _load(scene, sampling)
+    masts = _stated(scene, tracer.height, None if town is None else town.georeference) or []
     here = [mast for mast in masts if np.linalg.norm(mast.position - transmitter) < SAME_PLACE_M]
     called = [mast for mast in here if name.endswith(mast.name)]
     return tracer.at(transmitter, next((mast.antenna for mast in called or here), ISOTROPIC))
@@ -221,16 +213,21 @@ def _shoebox(scene: SceneSettings) -> Survey:
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
 
 
-def _source(scene: SceneSettings, town: Town | None) -> tuple[Sequence[Solid] | str | Path, Any]:
-    """What the ray tracer loads, and the test of free places where objects know where nobody stands."""
-    if town is not None:
-        return town.solids, None
-    if scene.builder is not None:
+def _load(
+    scene: SceneSettings, sampling: Sampling
+) -> tuple[RayTracer, Town | None, Callable[[np.ndarray], np.ndarray] | None]:
+    """The ray tracer, what a map holds, and a test of free places where objects know where nobody stands."""
+    source: Any = scene.builtin if scene.builtin is not None else Path(str(scene.xml))
+    town, allowed = None, None
+    if scene.file is not None:
+        town = read_town(scene.file, scene.carrier_hz)
+        source = town.solids
+    elif scene.builder is not None:
         if scene.builder not in BUILDERS:
             raise ValueError(f"scene.builder={scene.builder}: expected one of {', '.join(BUILDERS)}")
-        solids = BUILDERS[scene.builder](scene.seed)
-        return solids, clear_of(solids)
-    return (scene.builtin if scene.builtin is not None else Path(str(scene.xml))), None
+        source = BUILDERS[scene.builder](scene.seed)
+        allowed = clear_of(source)
+    return RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering), town, allowed
 
 
 def _area(scene: SceneSettings, box: np.ndarray) -> np.ndarray:
@@ -253,26 +250,17 @@ def _stated(
     return None
 
 
-def _masts(
-    scene: SceneSettings,
-    tracer: RayTracer,
-    ground: Ground,
-    area: np.ndarray,
-    georeference: Georeference | None,
-) -> list[Transmitter]:
-    """Transmitters as stated, or one in the middle."""
-    stated = _stated(scene, lambda across: tracer.surface(across)[0], georeference)
-    if stated is not None:
-        return stated
+def _in_the_middle(tracer: RayTracer, ground: Ground, area: np.ndarray) -> Transmitter:
+    """A transmitter where nobody states one."""
     middle = area.mean(0)
     if ground.open_sky:
-        high = float(tracer.surface(middle[None])[0][0]) + MAST_M
+        high = float(tracer.height(middle[None])[0]) + MAST_M
     else:
         low, top = tracer.box()[:, 2]
         high = float(low + CEILING * (top - low))
     position = np.round(np.append(middle, high), 1)
     log.info("no scene.transmitter_m: %s m taken, in the middle", position.tolist())
-    return [Transmitter("tx", position, Antenna())]
+    return Transmitter("tx", position)
 
 
 def _around(scene: SceneSettings, tracer: RayTracer, area: np.ndarray) -> Ground:
@@ -283,7 +271,7 @@ def _around(scene: SceneSettings, tracer: RayTracer, area: np.ndarray) -> Ground
     def lift(points: np.ndarray) -> np.ndarray:
         if over == "zero":
             return points
-        return points + [0.0, 0.0, 1.0] * tracer.surface(points[:, :2])[0][:, None]
+        return points + [0.0, 0.0, 1.0] * tracer.height(points[:, :2])[:, None]
 
     def allowed(points: np.ndarray) -> np.ndarray:
         free = tracer.clear_of_surfaces(points, CLEARANCE)

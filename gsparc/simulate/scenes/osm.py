@@ -61,9 +61,7 @@ class Town:
 def read_town(path: str | Path, carrier_hz: float) -> Town:
     """Buildings and streets of an extract.
 
-    Args:
-        path: *.osm.
-        carrier_hz: the ground's model is of 1 to 10 GHz; else it is of concrete [Hz].
+    The ground's model is of 1 to 10 GHz; at other carriers [Hz] it is of concrete.
 
     Raises:
         ValueError: no such file, not OSM's XML, or no building in it.
@@ -78,7 +76,7 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     shapes = [
         (shape, tags)
         for geometry, tags in features
-        if _said(tags, "building") not in (None, "no") and (_said(tags, "location") != "underground")
+        if _tag(tags, "building") not in (None, "no") and (_tag(tags, "location") != "underground")
         for shape in _polygons(geometry)
     ]
     if not shapes:
@@ -112,8 +110,10 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
         )
     soil = "medium_dry_ground" if 1e9 <= carrier_hz <= 10e9 else "concrete"
     count = len(shapes)
-    said = [f"{number} of {count} buildings: {what}" for what, number in sorted(guesses.items())]
-    notes = (f"{count} buildings about {origin.latitude:g}, {origin.longitude:g} degrees", *said)
+    notes = (
+        f"{count} buildings about {origin.latitude:g}, {origin.longitude:g} degrees",
+        *(f"{number} of {count} buildings: {what}" for what, number in sorted(guesses.items())),
+    )
     streets = [line for geometry, tags in features for line in _streets(geometry, tags, origin)]
     (x0, y0), (x1, y1) = box + np.array([[-MARGIN_M], [MARGIN_M]])
     ground = sheet(GROUND, soil, (x0, y0, 0), (x1 - x0, 0, 0), (0, y1 - y0, 0))
@@ -136,7 +136,7 @@ def _features(path: Path) -> list[tuple[Any, Mapping[str, Any]]]:
     return list(zip(table.geometry, rows, strict=True))
 
 
-def _said(tags: Mapping[str, Any], name: str) -> str | None:
+def _tag(tags: Mapping[str, Any], name: str) -> str | None:
     """A tag in lower case; None where it is absent (or NaN, in a table)."""
     value = tags.get(name)
     return value.strip().lower() if isinstance(value, str) and value.strip() else None
@@ -152,22 +152,22 @@ def _polygons(geometry: Any) -> list[Any]:
 
 def _metres(text: str | None) -> float | None:
     """A length as OSM writes it: `12`, `12.5 m`, `40 ft`, `40'`; None where it is none."""
-    found = re.fullmatch(r"(\d+(?:[.,]\d+)?)\s*(m|metres?|meters?|ft|feet|')?", text or "")
-    if not found:
+    match = re.fullmatch(r"(\d+(?:[.,]\d+)?)\s*(m|metres?|meters?|ft|feet|')?", text or "")
+    if not match:
         return None
-    return float(found[1].replace(",", ".")) * (FEET_M if found[2] in ("ft", "feet", "'") else 1.0)
+    return float(match[1].replace(",", ".")) * (FEET_M if match[2] in ("ft", "feet", "'") else 1.0)
 
 
 def _heights(tags: Mapping[str, Any], guesses: Counter[str]) -> tuple[float, float]:
     """Lowest and highest z [m] of a building."""
-    low = _metres(_said(tags, "min_height"))
-    levels = _metres(_said(tags, "building:levels"))
-    high = _metres(_said(tags, "height")) or _metres(_said(tags, "building:height"))
+    low = _metres(_tag(tags, "min_height"))
+    levels = _metres(_tag(tags, "building:levels"))
+    high = _metres(_tag(tags, "height")) or _metres(_tag(tags, "building:height"))
     if low is None:
-        low = (_metres(_said(tags, "building:min_level")) or 0.0) * LEVEL_M
+        low = (_metres(_tag(tags, "building:min_level")) or 0.0) * LEVEL_M
     if high is None and levels:
         guesses[f"height from levels of {LEVEL_M:g} m"] += 1
-        high = (levels + (_metres(_said(tags, "roof:levels")) or 0.0)) * LEVEL_M
+        high = (levels + (_metres(_tag(tags, "roof:levels")) or 0.0)) * LEVEL_M
     if high is None or not low < high <= TALLEST_M:
         guesses[f"no height that can be: {USUAL_LEVELS * LEVEL_M:g} m taken"] += 1
         low, high = 0.0, USUAL_LEVELS * LEVEL_M
@@ -175,10 +175,10 @@ def _heights(tags: Mapping[str, Any], guesses: Counter[str]) -> tuple[float, flo
 
 
 def _material(tags: Mapping[str, Any], guesses: Counter[str]) -> str:
-    for tag in TAGS:
-        said = _said(tags, tag)
-        if said in MATERIALS:
-            return MATERIALS[said]
+    for name in TAGS:
+        word = _tag(tags, name)
+        if word in MATERIALS:
+            return MATERIALS[word]
     guesses["no material: concrete taken"] += 1
     return "concrete"
 
@@ -202,8 +202,8 @@ def _extruded(shape: Any, low: float, high: float, origin: Georeference) -> Any:
 
 
 def _streets(geometry: Any, tags: Mapping[str, Any], origin: Georeference) -> list[np.ndarray]:
-    kind = _said(tags, "highway")
-    if kind in (None, *WALKED) or _said(tags, "tunnel") == "yes" or geometry.geom_type != "LineString":
+    kind = _tag(tags, "highway")
+    if kind in (None, *WALKED) or _tag(tags, "tunnel") == "yes" or geometry.geom_type != "LineString":
         return []
     corners = np.array(geometry.coords)
     return [origin.from_degrees(corners[:, 1], corners[:, 0])]

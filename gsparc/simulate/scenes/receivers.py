@@ -100,14 +100,11 @@ def receivers(
     """Places of the layout that stand nowhere else than on the ground.
 
     Args:
-        how: the layout.
-        count: of receivers over an area.
+        how, count: the layout, and the number of receivers over an area.
         area: (2, 2) [m] lower and upper corner in x and y.
         height: lowest and highest, drawn for each, but out of a file [m].
         seed: of places and heights.
-        ground: of the scene.
-        streets: (n, 2) [m] each, of a map.
-        georeference: of the world's origin.
+        ground, streets, georeference: of the scene; streets are (n, 2) [m] each, of a map.
 
     Raises:
         ValueError: no places, or places inside of something where that is refused.
@@ -171,10 +168,10 @@ def _along(
 
 
 def _lines(how: Layout) -> list[np.ndarray]:
-    given = how.points_m
+    given: Any = how.points_m
     try:
         nested = given is not None and np.ndim(given[0]) == 2
-        lines = [np.array(line, dtype=np.float64) for line in (given if nested else [given])]  # type: ignore[union-attr]
+        lines = [np.array(line, dtype=np.float64) for line in (given if nested else [given])]
     except (TypeError, ValueError, IndexError):
         lines = []
     if not lines or any(x.ndim != 2 or x.shape[1] != 2 or len(x) < 2 for x in lines):
@@ -200,18 +197,18 @@ def _of_file(
     if how.file is None:
         raise ValueError("scene.receivers.file is missing; expected a table with x and y, or degrees")
     try:
-        asked, time_s = read_query_places(how.file, ["rx"]), read_times(how.file)
+        table, time_s = read_query_places(how.file, ["rx"]), read_times(how.file)
     except DataError as error:
         raise ValueError(f"scene.receivers.file: {error}") from None
-    for note in asked.notes:
+    for note in table.notes:
         log.info("%s: %s", how.file, note)
-    there = asked.ends["rx"]
-    across = there.across
-    if there.degrees:
+    listed = table.ends["rx"]
+    across = listed.across
+    if listed.degrees:
         if georeference is None:
             raise ValueError(f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y")
         across = georeference.from_degrees(*across.T)
-    above = np.full(len(across), height) if there.height is None else there.height
+    above = np.full(len(across), height) if listed.height is None else listed.height
     if time_s is not None and len(time_s) != len(across):
         raise ValueError(
             f"scene.receivers.file: {how.file}, time_s: {len(time_s)} times for {len(across)} places"
@@ -232,12 +229,12 @@ def place(
 ) -> np.ndarray:
     """`count` positions (S, 3) float64 [m], uniform over an area where `allowed` is True.
 
+    A larger count begins with the positions of a smaller one.
+
     Args:
-        count: how many.
         area: (2, 2) [m] lower and upper corner in x and y.
         height: lowest and highest z [m].
         allowed: (N, 3) -> (N,) bool.
-        seed: of the draw; a larger count begins with the positions of a smaller one.
 
     Raises:
         ValueError: almost nowhere is allowed.
@@ -246,13 +243,13 @@ def place(
     if not (np.isfinite([low, high]).all() and (high >= low).all() and (high > low)[:2].all()):
         raise ValueError(f"scene.area_m, scene.height_m: expected lower below upper, got {low} and {high}")
     rng = np.random.default_rng(seed)
-    found = np.empty((0, 3))
+    places = np.empty((0, 3))
     for _ in range(TRIES * -(-count // DRAWN)):
         drawn = rng.uniform(low, high, size=(DRAWN, 3))
-        found = np.concatenate([found, drawn[allowed(drawn)]])
-        if len(found) >= count:
-            return found[:count]
-    fit = f"only {len(found)} of {count} receivers fit into scene.area_m"
+        places = np.concatenate([places, drawn[allowed(drawn)]])
+        if len(places) >= count:
+            return places[:count]
+    fit = f"only {len(places)} of {count} receivers fit into scene.area_m"
     raise ValueError(f"scene: {fit}; is it inside a building?")
 
 

@@ -86,7 +86,7 @@ def stations(
     Raises:
         ValueError: an entry with an unknown setting, without a place, or two of one name.
     """
-    found: list[Transmitter] = []
+    made: list[Transmitter] = []
     for number, entry in enumerate(entries):
         where = f"scene.transmitters[{number}]"
         mast = Mast(**known_keys(entry, Mast, where, "setting"))
@@ -99,13 +99,13 @@ def stations(
         name = mast.name or f"tx{number}"
         for sector in range(mast.sectors):
             azimuth = (mast.azimuth_deg + 360 * sector / mast.sectors) % 360
-            called = name if mast.sectors == 1 else f"{name}-{sector + 1}"
-            found.append(Transmitter(called, position, Antenna(pattern, azimuth, mast.downtilt_deg)))
-    names = [one.name for one in found]
+            label = name if mast.sectors == 1 else f"{name}-{sector + 1}"
+            made.append(Transmitter(label, position, Antenna(pattern, azimuth, mast.downtilt_deg)))
+    names = [one.name for one in made]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"scene.transmitters: {twice[0]!r} twice; expected a name for each")
-    return found
+    return made
 
 
 def _position(

@@ -11,8 +11,7 @@ from access_points import invented
 from releases import real
 from scipy.stats import multivariate_normal
 
-from gsparc.locate.fingerprints.field import FingerprintField, learn
-from gsparc.locate.fingerprints.likelihood import HEARING, Levels, misfit
+from gsparc.locate.fingerprints.field import HEARING, FingerprintField, Levels, learn, misfit
 from gsparc.locate.fingerprints.rows import parted, read_fingerprints
 
 NAN = float("nan")
@@ -33,7 +32,7 @@ def field() -> FingerprintField:
     return learn(*invented(400))
 
 
-def test_levels_and_silence_are_predicted_where_nobody_measured(field):
+def test_levels_and_silence_are_predicted_elsewhere(field):
     level, places = invented(200, seed=1)
     found, heard = field.moments(torch.from_numpy(places)), np.isfinite(level)
     error = (level - found.mean.numpy())[heard]
@@ -45,7 +44,7 @@ def test_levels_and_silence_are_predicted_where_nobody_measured(field):
     assert probability.min() > 0 and probability.max() < 1
 
 
-def test_a_row_is_most_likely_near_its_place(field):
+def test_row_is_most_likely_near_its_place(field):
     level, places = invented(60, seed=1)
     grid = np.stack(np.meshgrid(np.arange(0, 30, 1.0), np.arange(0, 20, 1.0), [0.0]), -1).reshape(-1, 3)
     found = likely(field, level, grid)
@@ -54,7 +53,7 @@ def test_a_row_is_most_likely_near_its_place(field):
     torch.testing.assert_close(likely(field, level[3:4], grid)[0], found[3], rtol=1e-4, atol=1e-3)
 
 
-def test_a_device_that_adds_to_all_levels_is_found_with_an_offset(field):
+def test_device_offset_is_absorbed(field):
     level, places = invented(60, seed=1)
     grid = invented(300, seed=2)[1]
     plain, shifted = (likely(field, level - 12, grid, offset).argmax(1) for offset in (None, 12.0))
@@ -62,7 +61,7 @@ def test_a_device_that_adds_to_all_levels_is_found_with_an_offset(field):
     assert apart[1] < 0.8 * apart[0]
 
 
-def test_the_likelihood_is_the_density_of_a_normal_vector_with_a_common_part():
+def test_likelihood_is_a_normal_density_with_a_common_part():
     rng = np.random.default_rng(0)
     mean, variance = rng.uniform(-80, -50, (2, 4)), rng.uniform(4, 25, (2, 4))
     heard = rng.uniform(0.2, 0.9, (2, 4))
@@ -85,7 +84,7 @@ def test_the_likelihood_is_the_density_of_a_normal_vector_with_a_common_part():
     np.testing.assert_allclose((with_ - without).numpy(), wanted, atol=5e-3)
 
 
-def test_floors_are_told_apart():
+def test_floors_are_distinguished():
     field = learn(*invented(500, floors=2))
     level, places = invented(100, floors=2, seed=1)
     other = places * [1, 1, 0] + [0, 0, 4.0] - places * [0, 0, 1]
@@ -104,7 +103,7 @@ def test_few_rows_and_access_points_never_heard():
         learn(np.full((5, 3), np.nan, np.float32), places[:5])
 
 
-def test_a_place_takes_less_than_a_millisecond(field):
+def test_place_takes_a_millisecond(field):
     """200 access points, as a batch; measured 0.1 to 0.3 ms."""
     rng = np.random.default_rng(0)
     level = np.where(rng.random((400, 200)) < 0.3, rng.uniform(-90, -40, (400, 200)), np.nan)
@@ -118,7 +117,7 @@ def test_a_place_takes_less_than_a_millisecond(field):
     assert (time.perf_counter() - start) / len(places) < 3e-3  # beside other work
 
 
-def test_real_walks_are_placed_better_than_by_the_nearest_row():
+def test_walks_are_placed_better_than_by_the_nearest_row():
     rows = read_fingerprints(real("locate/wifine-floor4.npz"))
     train, test = parted(rows, "walks", share=0.25)
     train, test = train[::3], test[::6]

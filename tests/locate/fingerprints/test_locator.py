@@ -42,7 +42,7 @@ def test_walks_are_placed_better_together():
     assert 0.05 < FingerprintLocator.of(heard, 0.0, around=False, track=True).speed < 1
 
 
-def test_the_place_is_on_one_floor():
+def test_place_is_on_one_floor():
     locator = FingerprintLocator.of(rows_of(*invented(60, floors=2)), 0.0, around=True, track=False)
     cells = locator.cells
     low = cells.centre[:, 2] < 2
@@ -50,7 +50,7 @@ def test_the_place_is_on_one_floor():
     assert place(Posterior(cells, np.log(mass / cells.size)))[2] == pytest.approx(cells.centre[low, 2][0])
 
 
-def test_coordinates_of_a_country_are_no_other():
+def test_large_coordinates_change_nothing():
     """UJIIndoorLoc has northings of 4,864,900 m."""
     known, heard = rows_of(*invented(150)), rows_of(*invented(20, seed=1))
     far = np.array([-7500.0, 4_864_900.0, 0])

@@ -23,7 +23,7 @@ def written(path, **other):
     return path
 
 
-def test_an_archive_is_read(tmp_path):
+def test_archive_is_read(tmp_path):
     file = written(
         tmp_path / "a.npz", floor=np.int64(3), test=np.array([0, 1, 0, 0], bool), month=np.arange(4)
     )
@@ -51,13 +51,13 @@ def test_an_archive_is_read(tmp_path):
         ({"access_point": np.array(["a", "a"])}, "expected each once"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(tmp_path, other, said):
+def test_bad_archives_are_refused_in_one_line(tmp_path, other, said):
     with pytest.raises(DataError, match=said) as error:
         read_fingerprints(written(tmp_path / "a.npz", **other))
     assert "\n" not in str(error.value)
 
 
-def test_a_table_is_read(tmp_path):
+def test_table_is_read(tmp_path):
     file = tmp_path / "a.csv"
     head = "WAP001,WAP002,LONGITUDE,LATITUDE,FLOOR,BUILDINGID\n"
     file.write_text(head + "-60,100,-7500.5,4864900,2,1\n100,-90,-7400,4864800,0,0\n")
@@ -77,7 +77,7 @@ def test_a_table_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["none.npz", "none.csv"])
-def test_a_file_that_is_not_there(tmp_path, name):
+def test_missing_file_is_refused(tmp_path, name):
     with pytest.raises(DataError, match=r"[Nn]o such file"):
         read_fingerprints(tmp_path / name)
 
@@ -92,7 +92,7 @@ def invented(count: int = 200) -> Fingerprints:
     )
 
 
-def test_splits_hold_out_what_they_say():
+def test_splits_hold_out_whole_units():
     rows = invented()
     for how, unit in (
         ("places", np.floor(rows.position / 4)),
@@ -110,7 +110,7 @@ def test_splits_hold_out_what_they_say():
         parted(rows, "walk")
 
 
-def test_columns_follow_another_campaign():
+def test_columns_are_those_of_another_campaign():
     rows = invented().at(np.arange(5)).of_access_points(np.array(["c", "z", "a"]))
     np.testing.assert_array_equal(rows.level[:, [2, 0]], invented().level[:5][:, [0, 2]])
     assert np.isnan(rows.level[:, 1]).all() and rows.level.dtype == np.float32
@@ -123,14 +123,14 @@ def test_columns_follow_another_campaign():
     [("locate/rss-lib1.npz", "released", 3120), ("locate/wifine-floor4.npz", "walks", 520),
      ("change/library-months.npz", "later", 5656), ("change/garage-rounds.npz", "later", 6800)],
 )  # fmt: skip
-def test_the_files_of_the_campaigns(name, how, count):
+def test_files_of_the_campaigns(name, how, count):
     rows = read_fingerprints(real(name))
     train, test = parted(rows, how)
     assert np.isfinite(rows.level).any(1).mean() > 0.99
     assert len(train) + len(test) == len(rows.level) and len(test) == count
 
 
-def test_rows_of_unknown_places_are_read_where_they_may_be(tmp_path):
+def test_unknown_places_are_read_where_allowed(tmp_path):
     file, table = written(tmp_path / "a.npz", position=None), tmp_path / "a.csv"
     table.write_text("WAP001,FLOOR\n-60,2\n100,0\n")
     for path in (file, table):

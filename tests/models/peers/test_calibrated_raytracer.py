@@ -22,14 +22,16 @@ from gsparc.simulate.calibration import (
     student,
     used_materials,
 )
-from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import SceneSettings, known_scene, names_scene
 from gsparc.training.context import FitContext
 
 STATION = np.array([-2.5, 0.0, 3.0])
 CARRIER_HZ = 3.5e9
-PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
+PLAIN = PropagationEffects(
+    diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2
+)
 TRUE = Material(4.0, 0.2)
 GAIN_DB = 17.0
 ALL = np.arange(60)
