@@ -17,9 +17,8 @@ from record import guarded, output_of
 from torch import Tensor
 
 from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
-from gsparc.ops.geometry import Gaussians
 from gsparc.ops.networks import networks, products
-from gsparc.ops.operators import composite_backward_op, view_of
+from gsparc.ops.operators import composite_gradient
 from gsparc.prediction.timing import ClockSettings, interleaved
 from gsparc.training.losses import _Kernel, _written_out, ssim
 
@@ -217,9 +216,8 @@ def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
     """The backward operator alone, for an upstream gradient of noise."""
     raster = composite(plan, *model, features)
     upstream = torch.randn_like(raster.image)
-    inputs = (upstream, None, raster.image, raster.transmittance, Gaussians(*model, None), features)
-    view = view_of(plan)
-    return lambda: composite_backward_op.of(*inputs, *view)
+    inputs = (upstream, None, raster.image, raster.transmittance, plan.means2d, features, *model, None)
+    return lambda: composite_gradient(plan, *inputs)
 
 
 def by_kernel(function: Callable[[], Any]) -> dict[str, float]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-NOT_THESE = ("test_operators", "test_at_once")  # registration; a call of the CPU alone
+NOT_THESE = ("test_operators", "test_at_once", "test_compute_kernels")  # of the CPU alone, or in test_cuda.py
 NOT_HERE = {
     "test_absent_backends_say_why": "test_library.py has more of them",
     "test_every_instruction_set": "of the CPU",

@@ -141,7 +141,7 @@ def test_gradient_is_exactly_zero_where_nothing_is_seen(backend, examples):
 def test_weights_and_frozen_views_say_the_same(backend, examples):
     def same(drawn: Drawn):
         scene, optics = drawn.scene.to(drawn.dtype), drawn.optics
-        model = (scene.means, scene.quats, scene.scales, scene.opacities)
+        model = scene.model
         hidden = {"extinctions": scene.extinctions}
         plan = make_plan(*model, drawn.pose, drawn.grid, ids=scene.ids, backend=backend, **hidden, **optics)
         seen, view = mean_weights(plan, *model, **hidden), freeze(plan, *model, version=0, **hidden)

@@ -34,7 +34,7 @@ def test_features_that_are_not_finite(backend, value):
 @BACKENDS
 def test_features_of_a_frozen_view_were_not_looked_at(backend):
     scene = random_scene(n=40, samples=2)
-    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    model = scene.model
     view = freeze(make_plan(*model, poses(1), GRID, backend=backend), *model, version=0)
     features = scene.features.clone()
     features[1, view.order[3], 0] = float("nan")
@@ -57,7 +57,7 @@ def test_features_under_transforms_were_not_looked_at(backend):
     pose = poses(1)
 
     def drawn_of(values):
-        model = (scene.means, scene.quats, scene.scales, scene.opacities)
+        model = scene.model
         return rasterize(*model, values, pose, GRID, backend=backend).image
 
     mapped_last = lambda values: vmap(drawn_of, in_dims=2)(values.movedim(0, 2))  # noqa: E731
@@ -96,7 +96,7 @@ def test_the_pose_that_is_none_was_not_named(backend):
     scene, many = random_scene(n=6, samples=1), poses(300)
     many.rotation[217] *= -1
     with pytest.raises(ValueError, match="pose 217 is not finite"):
-        make_plan(scene.means, scene.quats, scene.scales, scene.opacities, many, GRID, backend=backend)
+        make_plan(*scene.model, many, GRID, backend=backend)
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
