@@ -58,7 +58,7 @@ sanitize() {
   for tool in memcheck racecheck synccheck; do
     echo "-- $tool"
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 95 compute-sanitizer --tool "$tool" --error-exitcode 7 "${ours[@]}" \
-      "$PYTHON" bench/gpu.py short || worst=$?
+      "$PYTHON" -P -m pytest tests/cuda/test_watched.py -q -k "every_kernel and gpu" -p no:cacheprovider || worst=$?
   done
   return $worst
 }

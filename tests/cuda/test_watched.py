@@ -121,6 +121,11 @@ def everything(dtype: torch.dtype) -> None:
         networks.networks(torch.ones(samples, 19), *weights).sum().backward()
 
 
+def test_every_kernel_runs(where):
+    """What compute-sanitizer watches on a GPU (bench/gpu.sh)."""
+    everything(torch.float32)
+
+
 @pytest.fixture(scope="module")
 def record(tmp_path_factory):
     path = tmp_path_factory.mktemp("calls") / "calls"

@@ -29,6 +29,19 @@ def backend(request):
         LEDGER.engine = None
 
 
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """Folder of a training that nobody disturbed, its overrides and its length [s]."""
+    from campaigns import brief, spectra
+    from crashes import DENSIFIED, run, training
+
+    folder = tmp_path_factory.mktemp("undisturbed")
+    settings = brief(spectra(folder / "own.npz"), *DENSIFIED)
+    code, seconds = run(training, str(folder / "whole"), settings)
+    assert code == 0
+    return folder / "whole", settings, seconds
+
+
 def pytest_addoption(parser):
     parser.addoption("--table", type=Path, help="write what was measured between the markers of this file")
     parser.addoption("--soak-minutes", type=float, help="length of test_soak.py instead of 40 s")

@@ -169,7 +169,8 @@ def assert_close(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: flo
 
 
 TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-4}
-PROJECTIONS = pytest.mark.parametrize("projection", ["tangent", "equirect"])
+PROJECTED = ("tangent", "equirect")
+PROJECTIONS = pytest.mark.parametrize("projection", PROJECTED)
 
 
 def assert_equals_reference(

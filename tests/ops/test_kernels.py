@@ -159,10 +159,11 @@ def test_flips_at_the_cutoff_are_rare(projection):
 
 @PROJECTIONS
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_gradcheck(projection, backend):
+@pytest.mark.parametrize("seed", [3, 4])
+def test_gradcheck(projection, backend, seed):
     """Every derivative by finite differences, with cut-offs so low that none is crossed."""
-    scene = random_scene(n=4, seed=3, hides=True)
-    cut = Cutoff(1e-30, 0.0)
+    scene = random_scene(n=4, seed=seed, hides=True)
+    cut = Cutoff(1e-30, 0.0, relative=seed == 4)
     features = scene.features[:2, :, :1]
     inputs = [scene.means, scene.quats, scene.scales, scene.opacities, scene.extinctions, features]
     inputs = [tensor.clone().requires_grad_() for tensor in inputs]

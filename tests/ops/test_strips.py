@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from compute_kernels import SETS, assert_threads_agree, instruction_set
-from rasters import PROJECTIONS, assert_equals_reference, origin, poses, random_scene, render
+from rasters import PROJECTED, PROJECTIONS, assert_equals_reference, origin, poses, random_scene, render
 
 from gsparc.ops import SphereGrid, make_plan
 
@@ -34,8 +34,10 @@ CASES = {
 }  # fmt: skip
 
 
-@PROJECTIONS
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case,projection",
+    [(case, kind) for case in CASES for kind in PROJECTED if kind == "tangent" or " row" not in case],
+)
 def test_equals_reference(case, projection):
     made, pose, grid = CASES[case]
     _, want = assert_equals_reference(made(), pose, grid, projection=projection)
