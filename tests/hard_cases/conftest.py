@@ -1,6 +1,6 @@
 """Every hard case on every backend, and the table of what was measured.
 
-`pytest tests/hard_cases --table docs/hard-cases.md` writes the table; see tests/ledger.py.
+`pytest tests/hard_cases --table docs/hard-cases.md` writes the table; see tests/helpers/ledger.py.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ def pytest_runtest_setup(item):
 
 
 def pytest_runtest_logreport(report):
-    told = LEDGER.tests[Path(report.fspath).stem.removeprefix("test_")]
-    told.seconds += report.duration
-    told.passed += report.when == "call" and report.passed
-    told.failed += report.failed
+    outcome = LEDGER.tests[Path(report.fspath).stem.removeprefix("test_")]
+    outcome.seconds += report.duration
+    outcome.passed += report.when == "call" and report.passed
+    outcome.failed += report.failed
 
 
 def pytest_sessionfinish(session):
