@@ -109,11 +109,11 @@ def kernel_ms(function: Callable[[], Any], inner: int = 10, rounds: int = 100) -
     return event_ms(graph_of(function, inner).replay, rounds, inner=inner)
 
 
-def cold_ms(function: Callable[[], Any], rounds: int = 100) -> dict[str, float]:
+def cold_ms(function: Callable[[], Any]) -> dict[str, float]:
     """The same of one call that finds nothing of its own in the second-level cache."""
     size = 4 * torch.cuda.get_device_properties().L2_cache_size
     cache = torch.empty(size, dtype=torch.uint8, device="cuda")
-    return event_ms(graph_of(function).replay, rounds, forget=cache)
+    return event_ms(graph_of(function).replay, rounds=100, forget=cache)
 
 
 def ceilings() -> dict[str, Any]:
