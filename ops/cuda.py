@@ -100,7 +100,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     starts = count * tiles(plan.settings) + 1
     if count * n == 0:
         zeros = [buffer.zero_() for buffer in buffers[:-1]]
-        return replace(plan, buffers=Buffers(*zeros, buffers.entries.new_zeros(starts)))
+        return replace(plan, buffers=Buffers._make([*zeros, buffers.entries.new_zeros(starts)]))
     verdict = means.new_empty(2, dtype=torch.int64)
     run_on_plan("plan", plan, gaussians, ids, plan.means2d, plan.radii, plan.visible, verdict)
     key = (count, n, plan.settings)

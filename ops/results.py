@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ class Plan:
         means2d: (P, N, 2) (column, row) [px].
         radii: (P, N) [px], 0 where culled.
         visible: (P, N) bool.
-        buffers: the backend's own tensors.
+        buffers: the backend's own tensors: `operators.Buffers`, or of the reference the depth order alone.
         pose_trained: whether the poses it was given require gradients, of which there are none.
     """
 
@@ -35,7 +36,7 @@ class Plan:
     means2d: Tensor
     radii: Tensor
     visible: Tensor
-    buffers: tuple[Tensor, ...]
+    buffers: Any
     pose_trained: bool = False
 
     @property
