@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from record import LOG, guarded, output_of, update
+from record import guarded, output_of, update
 
 
 def machine() -> dict[str, Any]:
@@ -74,14 +74,6 @@ def bench(file: Path) -> None:
     update(file, frozen=guarded(lambda: measure.frozen(2_000, ceilings)))
     update(file, emission=guarded(lambda: measure.emission(62_000, 16, ceilings)))
     update(file, similarity=guarded(lambda: measure.similarity(16, ceilings)))
-
-
-def short() -> None:
-    """Each kernel once on a small scene: what compute-sanitizer watches."""
-    import measure
-
-    measure.touch_everything()
-    LOG.info("every kernel ran")
 
 
 def dataset_overrides() -> list[str]:
@@ -157,7 +149,7 @@ def note(file: Path, name: str, status: str, seconds: str) -> None:
     file.write_text(json.dumps(known | {"stages": stages}, indent=1))
 
 
-STAGES = {stage.__name__: stage for stage in (needs, build, bench, short, train, table, note)}
+STAGES = {stage.__name__: stage for stage in (needs, build, bench, train, table, note)}
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -58,7 +58,7 @@ sanitize() {
   for tool in memcheck racecheck synccheck; do
     echo "-- $tool"
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 95 compute-sanitizer --tool "$tool" --error-exitcode 7 "${ours[@]}" \
-      "$PYTHON" bench/gpu.py short || worst=$?
+      "$PYTHON" -P -m pytest tests/cuda/test_watched.py -q -k "every_kernel and gpu" -p no:cacheprovider || worst=$?
   done
   return $worst
 }
@@ -66,7 +66,7 @@ export -f sanitize
 export PYTHON
 
 stage build 300 "$PYTHON" bench/gpu.py build "$OUT/cuda.json"
-stage tests 240 "$PYTHON" -P -m pytest tests/cuda -q --maxfail=20 -k "gpu or test_device" -p no:cacheprovider
+stage tests 240 "$PYTHON" -P -m pytest tests/cuda tests/ops -q --maxfail=20 -k "gpu or test_device" -p no:cacheprovider
 stage hard 240 "$PYTHON" -P -m pytest tests/hard_cases -q --maxfail=20 -m "not slow" -k "cuda and not shim" -p no:cacheprovider
 stage bench 200 "$PYTHON" bench/gpu.py bench "$OUT/cuda.json"
 stage sanitize 290 bash -c sanitize

@@ -7,21 +7,21 @@ finished result.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import torch
-from record import guarded, output_of
+from record import guarded
 from torch import Tensor
 
 from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
-from gsparc.ops.geometry import Gaussians
-from gsparc.ops.networks import networks, products
-from gsparc.ops.operators import composite_backward_op, view_of
+from gsparc.ops.networks import networks
+from gsparc.ops.operators import composite_gradient
 from gsparc.prediction.timing import ClockSettings, interleaved
-from gsparc.training.losses import _Kernel, _written_out, ssim
+from gsparc.training.losses import ssim
 
 GRID = SphereGrid.hemisphere()
 Model = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -109,17 +109,11 @@ def kernel_ms(function: Callable[[], Any], inner: int = 10, rounds: int = 100) -
     return event_ms(graph_of(function, inner).replay, rounds, inner=inner)
 
 
-def cold_ms(function: Callable[[], Any], rounds: int = 100) -> dict[str, float]:
+def cold_ms(function: Callable[[], Any]) -> dict[str, float]:
     """The same of one call that finds nothing of its own in the second-level cache."""
     size = 4 * torch.cuda.get_device_properties().L2_cache_size
     cache = torch.empty(size, dtype=torch.uint8, device="cuda")
-    return event_ms(graph_of(function).replay, rounds, forget=cache)
-
-
-def clocks() -> str:
-    """SM and memory clocks now and at most, power and temperature, as the driver says."""
-    asked = "--query-gpu=clocks.sm,clocks.max.sm,clocks.mem,clocks.max.mem,power.draw,temperature.gpu"
-    return output_of("nvidia-smi", asked, "--format=csv,noheader")
+    return event_ms(graph_of(function).replay, rounds=100, forget=cache)
 
 
 def ceilings() -> dict[str, Any]:
@@ -131,17 +125,12 @@ def ceilings() -> dict[str, Any]:
     torch.backends.cuda.matmul.allow_tf32 = False
     a, b = (torch.randn(8192, 8192, device="cuda") for _ in range(2))
     product = event_ms(lambda: a @ b, rounds=8)["p50"]
-    for _ in range(40):
-        a @ b
-    busy = clocks()  # while those run
-    torch.cuda.synchronize()
     one = torch.zeros(1, device="cuda")
     return {
         "copy_tb_s": 2 * 4 * 512 * 2**20 / copy / 1e9,
         "float32_tflop_s": 2 * 8192**3 / product / 1e9,
         "empty_launch_ms": kernel_ms(lambda: one.add_(1), inner=20)["p50"],
         "empty_graph_ms": kernel_ms(lambda: one.add_(1), inner=1)["p50"],
-        "clocks_under_load": busy,
     }
 
 
@@ -209,7 +198,6 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
         for name, (call, cost) in ends.items():
             found[f"end_to_end_{name}"] = compared(wall_ms(call), *cost, limits)
     found["end_to_end_forward_backward"] = compared(wall_ms(step), *step_cost, limits)
-    found["kernels_us"] = guarded(lambda: by_kernel(step))
     return found
 
 
@@ -217,22 +205,8 @@ def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
     """The backward operator alone, for an upstream gradient of noise."""
     raster = composite(plan, *model, features)
     upstream = torch.randn_like(raster.image)
-    inputs = (upstream, None, raster.image, raster.transmittance, Gaussians(*model, None), features)
-    view = view_of(plan)
-    return lambda: composite_backward_op.of(*inputs, *view)
-
-
-def by_kernel(function: Callable[[], Any]) -> dict[str, float]:
-    """Microseconds of each kernel in one call, the largest first."""
-    from torch.profiler import ProfilerActivity, profile
-
-    function()
-    with profile(activities=[ProfilerActivity.CUDA]) as seen:
-        for _ in range(5):
-            function()
-        torch.cuda.synchronize()
-    rows = [(e.key.split("(")[0][-60:], e.device_time_total / 5) for e in seen.key_averages()]
-    return {name: round(us, 1) for name, us in sorted(rows, key=lambda row: -row[1])[:14] if us > 0}
+    inputs = (upstream, None, raster.image, raster.transmittance, plan.means2d, features, *model, None)
+    return lambda: composite_gradient(plan, *inputs)
 
 
 def many_poses(count: int, poses: int, limits: dict[str, Any]) -> dict[str, Any]:
@@ -263,47 +237,23 @@ BATCHES = (1, 16, 64, 256, 1024, 4096)
 
 
 def frozen(count: int, limits: dict[str, Any]) -> dict[str, Any]:
-    """Spectra per second of a static receiver by the size of the batch, beside cuBLAS and cuSPARSE."""
+    """Spectra per second of a static receiver by the size of the batch: user calls and captured graphs."""
     model, pose = scene(count), origin()
     view = freeze(make_plan(*model, pose, GRID), *model, version=0)
-    weights = int((view.buffers[3] > 0).sum())
-    with torch.no_grad():
-        dense = view.render(torch.eye(count, device="cuda").unsqueeze(-1), 0).flatten(1)
-        sparse = dense.mT.contiguous().to_sparse_csr()
-        found: dict[str, Any] = {"gaussians": count, "weights_not_zero": weights}
-        found["share_of_weights_not_zero"] = weights / dense.numel()
-        for batch in BATCHES:
-            found[f"batch{batch}"] = guarded(
-                partial(frozen_batch, view, dense, sparse, batch, weights, limits)
-            )
-        found |= guarded(lambda: with_networks(view, model, BATCHES[-1]))
+    weights, pixels = int((view.buffers[3] > 0).sum()), GRID.height * GRID.width
+    found: dict[str, Any] = {"gaussians": count, "weights_not_zero": weights}
+    found["share_of_weights_not_zero"] = weights / (count * pixels)
+    for batch in BATCHES:
+        features = torch.rand(batch, count, 1, device="cuda")
+        query = partial(view.render, features, 0)
+        cost = 4 * batch * pixels, 2 * batch * weights  # images written, products of weights not zero
+        with torch.no_grad():
+            kernels = guarded(lambda q=query, c=cost: compared(kernel_ms(q, inner=2, rounds=30), *c, limits))
+            wall = wall_ms(query, rounds=30)
+        rates = {"": wall["p50"], "_captured": kernels.get("p50", math.nan)}
+        rates = {f"spectra_per_s{name}": 1e3 * batch / ms for name, ms in rates.items()}
+        found[f"batch{batch}"] = {"end_to_end": wall, "kernels": kernels, **rates}
     return found
-
-
-def frozen_batch(
-    view: Any, dense: Tensor, sparse: Tensor, batch: int, weights: int, limits: dict[str, Any]
-) -> dict[str, Any]:
-    """One batch size: user calls, captured graphs, and three products of cuBLAS and cuSPARSE."""
-    features = torch.rand(batch, len(dense), 1, device="cuda")
-    flat = features.squeeze(-1)
-    columns = flat.mT.contiguous()
-    query = lambda: view.render(features, 0)  # noqa: E731
-    wall = wall_ms(query, rounds=30)
-    cost = 4 * batch * dense.shape[1], 2 * batch * weights  # images written, products of weights not zero
-    kernels = compared(kernel_ms(query, inner=2, rounds=30), *cost, limits)
-    rates = {"": wall["p50"], "_captured": kernels["p50"]}
-    for tf32, name in ((False, "_dense_float32"), (True, "_dense_tf32")):
-        torch.backends.cuda.matmul.allow_tf32 = tf32
-        rates[name] = kernel_ms(lambda: flat @ dense, inner=2, rounds=10)["p50"]
-    torch.backends.cuda.matmul.allow_tf32 = False
-    error = float((query().flatten(1) - flat @ dense).abs().max())
-    found = {"end_to_end": wall, "kernels": kernels, "error_to_dense": error}
-    csr = guarded(lambda: event_ms(lambda: sparse @ columns, rounds=5))
-    if "p50" in csr:
-        rates["_sparse_csr"] = csr["p50"]
-    else:
-        found["sparse_csr"] = csr
-    return found | {f"spectra_per_s{name}": 1e3 * batch / ms for name, ms in rates.items()}
 
 
 def network_weights(count: int, inputs: int, hidden: int, outputs: int) -> list[Tensor]:
@@ -312,76 +262,30 @@ def network_weights(count: int, inputs: int, hidden: int, outputs: int) -> list[
     return [torch.randn(count, *shape, device="cuda") for shape in shapes]
 
 
-def with_networks(view: Any, model: Model, batch: int) -> dict[str, float]:
-    """The same from positions: encoding, networks (33-32-1), attenuation, image."""
-    count = len(model[0])
-    weights = network_weights(count, 33, 32, 1)
-    places, axes = torch.randn(batch, 3, device="cuda"), torch.randn(3, 15, device="cuda")
-
-    def answer() -> Tensor:
-        waves = places @ axes
-        encoded = torch.cat([places, waves.sin(), waves.cos()], -1)
-        distance = torch.cdist(places, model[0]).unsqueeze(-1)
-        return view.render(torch.sigmoid(networks(encoded, *weights) - distance.log()) / distance, 0)
-
-    return {"spectra_per_s_with_networks": 1e3 * batch / wall_ms(answer, rounds=10)["p50"]}
-
-
 def emission(count: int, batch: int, limits: dict[str, Any]) -> dict[str, Any]:
-    """The emission networks alone (33-32-2), ours beside matrix products."""
+    """The emission networks alone (33-32-2), forward and backward."""
     weights, found = network_weights(count, 33, 32, 2), {}
     for samples in (1, batch):
         encoded = torch.randn(samples, 33, device="cuda")
         flops = 2 * samples * count * (33 * 32 + 64)
         bytes_ = 4 * sum(w.numel() for w in weights) + 8 * samples * count
-        ours = kernel_ms(lambda encoded=encoded: networks(encoded, *weights), inner=2)
+        ours = kernel_ms(partial(networks, encoded, *weights), inner=2)
         found[f"batch{samples}"] = compared(ours, bytes_, flops, limits)
-        theirs = event_ms(lambda encoded=encoded: products(encoded, *weights), rounds=10)
-        found[f"batch{samples}_matrix_products"] = theirs
     leaves = [weight.requires_grad_() for weight in weights]
-    encoded = torch.randn(batch, 33, device="cuda")
-    for name, function in (("ours", networks), ("matrix_products", products)):
-        out = function(encoded, *leaves)
-        slope = torch.randn_like(out)
-        grads = lambda out=out, slope=slope: torch.autograd.grad(out, leaves, slope, retain_graph=True)  # noqa: E731
-        found[f"backward_{name}"] = event_ms(grads, rounds=10)
-    return found
+    out = networks(encoded, *leaves)
+    slope = torch.randn_like(out)
+    grads = partial(torch.autograd.grad, out, leaves, slope, retain_graph=True)
+    return found | {"backward": event_ms(grads, rounds=10)}
 
 
 def similarity(batch: int, limits: dict[str, Any]) -> dict[str, Any]:
-    """The structural similarity of a batch with its gradient, ours beside the one written out in torch."""
+    """The structural similarity of a batch with its gradient."""
     images = torch.rand(2, batch, GRID.height, GRID.width, device="cuda")
     prediction, target = images[0].requires_grad_(), images[1]
-    steps = {
-        name: lambda kind=kind: torch.autograd.grad(kind(prediction, target).sum(), prediction)
-        for name, kind in (("ours", _Kernel.apply), ("written_out", _written_out))
-    }
-    found: dict[str, Any] = {name: {"end_to_end": wall_ms(step)} for name, step in steps.items()}
+
+    def step() -> Any:
+        return torch.autograd.grad(ssim(prediction, target).sum(), prediction)
+
     # Windows of 11 and 11 taps over five maps and, transposed, over three; images read, a gradient written.
     pixels = prediction.numel()
-    found["ours"] |= compared(event_ms(steps["ours"]), 12 * pixels, 2 * 22 * 8 * pixels, limits)
-    return found
-
-
-def touch_everything() -> None:
-    """Run every kernel once, both projections, one and several poses, few and many channels."""
-    model = scene(300)
-    grid = SphereGrid.hemisphere(13, 45)
-    for projection in ("tangent", "equirect"):
-        for pose, samples, channels in ((origin(), 1, 1), (origin(), 3, 7), (origin(2), 2, 3)):
-            leaves = [tensor.clone().requires_grad_() for tensor in model]
-            features = torch.rand(samples, 300, channels, device="cuda", requires_grad=True)
-            ids = torch.randperm(300, device="cuda")
-            raster = rasterize(*leaves, features, pose, grid, projection=projection, ids=ids)
-            plan = make_plan(*leaves, pose, grid, projection=projection)
-            seen = mean_weights(plan, *leaves)
-            (raster.image.sum() + raster.transmittance.sum() + seen.mean.sum() + seen.share.sum()).backward()
-        view = freeze(make_plan(*model, origin(), grid, projection=projection), *model, version=0)
-        view.render(torch.rand(300, 2, device="cuda"), 0)
-        view.render(torch.rand(40, 300, 1, device="cuda"), 0)
-    images = torch.rand(2, 23, 40, device="cuda", requires_grad=True)
-    ssim(images, images.detach().flip(0)).sum().backward()
-    weights = [weight.requires_grad_() for weight in network_weights(300, 19, 24, 2)]
-    for samples in (1, 21):
-        networks(torch.rand(samples, 19, device="cuda"), *weights).sum().backward()
-    torch.cuda.synchronize()
+    return {"end_to_end": wall_ms(step)} | compared(event_ms(step), 12 * pixels, 2 * 22 * 8 * pixels, limits)

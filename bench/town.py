@@ -22,19 +22,14 @@ NOISE_DB = 1.0
 STATION = (1_400.0, 1_600.0, 25.0)
 HEIGHT_M = 1.5  # of what moves
 TESTED = 2_000
-SCATTERERS = 10
+SCATTERERS, ANTENNAS, TONES = 10, 16, 64  # of the hall; antennas in a row, half a wavelength apart
 CITY = Path(__file__).parents[2] / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
 STATION_USED, JITTER_M, CITY_NOISE_DB = 11, 15.0, 3.0  # the station most heard of; noise as gp finds it
 
 
-def town(count: int, seed: int = 0) -> Measurements:
-    """Powers of `count` rows to learn from, and, behind them, of `TESTED` places that no number changes.
-
-    Args:
-        count: rows.
-        seed: of places and noise.
-    """
-    rng = np.random.default_rng([seed, count])
+def town(count: int) -> Measurements:
+    """Powers of `count` rows to learn from, and, behind them, of `TESTED` places that no number changes."""
+    rng = np.random.default_rng([0, count])
     drawn = [np.random.default_rng(2).uniform(0, SIDE_M, (TESTED, 2)), rng.uniform(0, SIDE_M, (count, 2))]
     places = np.concatenate(drawn[::-1])
     decibels = shadowed(places, np.array(STATION), np.random.default_rng(1))
@@ -57,7 +52,7 @@ def shadowed(places: np.ndarray, station: np.ndarray, shadows: np.random.Generat
     return decibels
 
 
-def city(count: int, seed: int = 0) -> Measurements:
+def city(count: int) -> Measurements:
     """The same of a measured city: places about measured ones, powers those that a process of them predicts.
 
     Its noise is drawn anew. Measured powers drawn again and again would share the noise they were measured
@@ -68,7 +63,7 @@ def city(count: int, seed: int = 0) -> Measurements:
         known = np.pad(stored["mobile_position"][heard].astype(float), ((0, 0), (0, 1)))
         powers = stored["rssi_db"][heard, STATION_USED].astype(float)
         station = np.append(stored["station_position"][STATION_USED], 0.0)
-    rng, parts = np.random.default_rng([seed, count]), []
+    rng, parts = np.random.default_rng([0, count]), []
     for part, number in ((rng, count), (np.random.default_rng(2), TESTED)):
         place = known[part.integers(len(known), size=number)]
         place[:, :2] += JITTER_M * part.normal(size=(number, 2))
@@ -83,7 +78,7 @@ def city(count: int, seed: int = 0) -> Measurements:
     return from_arrays(arrays, {"name": "city"})
 
 
-def hall(path: Path, count: int, antennas: int = 16, tones: int = 64, seed: int = 0) -> None:
+def hall(path: Path, count: int) -> None:
     """Write channels of places in a hall of 10 m by 10 m, of which the last `TESTED` are for the test.
 
     A direct wave and `SCATTERERS` others at 3.5 GHz and 100 MHz, noise of a thousandth of their power.
@@ -91,19 +86,17 @@ def hall(path: Path, count: int, antennas: int = 16, tones: int = 64, seed: int 
     Args:
         path: *.h5, written block by block.
         count: rows to learn from.
-        antennas, tones: of a row of half a wavelength's spacing, and in the band.
-        seed: of places and noise.
     """
-    world, rng = np.random.default_rng(3), np.random.default_rng([seed, count])
+    world, rng = np.random.default_rng(3), np.random.default_rng([0, count])
     sources = np.concatenate([[[12.0, 5.0, 3.0]], world.uniform([-8, -8, 0], [18, 18, 5], (SCATTERERS, 3))])
     gain = np.concatenate([[1.0], 0.3 * world.normal(size=SCATTERERS)])
     places = np.c_[rng.uniform(0, 10, (count + TESTED, 2)), np.full(count + TESTED, 1.5)]
-    frequency = 3.5e9 + 1e8 * (np.arange(tones) / tones - 0.5)
-    apart = np.arange(antennas) * 0.5 * LIGHT / 3.5e9
+    frequency = 3.5e9 + 1e8 * (np.arange(TONES) / TONES - 0.5)
+    apart = np.arange(ANTENNAS) * 0.5 * LIGHT / 3.5e9
     with h5py.File(path, "w") as file:
         file["rx_position"], file["tx_position"] = places, sources[0]
         file["frequency_hz"], file["carrier_hz"] = frequency, 3.5e9
-        stored = file.create_dataset("csi", (len(places), antennas, tones), np.complex64)
+        stored = file.create_dataset("csi", (len(places), ANTENNAS, TONES), np.complex64)
         for start in range(0, len(places), 2_000):
             towards = sources - places[start : start + 2_000, None]
             far = np.linalg.norm(towards, axis=2)

@@ -10,10 +10,9 @@ if __name__ != "gsparc.ops":
 from gsparc.ops.backends import BackendUnavailable
 from gsparc.ops.frozen import FrozenPlan, StalePlan
 from gsparc.ops.geometry import Pose, SphereGrid
-from gsparc.ops.plan import Plan
 from gsparc.ops.projection import Projection
 from gsparc.ops.rasterizer import composite, freeze, make_plan, mean_weights, rasterize
-from gsparc.ops.results import Raster, Weights
+from gsparc.ops.results import Plan, Raster, Weights
 from gsparc.ops.settings import Cutoff, Optics
 from gsparc.ops.validation import UnsoundGaussian
 

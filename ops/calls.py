@@ -6,17 +6,27 @@ import ctypes
 import struct
 from collections.abc import Sequence
 from contextlib import nullcontext
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, get_type_hints
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import built
 from gsparc.ops.settings import KernelSettings
 
 libraries: dict[str, Any] = {}
 """CUDA libraries (cuda_library.Library) by device type; tests put the host shim under "cpu"."""
+
+
+@cache
+def kernels() -> Any:
+    """The compiled CPU kernels with the constants of csrc/layout.h; None where no compiler was at hand."""
+    try:
+        from gsparc.ops import _native
+    except ImportError:
+        return None
+    return _native
+
 
 _C_TYPES: dict[type, Any] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: ctypes.c_double}
 
@@ -73,7 +83,7 @@ def run(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> int
     """
     call = call_for(like, *tensors, **numbers)
     if not like.is_cuda and "cpu" not in libraries:
-        return getattr(built.kernels(), name)(ctypes.addressof(call))
+        return getattr(kernels(), name)(ctypes.addressof(call))
     device, library = like.device, libraries[like.device.type]
     with torch.cuda.device(device) if like.is_cuda else nullcontext():
         scratch = torch.empty(library.run(name, call), dtype=torch.uint8, device=device)

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.ops import built, calls
-from gsparc.ops.operators import KERNELS, contiguous, kernel, operator
+from gsparc.ops import calls
+from gsparc.ops.operators import KERNELS, contiguous, differentiable, fill, kernel
 from gsparc.ops.transforms import beyond_kernels
 
 
@@ -50,8 +50,8 @@ def channels(
         raise ValueError(f"{subcarriers} subcarriers are none: give 0 or more")
     tones = [first_hz, step_hz]
     served = not beyond_kernels(gains, steering, delays)
-    if served and built.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
-        return channels_op.of(gains, steering, delays, tones, subcarriers)
+    if served and calls.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
+        return differentiable(_outputs, _gradients, (tones, subcarriers), gains, steering, delays)
     return summed(gains, steering, delays, tones, subcarriers)
 
 
@@ -69,47 +69,27 @@ def summed(
     return torch.view_as_real(torch.einsum("bn,na,nk->bak", *weights, factor).contiguous())
 
 
-@operator
-def channels_op(
-    gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float], subcarriers: int
-) -> Tensor:
-    """`channels` by the CPU kernel."""
-    return gains.new_empty(gains.shape[0], steering.shape[1], subcarriers, 2)
+def _outputs(fixed: Any, gains: Tensor, steering: Tensor, delays: Tensor) -> Tensor:
+    tones, subcarriers = fixed
+    out = gains.new_empty(len(gains), steering.shape[1], subcarriers, 2)
+    return fill("channels", gains, out, gains, steering, delays, tones)
 
 
-@operator
-def channels_backward_op(
-    slope: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of gains, steering and delays for the gradient `slope` (B, A, K, 2) of the channels."""
-    return gains.new_empty(gains.shape), steering.new_empty(steering.shape), delays.new_empty(delays.shape)
+def _gradients(fixed: Any, slope: Tensor, outputs: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+    out = tuple(part.new_empty(part.shape) for part in inputs)
+    return fill("channels_backward", slope, out, slope, *inputs, fixed[0])
 
 
 @kernel("channels", "cpu")
-def _channels(
-    out: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Any, subcarriers: int
-) -> None:
-    sizes = (*gains.shape[:2], steering.shape[1], subcarriers)
-    inputs = contiguous((gains, steering, delays))
-    calls.run("channels", gains, *inputs, out, sizes=sizes, numbers=tones)
+def _channels(out: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float]) -> None:
+    sizes = (*gains.shape[:2], *out.shape[1:3])
+    calls.run("channels", gains, *contiguous((gains, steering, delays)), out, sizes=sizes, numbers=tones)
 
 
 @kernel("channels_backward", "cpu")
 def _channels_backward(
-    out: Any, slope: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Any
+    out: Any, slope: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float]
 ) -> None:
-    sizes = (*gains.shape[:2], steering.shape[1], slope.shape[2])
+    sizes = (*gains.shape[:2], *slope.shape[1:3])
     inputs = contiguous((gains, steering, delays, slope))
     calls.run("channels_backward", gains, *inputs, *out, sizes=sizes, numbers=tones)
-
-
-def _setup(ctx, inputs, output):
-    gains, steering, delays, ctx.tones, _ = inputs
-    ctx.save_for_backward(gains, steering, delays)
-
-
-def _backward(ctx, slope):
-    return *channels_backward_op(slope, *ctx.saved_tensors, ctx.tones), None, None
-
-
-channels_op.register_autograd(_backward, setup_context=_setup)

@@ -11,6 +11,7 @@ of this size needed, plus headroom; if it needs more, its images and gradients a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -18,19 +19,17 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import _native, calls, cuda_library, validation
-from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
+from gsparc.ops.geometry import Gaussians, SphereGrid
 from gsparc.ops.operators import (
     Buffers,
-    Poses,
     check_memory,
     composite,
     contiguous,
     kernel,
-    kernel_view,
     make_plan,
     mean_weights,
 )
-from gsparc.ops.plan import Plan
+from gsparc.ops.results import Plan
 from gsparc.ops.settings import KernelSettings
 
 __all__ = ["composite", "freeze", "load", "make_plan", "mean_weights", "thaw"]
@@ -72,63 +71,57 @@ def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) 
     return numbers.to(device)
 
 
-def capacity_of(buffers: Buffers, poses: int, settings: KernelSettings) -> int:
+def capacity_of(plan: Plan) -> int:
     """How many entries a plan has room for."""
-    return (buffers.entries.numel() - poses * tiles(settings) - 1) // 2
+    return (plan.buffers.entries.numel() - plan.num_poses * tiles(plan.settings) - 1) // 2
 
 
 def run_on_plan(
-    name: str,
-    *tensors: Tensor | None,
-    buffers: Buffers,
-    gaussians: Gaussians,
-    poses: Poses,
-    settings: KernelSettings,
-    sizes: Sequence[int] = (),
+    name: str, plan: Plan, gaussians: Gaussians, *tensors: Tensor | None, sizes: Sequence[int] = ()
 ) -> None:
     """Call a kernel that reads a plan (`read_view`), Gaussians and poses, then `tensors`."""
-    means, count = gaussians.means, len(poses.positions)
+    means, buffers = gaussians.means, plan.buffers
     entries, capacity = None, 0
     if buffers.entries.numel():
-        entries, capacity = buffers.entries, capacity_of(buffers, count, settings)
-    view = (_tables(means.device, means.dtype, settings), *buffers[:5], buffers.starts[-1:], entries)
-    inputs = contiguous((*gaussians, *poses, *tensors))
-    calls.run(name, means, *view, *inputs, sizes=(count, len(means), capacity, *sizes), settings=settings)
+        entries, capacity = buffers.entries, capacity_of(plan)
+    view = (_tables(means.device, means.dtype, plan.settings), *buffers[:5], buffers.starts[-1:], entries)
+    inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
+    counts = (plan.num_poses, len(means), capacity, *sizes)
+    calls.run(name, means, *view, *inputs, sizes=counts, settings=plan.settings)
 
 
 @kernel("plan", "cuda")
-def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings) -> Any:
-    means, count, n = gaussians.means, len(poses.positions), len(gaussians.means)
+def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
+    means, count, n, buffers = gaussians.means, plan.num_poses, plan.num_gaussians, plan.buffers
     if count * n >= MOST_PAIRS:
         raise MemoryError(
             f"{count} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
         )
-    buffers, means2d, radii, visible = out
-    starts = count * tiles(settings) + 1
+    starts = count * tiles(plan.settings) + 1
     if count * n == 0:
         zeros = [buffer.zero_() for buffer in buffers[:-1]]
-        return Buffers._make([*zeros, buffers.entries.new_zeros(starts)]), means2d, radii, visible
+        return replace(plan, buffers=Buffers._make([*zeros, buffers.entries.new_zeros(starts)]))
     verdict = means.new_empty(2, dtype=torch.int64)
-    view: dict[str, Any] = {"gaussians": gaussians, "poses": poses, "settings": settings}
-    run_on_plan("plan", ids, means2d, radii, visible, verdict, buffers=buffers, **view)
-    key = (count, n, settings)
+    run_on_plan("plan", plan, gaussians, ids, plan.means2d, plan.radii, plan.visible, verdict)
+    key = (count, n, plan.settings)
     if _capturing(means):
         if key not in _capacities:
             raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
         capacity = _with_headroom(_capacities[key])
     else:
         status, capacity = verdict.tolist()
-        validation.raise_for_status(status, Pose(*poses))
+        validation.raise_for_status(status, plan.pose)
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
-    buffers = buffers._replace(entries=means.new_empty(starts + 2 * capacity, dtype=torch.int32))
-    run_on_plan("bin", buffers=buffers, **view)
-    return buffers, means2d, radii, visible
+    entries = means.new_empty(starts + 2 * capacity, dtype=torch.int32)
+    plan = replace(plan, buffers=buffers._replace(entries=entries))
+    run_on_plan("bin", plan, gaussians)
+    return plan
 
 
-def _by_gaussian(features: Tensor, poses: Poses) -> Tensor:
+def _by_gaussian(features: Tensor, poses: int) -> Tensor:
     """Features (B, N, C) as (P, N, K) with the K channels of a pose side by side."""
-    if len(poses.positions) != 1:
+    if poses != 1:
         return features.contiguous()
     samples, n, channels = features.shape
     return features.permute(1, 0, 2).reshape(1, n, samples * channels).contiguous()
@@ -142,69 +135,66 @@ def _zero(gradients: Gaussians) -> None:
 
 
 @kernel("composite", "cuda")
-def _composite(out: Any, means2d: Tensor, features: Tensor, **view: Any) -> None:
-    rows = _by_gaussian(features, view["poses"])
-    if len(view["poses"].positions) > 0:
-        run_on_plan("composite", rows, *out, sizes=rows.shape[2:], **view)
+def _composite(out: Any, plan: Plan, gaussians: Gaussians, features: Tensor) -> None:
+    rows = _by_gaussian(features, plan.num_poses)
+    if plan.num_poses > 0:
+        run_on_plan("composite", plan, gaussians, rows, *out, sizes=rows.shape[2:])
 
 
 @kernel("composite_backward", "cuda")
 def _composite_backward(
     out: Any,
+    plan: Plan,
+    gaussians: Gaussians,
     grad_image: Tensor,
     grad_transmittance: Tensor | None,
     image: Tensor,
     transmittance: Tensor,
     features: Tensor,
-    **view: Any,
 ) -> Any:
-    count, (samples, n, channels) = len(view["poses"].positions), features.shape
-    rows = _by_gaussian(features, view["poses"])
-    entries = capacity_of(view["buffers"], count, view["settings"])
-    check_memory(entries, features.element_size() * (_native.MOMENTS + rows.shape[2]))
+    samples, n, channels = features.shape
+    rows = _by_gaussian(features, plan.num_poses)
+    check_memory(capacity_of(plan), features.element_size() * (_native.MOMENTS + rows.shape[2]))
     grads, _, grad_means2d = out
     grad_rows = torch.empty_like(rows)
     images = (image, transmittance, grad_image, grad_transmittance)
-    if count * n > 0:
+    if plan.num_poses * n > 0:
         tensors = (rows, *images, *grads, grad_rows, grad_means2d)
-        run_on_plan("composite_backward", *tensors, sizes=rows.shape[2:], **view)
+        run_on_plan("composite_backward", plan, gaussians, *tensors, sizes=rows.shape[2:])
     else:
         _zero(grads)
-    if count == 1:
+    if plan.num_poses == 1:
         grad_rows = grad_rows.reshape(n, samples, channels).permute(1, 0, 2).contiguous()
     return grads, grad_rows, grad_means2d
 
 
 @kernel("weights", "cuda")
-def _weights(out: Any, **view: Any) -> Any:
+def _weights(out: Any, plan: Plan, gaussians: Gaussians) -> Any:
     sums = out[0].new_empty(*out[0].shape, 2)
     if sums.numel():
-        run_on_plan("weights", sums, None, None, **view)
+        run_on_plan("weights", plan, gaussians, sums, None, None)
     return sums[..., 0].clone(), sums[..., 1].clone()
 
 
 @kernel("weights_backward", "cuda")
-def _weights_backward(out: Any, grad_seen: Tensor, grad_total: Tensor, **view: Any) -> None:
-    entries = capacity_of(view["buffers"], len(view["poses"].positions), view["settings"])
-    check_memory(entries, out.means.element_size() * (_native.MOMENTS + 1))
-    if grad_seen.numel() > 0:
-        run_on_plan("weights_backward", grad_seen, grad_total, *out, sizes=(1,), **view)
+def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tensor) -> None:
+    check_memory(capacity_of(plan), out.means.element_size() * (_native.MOMENTS + 1))
+    if slopes[0].numel() > 0:
+        run_on_plan("weights_backward", plan, gaussians, *slopes, *out, sizes=(1,))
     else:
         _zero(out)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Order (V,) of the visible Gaussians; tiles' starts and ends, each entry's rank and 32 weights."""
-    view, means = kernel_view(plan, gaussians), gaussians.means
-    buffers, settings = view["buffers"], view["settings"]
-    capacity = capacity_of(buffers, 1, settings)
+    means, buffers, capacity = gaussians.means, plan.buffers, capacity_of(plan)
     pixels = _native.TILE_WIDTH * _native.TILE_HEIGHT
     check_memory(capacity, pixels * means.element_size())
     blocks = means.new_zeros(capacity, pixels)
-    starts = buffers.entries[: tiles(settings) + 1].clone()
+    starts = buffers.entries[: tiles(plan.settings) + 1].clone()
     ends = starts[:-1].clone()
     if len(means) > 0:
-        run_on_plan("weights", None, blocks, ends, **view)
+        run_on_plan("weights", plan, gaussians, None, blocks, ends)
     order = buffers.order[0, : int(buffers.shown[0])].to(torch.int64)
     rank_of = order.new_zeros(len(means))
     rank_of[order] = torch.arange(len(order), device=order.device)

@@ -140,33 +140,26 @@ class SphereGrid:
         """Columns in a full circle: the width where they close it, if only nearly; as in csrc/pixels.h."""
         return float(self.width) if self.periodic else 2 * math.pi / self.azimuth_step
 
-    def elevations(self, dtype: torch.dtype = torch.float64) -> Tensor:
-        """Row centres (H,) [rad]."""
-        return self.first_elevation + self.elevation_step * torch.arange(self.height, dtype=dtype)
+    def elevations(self) -> Tensor:
+        """Row centres (H,) float64 [rad]."""
+        return self.first_elevation + self.elevation_step * torch.arange(self.height, dtype=torch.float64)
 
-    def azimuths(self, dtype: torch.dtype = torch.float64) -> Tensor:
-        """Column centres (W,) [rad]."""
-        return self.first_azimuth + self.azimuth_step * torch.arange(self.width, dtype=dtype)
+    def azimuths(self) -> Tensor:
+        """Column centres (W,) float64 [rad]."""
+        return self.first_azimuth + self.azimuth_step * torch.arange(self.width, dtype=torch.float64)
 
     def directions(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """Unit vectors of the pixel centres (H, W, 3), receiver frame."""
-        elevation, azimuth = self.elevations(torch.float64)[:, None], self.azimuths(torch.float64)[None, :]
-        horizontal = elevation.cos()
-        return torch.stack(
-            [
-                horizontal * azimuth.cos(),
-                horizontal * azimuth.sin(),
-                elevation.sin().expand(self.height, self.width),
-            ],
-            dim=-1,
-        ).to(dtype)
+        elevation, azimuth = self.elevations()[:, None], self.azimuths()[None, :]
+        level, upright = elevation.cos(), elevation.sin().expand(self.height, self.width)
+        return torch.stack([level * azimuth.cos(), level * azimuth.sin(), upright], dim=-1).to(dtype)
 
-    def solid_angles(self, dtype: torch.dtype = torch.float64) -> Tensor:
-        """Solid angle of each pixel (H, W) [sr]; cells are cut off at the poles."""
-        elevation, half = self.elevations(torch.float64), self.elevation_step / 2
+    def solid_angles(self) -> Tensor:
+        """Solid angle of each pixel (H, W) float64 [sr]; cells are cut off at the poles."""
+        elevation, half = self.elevations(), self.elevation_step / 2
         upper = (elevation + half).clamp(-math.pi / 2, math.pi / 2).sin()
         lower = (elevation - half).clamp(-math.pi / 2, math.pi / 2).sin()
-        return ((upper - lower) * self.azimuth_step)[:, None].expand(self.height, self.width).to(dtype)
+        return ((upper - lower) * self.azimuth_step)[:, None].expand(self.height, self.width)
 
     def edges(self) -> tuple[float, float, float, float]:
         """Least and largest azimuth, least and largest elevation of the pixels' edges [degrees]."""

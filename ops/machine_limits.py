@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import calls
-from gsparc.ops.plan import Plan
-from gsparc.ops.settings import kernel_settings
+from gsparc.ops.results import Plan
 
 
 def exponentials(tasks: int) -> int:
@@ -35,5 +34,5 @@ def pairs(plan: Plan) -> int:
     """
     if plan.backend != "cpu":
         raise ValueError(f"pairs are counted in plans of the cpu backend, this one is of {plan.backend!r}")
-    sizes, settings = (plan.num_poses, plan.num_gaussians), kernel_settings(plan.grid, plan.optics)
-    return calls.run("mark_pairs", plan.means2d, *plan.buffers, sizes=sizes, settings=settings)
+    sizes = (plan.num_poses, plan.num_gaussians)
+    return calls.run("mark_pairs", plan.means2d, *plan.buffers, sizes=sizes, settings=plan.settings)

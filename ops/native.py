@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,17 +14,15 @@ from gsparc.ops import _native, calls, operators, validation
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.operators import (
     Buffers,
-    Poses,
     check_memory,
     composite,
     contiguous,
     kernel,
-    kernel_view,
     make_plan,
     mean_weights,
     strips,
 )
-from gsparc.ops.plan import Plan
+from gsparc.ops.results import Plan
 from gsparc.ops.settings import KernelSettings
 
 __all__ = ["composite", "freeze", "instruction_set", "make_plan", "mean_weights", "rasterize", "thaw"]
@@ -32,32 +31,26 @@ NO_PLAN = (None,) * len(Buffers._fields)
 
 
 def run_on_plan(
-    name: str,
-    *tensors: Tensor | None,
-    buffers: Buffers,
-    gaussians: Gaussians,
-    poses: Poses,
-    settings: KernelSettings,
-    sizes: Sequence[int] = (),
+    name: str, plan: Plan, gaussians: Gaussians, *tensors: Tensor | None, sizes: Sequence[int] = ()
 ) -> int:
     """Call a kernel that begins with `ViewArgs` of csrc/layout.h, then `tensors`."""
-    inputs = contiguous((*gaussians, *poses, *tensors))
-    counts = (len(poses.positions), len(gaussians.means), *sizes)
-    return calls.run(name, gaussians.means, *buffers, *inputs, sizes=counts, settings=settings)
+    inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
+    counts = (plan.num_poses, plan.num_gaussians, *sizes)
+    return calls.run(name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings)
 
 
 @kernel("plan", "cpu")
-def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings) -> Any:
-    (buffers, *screen), means = out, gaussians.means
-    tensors = (*contiguous((*gaussians, *poses, ids)), *buffers[:-1], *screen)
-    sizes = (len(poses.positions), len(means))
-    status = calls.run("plan", means, *tensors, sizes=sizes, settings=settings)
-    validation.raise_for_status(status, Pose(*poses))
-    entries = int(buffers.starts.numpy()[-1])  # torch's own element takes ten times as long
+def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
+    means, pose = gaussians.means, plan.pose
+    call = partial(calls.run, sizes=(plan.num_poses, len(means)), settings=plan.settings)
+    inputs = contiguous((*gaussians, pose.position, pose.rotation, ids))
+    status = call("plan", means, *inputs, *plan.buffers[:-1], plan.means2d, plan.radii, plan.visible)
+    validation.raise_for_status(status, pose)
+    entries = int(plan.buffers.starts.numpy()[-1])  # torch's own element takes ten times as long
     check_memory(entries, 4)
-    buffers = buffers._replace(entries=means.new_empty(entries, dtype=torch.int32))
-    calls.run("entries", means, *buffers, sizes=sizes, settings=settings)
-    return buffers, *screen
+    buffers = plan.buffers._replace(entries=means.new_empty(entries, dtype=torch.int32))
+    call("entries", means, *buffers)
+    return replace(plan, buffers=buffers)
 
 
 def rasterize(
@@ -89,45 +82,43 @@ def rasterize(
 
 
 @kernel("composite", "cpu")
-def _composite(out: Any, features: Tensor, means2d: Tensor, **view: Any) -> None:
-    run_on_plan("composite", features, *out, sizes=features.shape[::2], **view)
+def _composite(out: Any, plan: Plan, gaussians: Gaussians, features: Tensor) -> None:
+    run_on_plan("composite", plan, gaussians, features, *out, sizes=features.shape[::2])
 
 
 @kernel("composite_backward", "cpu")
 def _composite_backward(
     out: Any,
+    plan: Plan,
+    gaussians: Gaussians,
     grad_image: Tensor,
     grad_transmittance: Tensor | None,
     image: Tensor,
     transmittance: Tensor,
     features: Tensor,
-    **view: Any,
 ) -> None:
     samples, _, channels = features.shape
-    shared = len(view["poses"].positions) == 1
-    per_entry = _native.MOMENTS + (samples * channels if shared else channels)
-    check_memory(len(view["buffers"].entries), features.element_size() * per_entry)
+    per_entry = _native.MOMENTS + (samples * channels if plan.num_poses == 1 else channels)
+    check_memory(len(plan.buffers.entries), features.element_size() * per_entry)
     grads, *rest = out
     tensors = (features, image, transmittance, grad_image, grad_transmittance, *grads, *rest)
-    run_on_plan("composite_backward", *tensors, sizes=(samples, channels), **view)
+    run_on_plan("composite_backward", plan, gaussians, *tensors, sizes=(samples, channels))
 
 
 @kernel("weights", "cpu")
-def _weights(out: Any, **view: Any) -> None:
-    run_on_plan("weights", *out, **view)
+def _weights(out: Any, plan: Plan, gaussians: Gaussians) -> None:
+    run_on_plan("weights", plan, gaussians, *out)
 
 
 @kernel("weights_backward", "cpu")
-def _weights_backward(out: Any, grad_seen: Tensor, grad_total: Tensor, **view: Any) -> None:
-    entries = view["buffers"].entries
-    check_memory(len(entries), out.means.element_size() * _native.MOMENTS)
-    run_on_plan("weights_backward", grad_seen, grad_total, *out, **view)
+def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tensor) -> None:
+    check_memory(len(plan.buffers.entries), out.means.element_size() * _native.MOMENTS)
+    run_on_plan("weights_backward", plan, gaussians, *slopes, *out)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Order (V,) of the visible Gaussians, and the weights alpha T as blocks of pixels; see frozen.h."""
-    view, rows, grid = kernel_view(plan, gaussians), _native.STRIP_ROWS, plan.grid
-    run, order = partial(run_on_plan, "freeze", **view), view["buffers"].order
+    rows, grid, run = _native.STRIP_ROWS, plan.grid, partial(run_on_plan, "freeze", plan, gaussians)
     counts = torch.zeros(
         strips(grid.height) * grid.width + 1, dtype=torch.int64
     )  # a tile has a column at least
@@ -138,7 +129,8 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     ranks, weights = torch.empty(size, dtype=torch.int32), gaussians.means.new_empty(size, lanes)
     if size > 0:
         run(starts, ranks, weights)
-    return order[0, : int(view["buffers"].shown[0])].to(torch.int64), (starts, ranks, weights)
+    order = plan.buffers.order[0, : int(plan.buffers.shown[0])].to(torch.int64)
+    return order, (starts, ranks, weights)
 
 
 def thaw(

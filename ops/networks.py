@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsparc.ops import backends, built, calls
-from gsparc.ops.operators import contiguous, empty_like, kernel, operator
+from gsparc.ops import backends, calls
+from gsparc.ops.operators import contiguous, differentiable, empty_like, fill, kernel
 from gsparc.ops.transforms import beyond_kernels, full_precision
 
 
@@ -27,14 +27,14 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     encoded = encoded.to(weight1.dtype)  # it comes in half precision from `torch.autocast`
     if encoded.requires_grad or beyond_kernels(encoded, weight1, bias1, weight2, bias2):
         return products(encoded, weight1, bias1, weight2, bias2)
-    kernels = built.kernels()
+    kernels = calls.kernels()
     fits = encoded.dtype in (torch.float32, torch.float64) and kernels is not None
     if fits and encoded.is_cuda:
         fits = encoded.dtype == torch.float32
         fits &= weight1.shape[1] <= kernels.MOST_INPUTS and weight2.shape[2] <= kernels.MOST_OUTPUTS
     if fits:
         backends.named(encoded.device.type)  # loads its kernels
-        return networks_op.of(encoded, Layers(weight1, bias1, weight2, bias2))
+        return differentiable(_outputs, _gradients, None, encoded, weight1, bias1, weight2, bias2)
     return products(encoded, weight1, bias1, weight2, bias2)
 
 
@@ -58,16 +58,17 @@ class Layers(NamedTuple):
     bias2: Tensor
 
 
-@operator
-def networks_op(encoded: Tensor, layers: Layers) -> Tensor:
-    """`networks`, without a gradient for `encoded`."""
-    return encoded.new_empty(encoded.shape[0], layers.weight1.shape[0], layers.weight2.shape[2])
+def _outputs(_: None, encoded: Tensor, *weights: Tensor) -> Tensor:
+    layers = Layers(*weights)
+    out = encoded.new_empty(len(encoded), len(layers.weight1), layers.weight2.shape[2])
+    return fill("networks", encoded, out, encoded, layers)
 
 
-@operator
-def networks_backward_op(slope: Tensor, encoded: Tensor, layers: Layers) -> Layers:
-    """Gradients of the layers for the gradient `slope` (B, N, C) of the outputs."""
-    return empty_like(layers)
+def _gradients(
+    _: None, slope: Tensor, outputs: Tensor, encoded: Tensor, *weights: Tensor
+) -> tuple[Tensor | None, ...]:
+    layers = Layers(*weights)
+    return None, *fill("networks_backward", encoded, empty_like(layers), slope, encoded, layers)
 
 
 @kernel("networks", "cpu", "cuda")
@@ -108,14 +109,3 @@ def _check(encoded: Tensor, layers: Layers) -> None:
 
 def _sizes(encoded: Tensor, layers: Layers) -> tuple[int, ...]:
     return len(encoded), *layers.weight1.shape, layers.weight2.shape[2]
-
-
-def _setup(ctx, inputs, output):
-    ctx.save_for_backward(*inputs)
-
-
-def _backward(ctx, slope):
-    return None, *networks_backward_op(slope, *ctx.saved_tensors)
-
-
-networks_op.register_autograd(_backward, setup_context=_setup)

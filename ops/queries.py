@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from gsparc.ops import built, calls
+from gsparc.ops import calls
 from gsparc.ops.operators import contiguous
 from gsparc.ops.transforms import followed
 
@@ -14,7 +14,7 @@ from gsparc.ops.transforms import followed
 def served(*tensors: Tensor) -> bool:
     """Whether the kernels answer: CPU tensors that neither autograd nor `torch.func` follows."""
     plain = all(part.device.type == "cpu" for part in tensors) and not followed(*tensors)
-    return plain and built.kernels() is not None
+    return plain and calls.kernels() is not None
 
 
 def array_spectrum(

@@ -11,11 +11,10 @@ from torch import Tensor
 from gsparc.ops import backends, reference_by_rows, validation
 from gsparc.ops.frozen import FrozenPlan
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
-from gsparc.ops.plan import Plan
 from gsparc.ops.projection import Projection
-from gsparc.ops.results import Raster, Weights
+from gsparc.ops.results import Plan, Raster, Weights
 from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, kernel_settings
-from gsparc.ops.transforms import beyond_kernels, unwatched
+from gsparc.ops.transforms import beyond_kernels, followed, plain, unfollowed
 
 
 def make_plan(
@@ -70,10 +69,10 @@ def _plan(
     pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
     validation.transforms(gaussians, pose, pose_trained)
     chosen = backends.choose(backend, gaussians.means.device)
-    with torch.no_grad() if torch.is_grad_enabled() else nullcontext():
-        still = Gaussians._make(None if tensor is None else tensor.detach() for tensor in gaussians)
-        poses = validation.poses(pose, gaussians.means)
-        plan = chosen.make_plan(validation.strongest(still), ids, poses, grid, optics)
+    with torch.no_grad() if torch.is_grad_enabled() else nullcontext(), unfollowed():
+        still = Gaussians._make(map(plain, gaussians))
+        poses = validation.poses(Pose(plain(pose.position), plain(pose.rotation)), still.means)
+        plan = chosen.make_plan(validation.strongest(still), plain(ids), poses, grid, optics)
     return replace(plan, pose_trained=True) if pose_trained else plan
 
 
@@ -153,10 +152,10 @@ def rasterize(
     """
     chosen = backends.choose(backend, means.device)
     at_once = getattr(chosen, "rasterize", None)
-    given = (means, quats, scales, opacities, extinctions, ids, features, *vars(pose).values())
+    given = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
-    if at_once is not None and unwatched(given):
+    if at_once is not None and not followed(*given):
         poses = validation.poses(pose, means)
         values = validation.features(features, means, poses)
         return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))

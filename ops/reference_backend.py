@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gsparc.ops import reference, validation
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
-from gsparc.ops.plan import Plan
-from gsparc.ops.results import visible_share
+from gsparc.ops.results import Plan, visible_share
 from gsparc.ops.settings import Optics
 from gsparc.ops.transforms import full_precision
 

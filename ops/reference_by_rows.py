@@ -14,8 +14,7 @@ from torch import Tensor
 
 from gsparc.ops import reference_backend
 from gsparc.ops.geometry import Gaussians, SphereGrid
-from gsparc.ops.plan import Plan
-from gsparc.ops.results import visible_share
+from gsparc.ops.results import Plan, visible_share
 
 ELEMENTS = 2**22  # of a tensor Gaussians x pixels
 

@@ -1,13 +1,58 @@
-"""Outputs of the rasterizer."""
+"""Plans and outputs of the rasterizer."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsparc.ops.settings import FAINTEST
+from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.settings import FAINTEST, KernelSettings, Optics, kernel_settings
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Footprints of N Gaussians for P poses, ordered and binned; bookkeeping without gradients.
+
+    Valid for the geometry and opacities it was made from, and for nothing else.
+
+    Attributes:
+        pose: P poses; one without a leading axis is shared by a whole batch.
+        grid, optics: pixel directions and projection it was made for.
+        backend: name of the backend that made it; the same one must composite it.
+        means2d: (P, N, 2) (column, row) [px].
+        radii: (P, N) [px], 0 where culled.
+        visible: (P, N) bool.
+        buffers: the backend's own tensors: `operators.Buffers`, or of the reference the depth order alone.
+        pose_trained: whether the poses it was given require gradients, of which there are none.
+    """
+
+    pose: Pose
+    grid: SphereGrid
+    optics: Optics
+    backend: str
+    means2d: Tensor
+    radii: Tensor
+    visible: Tensor
+    buffers: Any
+    pose_trained: bool = False
+
+    @property
+    def settings(self) -> KernelSettings:
+        """Grid and optics as the kernels take them."""
+        return kernel_settings(self.grid, self.optics)
+
+    @property
+    def num_gaussians(self) -> int:
+        """N."""
+        return self.means2d.shape[1]
+
+    @property
+    def num_poses(self) -> int:
+        """P."""
+        return self.means2d.shape[0]
 
 
 @dataclass(frozen=True)

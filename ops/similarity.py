@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsparc.ops import built, calls
-from gsparc.ops.operators import kernel, operator
+from gsparc.ops import calls
+from gsparc.ops.operators import fill, kernel
 from gsparc.ops.transforms import beyond_kernels
 
 
@@ -17,11 +17,10 @@ def served(images: Tensor) -> bool:
     device = images.device.type
     if beyond_kernels(images):
         return False
-    loaded = device in calls.libraries or (device == "cpu" and built.kernels() is not None)
+    loaded = device in calls.libraries or (device == "cpu" and calls.kernels() is not None)
     return images.dtype == torch.float32 and loaded
 
 
-@operator
 def similarity_op(
     prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
 ) -> tuple[Tensor, Tensor]:
@@ -30,7 +29,8 @@ def similarity_op(
     `taps` is one axis of a separable, symmetric window of odd length, `stability` the constants C1 and C2.
     A GPU takes no window that is not symmetric or too wide (ValueError).
     """
-    return prediction.new_empty(prediction.shape[0]), prediction.new_empty(prediction.shape if slope else 0)
+    out = prediction.new_empty(prediction.shape[0]), prediction.new_empty(prediction.shape if slope else 0)
+    return fill("similarity", prediction, out, prediction, target, taps, stability, slope)
 
 
 @kernel("similarity", "cpu")
@@ -59,7 +59,7 @@ def _cuda(
     slope: bool,
 ) -> tuple[Tensor, Tensor]:
     half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
-    radius, known = len(half) - 1, built.kernels()
+    radius, known = len(half) - 1, calls.kernels()
     if radius > known.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
         most = 2 * known.MOST_RADIUS + 1
         raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -62,29 +63,23 @@ def beyond_kernels(*values: Any) -> bool:
     return transforming() or carries_tangent(*values)
 
 
-def followed(*values: Tensor) -> bool:
+def followed(*values: Tensor | None) -> bool:
     """Whether autograd, in either mode, or `torch.func` follows any of these."""
-    recorded = torch.is_grad_enabled() and any(value.requires_grad for value in values)
+    recorded = torch.is_grad_enabled() and any(value is not None and value.requires_grad for value in values)
     return recorded or beyond_kernels(*values)
+
+
+def unfollowed() -> AbstractContextManager[Any]:
+    """Within, transforms of `torch.func` do not see what is computed."""
+    return torch._C._DisableFuncTorch() if transforming() else nullcontext()
+
+
+def plain(value: Tensor | None) -> Any:
+    """The numbers behind a tensor or None, for choices without a derivative; used within `unfollowed`."""
+    return None if value is None else unwrapped(value, 0)[0].detach()
 
 
 def numbers(value: Tensor) -> np.ndarray:
     """The numbers of a tensor without what follows them, for choices that have no derivative."""
-    with torch._C._DisableFuncTorch():  # what it returns would be followed again
-        return unwrapped(value, 0)[0].detach().cpu().numpy()
-
-
-def unwatched(values: Iterable[Any]) -> bool:
-    """Whether torch would only pass a call on: nothing records, traces, maps, fakes or differentiates."""
-    if transforming() or differentiated_forward() or torch.compiler.is_compiling():
-        return False
-    if torch._C._get_tracing_state() is not None or torch._C._len_torch_function_stack():
-        return False
-    if torch._C._len_torch_dispatch_stack():
-        return False
-    recorded, plain = torch.is_grad_enabled(), (Tensor, torch.nn.Parameter)
-    return all(
-        type(value) in plain and value.is_cpu and not (recorded and value.requires_grad)
-        for value in values
-        if isinstance(value, Tensor)
-    )
+    with unfollowed():
+        return plain(value).cpu().numpy()

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from gsparc.ops import built
+from gsparc.ops import calls
 from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, SKEW, WIDEST
 from gsparc.ops.transforms import (
@@ -112,9 +112,9 @@ def raise_for_status(status: int, pose: Pose) -> None:
     """Raise for a plan's status: UNSOUND_POSE, EQUAL_IDS, 4 * Gaussian + parameter, or -1 if valid."""
     if status < 0:
         return
-    if status == built.kernels().UNSOUND_POSE:
+    if status == calls.kernels().UNSOUND_POSE:
         raise_for_pose(pose)
-    if status == built.kernels().EQUAL_IDS:
+    if status == calls.kernels().EQUAL_IDS:
         raise_for_ids()
     raise_for(Gaussians._fields[status % 4], status // 4)
 

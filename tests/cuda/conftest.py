@@ -13,16 +13,3 @@ def where(request):
     """Every CPU tensor of the test goes through the CUDA kernels."""
     with serving(request.param):
         yield request.param
-
-
-def pytest_collection_modifyitems(config, items):
-    """The reference needs no second run here."""
-    here = [item for item in items if "tests/cuda" in str(item.path).replace("\\", "/")]
-    again = {
-        item
-        for item in here
-        if getattr(item, "callspec", None) and "reference" in item.callspec.params.values()
-    }
-    if again:
-        config.hook.pytest_deselected(items=list(again))
-        items[:] = [item for item in items if item not in again]

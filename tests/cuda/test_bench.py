@@ -81,7 +81,6 @@ def measure(monkeypatch):
         measure, "kernel_ms", lambda call, **how: call() is not None and {"p50": 1.0, "p95": 2.0}
     )
     monkeypatch.setattr(measure, "cold_ms", lambda call: {"p50": 3.0, "p95": 4.0})
-    monkeypatch.setattr(measure, "by_kernel", lambda call: {"kernel": 5.0})
     for timer in ("event_ms", "wall_ms"):
         slow = getattr(measure, timer)
         monkeypatch.setattr(measure, timer, lambda call, slow=slow, **how: slow(call, rounds=2))
@@ -111,15 +110,12 @@ def test_every_figure_is_a_ratio_to_the_device(measure):
         assert found[name]["ratio"] == pytest.approx(found[name]["p50"] / found[name]["floor_ms"])
 
 
-def test_frozen_batches_are_compared_with_the_vendors_products(measure):
+def test_frozen_batches(measure):
     found = measure.frozen(30, LIMITS)
     no_errors(found)
     for batch in measure.BATCHES:
         section = found[f"batch{batch}"]
-        assert section["error_to_dense"] < 1e-5
-        rates = [key for key in section if key.startswith("spectra_per_s")]
-        assert len(rates) == 5 and all(section[rate] > 0 for rate in rates)
-    assert found["spectra_per_s_with_networks"] > 0
+        assert all(section[f"spectra_per_s{name}"] > 0 for name in ("", "_captured"))
 
 
 def test_batches_and_networks(measure):
@@ -142,7 +138,7 @@ def test_json_survives_failing_stages(measure, tmp_path, capsys):
     assert "| tests.exit | 1 |" in capsys.readouterr().out
 
 
-def test_similarity_is_timed_beside_the_one_written_out(measure):
+def test_similarity(measure):
     found = measure.similarity(2, LIMITS)
     no_errors(found)
-    assert found["ours"]["ratio"] > 0 and {"end_to_end"} <= found["written_out"].keys()
+    assert found["ratio"] > 0 and "end_to_end" in found

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
+from compute_kernels import KIND_SHAPES, assert_equals_reference
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
 from gsparc.ops import (
-    Optics,
     SphereGrid,
     calls,
     cuda,
@@ -20,8 +18,7 @@ from gsparc.ops import (
     rasterize,
     similarity,
 )
-from gsparc.ops.settings import kernel_settings
-from gsparc.training.losses import _Kernel, _written_out
+from gsparc.training.losses import _Kernel
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 
@@ -59,7 +56,7 @@ def test_order_of_the_threads_does_not_matter(where):
 @pytest.mark.parametrize("channels", [1, 3, 8, 9, 70])
 def test_frozen_view_is_the_image(where, dtype, channels):
     scene = crowd(150).to(dtype)
-    model, grid = (scene.means, scene.quats, scene.scales, scene.opacities), GRIDS["patch"]
+    model, grid = scene.model, GRIDS["patch"]
     features = torch.randn(150, channels, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(
         dtype
     )
@@ -69,22 +66,6 @@ def test_frozen_view_is_the_image(where, dtype, channels):
     assert torch.allclose(
         view.render(features, version=3), want, atol=1e-12 if dtype == torch.float64 else 1e-5
     )
-
-
-@pytest.mark.parametrize("samples", [1, 5, 37])
-@pytest.mark.parametrize("inputs,hidden,channels", [(3, 16, 2), (33, 40, 1), (256, 32, 4)])
-def test_networks_equal_matrix_products(where, samples, inputs, hidden, channels):
-    draw = torch.Generator().manual_seed(samples)
-    count, shapes = 9, [(9, inputs, hidden), (9, hidden), (9, hidden, channels), (9, channels)]
-    encoded = torch.randn(samples, inputs, generator=draw)
-    weights = [torch.randn(shape, generator=draw).requires_grad_() for shape in shapes]
-    exact = [weight.detach().double().requires_grad_() for weight in weights]
-    out, want = networks.networks_op(encoded, *weights), networks.products(encoded.double(), *exact)
-    assert out.shape == (samples, count, channels)
-    slope = torch.randn(want.shape, generator=draw)
-    got, truth = torch.autograd.grad(out, weights, slope), torch.autograd.grad(want, exact, slope.double())
-    for a, b in [(out, want), *zip(got, truth, strict=True)]:
-        assert (a.double() - b).abs().max() < 1e-5 * (1 + b.abs().max())
 
 
 @BOTH
@@ -101,20 +82,9 @@ def test_nothing_is_read_before_it_is_written(where, dtype):
         assert all(torch.equal(a[name], b[name]) for name in a)
 
 
-@pytest.mark.parametrize("shape", [(1, 11, 11), (2, 23, 37), (1, 40, 12), (2, 12, 70), (0, 20, 20)], ids=str)
-def test_similarity_equals_the_written_out_one_in_float64(where, shape):
-    draw = torch.Generator().manual_seed(0)
-    a, b = (torch.rand(shape, generator=draw, dtype=torch.float64) for _ in range(2))
-    found = []
-    for kind, dtype in ((_Kernel.apply, torch.float32), (_written_out, torch.float64)):
-        leaf = a.to(dtype).requires_grad_()
-        value = kind(leaf, b.to(dtype))
-        (value * torch.arange(1, len(value) + 1)).sum().backward()
-        found.append((value.detach().double(), leaf.grad.double()))
-    (value, slope), (wanted, wanted_slope) = found
-    assert torch.allclose(value, wanted, atol=1e-5)
-    assert not slope.numel() or (slope - wanted_slope).abs().max() < 1e-4 * wanted_slope.abs().max()
-    assert torch.equal(_Kernel.apply(a.float(), b.float()), value.float())  # the same without a gradient
+@pytest.mark.parametrize("kind,shape", [case for case in KIND_SHAPES if case[0] != "channels"], ids=str)
+def test_compute_kernels_equal_their_definitions(where, kind, shape):
+    assert_equals_reference(kind, shape, torch.float32)
 
 
 def test_similarity_of_flat_images_stays_finite(where):
@@ -137,19 +107,19 @@ def test_more_positions_than_a_grid_has_rows(where):
     count = (2 if where == "shim" else 65535) * 16 + 5
     weights = [torch.ones(shape) for shape in ((1, 1, 1), (1, 1), (1, 1, 1), (1, 1))]
     encoded = torch.arange(count, dtype=torch.float32)[:, None]
-    assert torch.equal(networks.networks_op(encoded, *weights)[:, 0, 0], encoded[:, 0] + 2)
+    assert torch.equal(networks.networks(encoded, *weights)[:, 0, 0], encoded[:, 0] + 2)
 
 
 def test_too_many_pairs_for_one_plan_are_refused(where, monkeypatch):
     scene = random_scene(n=40)
     monkeypatch.setattr(cuda, "MOST_PAIRS", 100)
     with pytest.raises(MemoryError, match="3 poses of 40 Gaussians are too many for a plan"):
-        make_plan(scene.means, scene.quats, scene.scales, scene.opacities, poses(3), GRIDS["patch"])
+        make_plan(*scene.model, poses(3), GRIDS["patch"])
 
 
 def test_tables_that_a_graph_holds_are_never_freed(where):
     scene = random_scene(n=4)
-    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    model = scene.model
     tables = []
     for height in [20, *range(21, 60), 20]:
         make_plan(*model, origin(), SphereGrid(height, 8, -0.3, 2.5, 0.01, 0.05))
@@ -181,26 +151,12 @@ def test_captured_plan_needs_an_earlier_one(where, monkeypatch):
     monkeypatch.setattr(cuda, "_capacities", {})
     scene = random_scene(n=4)
     with pytest.raises(RuntimeError, match="plan once before capturing"):
-        make_plan(scene.means, scene.quats, scene.scales, scene.opacities, origin(), GRIDS["patch"])
-
-
-def test_unsound_input_is_named(where):
-    scene = random_scene(n=40)
-    settings = operators.packed(kernel_settings(GRIDS["hemisphere"], Optics()))
-    model = [scene.means, scene.quats, scene.scales, scene.opacities]
-    place, turn = torch.zeros(1, 3).double(), torch.eye(3).double()[None]
-    for part, (name, row) in enumerate([("means", 7), ("quats", 39), ("scales", 0), ("opacities", 12)]):
-        wrong = [tensor.clone() for tensor in model]
-        wrong[part][row] = math.nan
-        with pytest.raises(ValueError, match=f"Gaussian {row} has {name}"):
-            operators.plan_op(*wrong, None, None, place, turn, settings)
-    with pytest.raises(ValueError, match=r"pose \d+ is not finite"):
-        operators.plan_op(*model, None, None, place * math.nan, turn, settings)
+        make_plan(*scene.model, origin(), GRIDS["patch"])
 
 
 def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
     scene = crowd(60)
-    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    model = scene.model
     plan = make_plan(*model, origin(), GRIDS["patch"])
     leaf = scene.means.clone().requires_grad_()
     image = rasterize(leaf, *model[1:], scene.features, origin(), GRIDS["patch"]).image

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from rasters import GRIDS, assert_close, poses, random_scene, render
+from rasters import GRIDS, TOLERANCES, assert_close, poses, random_scene, render
 
-from gsparc.ops import Pose, cuda_library, freeze, make_plan, mean_weights, networks, rasterize
+from gsparc.ops import Pose, cuda_library, freeze, make_plan, mean_weights, rasterize
 
 REASON = cuda_library.missing_device()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
@@ -16,8 +16,8 @@ GRID = GRIDS["hemisphere"]
 def there(count: int = 0, n: int = 60, **kind):
     """A scene, its Gaussians as `rasterize` takes them, and poses, all on the GPU in float32."""
     scene = random_scene(n=n, **kind).to(torch.float32)
-    scene = type(scene)(**{k: None if v is None else v.cuda() for k, v in vars(scene).items()})
-    return scene, (scene.means, scene.quats, scene.scales, scene.opacities), poses(count).to("cuda")
+    scene = scene.on("cuda")
+    return scene, scene.model, poses(count).to("cuda")
 
 
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
@@ -26,27 +26,10 @@ def there(count: int = 0, n: int = 60, **kind):
 def test_tensors_on_the_gpu_go_through_its_kernels(projection, count, dtype):
     scene = random_scene(hides=True, seed=count)
     want = render(scene, poses(count), GRID, "reference", projection=projection)
-    moved = type(scene)(**{k: None if v is None else v.cuda() for k, v in vars(scene.to(dtype)).items()})
-    got = render_there(moved, poses(count).to("cuda"), projection)
-    assert_close(got, want, 1e-9 if dtype == torch.float64 else 1e-4)
-
-
-def render_there(scene, pose: Pose, projection: str) -> dict[str, torch.Tensor]:
-    """`render` with the same upstream gradients for tensors on the GPU."""
-    names = ["means", "quats", "scales", "opacities", "features", "extinctions"]
-    leaves = {name: getattr(scene, name).clone().requires_grad_() for name in names}
-    model, hidden = [leaves[name] for name in names[:4]], leaves["extinctions"]
-    raster = rasterize(*model, leaves["features"], pose, GRID, extinctions=hidden, projection=projection)
-    assert raster.image.is_cuda
-    draw = torch.Generator().manual_seed(5)
-    loss = 0.0
-    for output in (raster.image, raster.transmittance):
-        noise = torch.randn(output.shape, generator=draw, dtype=torch.float64)
-        loss = loss + (output * noise.to(output)).sum()
-    loss.backward()
-    out = {f"d_{name}": leaf.grad.cpu() for name, leaf in leaves.items()}
-    out |= {"image": raster.image.detach().cpu(), "transmittance": raster.transmittance.detach().cpu()}
-    return out | {"d_means2d": raster.means2d.grad.cpu()}
+    moved = scene.to(dtype).on("cuda")
+    got = render(moved, poses(count).to("cuda"), GRID, "cuda", projection=projection)
+    assert got["image"].is_cuda
+    assert_close({name: value.cpu() for name, value in got.items()}, want, TOLERANCES[dtype])
 
 
 def test_twice_is_bit_identical():
@@ -114,17 +97,6 @@ def test_weights_and_frozen_views_can_be_captured():
         graph.replay()
         want = rasterize(*model, query, pose, GRID).image
         assert torch.allclose(image, want if query.dim() == 3 else want[0], atol=1e-5)
-
-
-def test_networks_on_the_gpu():
-    shapes = [(500, 33, 32), (500, 32), (500, 32, 1), (500, 1)]
-    weights = [torch.randn(shape, device="cuda").requires_grad_() for shape in shapes]
-    encoded = torch.randn(20, 33, device="cuda")
-    exact = [weight.detach().double().requires_grad_() for weight in weights]
-    out, want = networks.networks(encoded, *weights), networks.products(encoded.double(), *exact)
-    got, truth = torch.autograd.grad(out.sum(), weights), torch.autograd.grad(want.sum(), exact)
-    for a, b in [(out, want), *zip(got, truth, strict=True)]:
-        assert (a.double() - b).abs().max() < 1e-5 * (1 + b.abs().max())
 
 
 def test_a_million_gaussians_stay_within_the_bound():

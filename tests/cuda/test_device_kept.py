@@ -12,7 +12,7 @@ import torch
 from modules import module
 
 from gsparc.ops import Pose, backends, validation
-from gsparc.ops.plan import Plan
+from gsparc.ops.results import Plan
 
 
 class Shapes:

@@ -118,7 +118,12 @@ def everything(dtype: torch.dtype) -> None:
         similarity_op(images, images.flip(0), [0.1, 0.2, 0.4, 0.2, 0.1], [1e-4, 9e-4], slope)
     weights = [torch.ones(shape, requires_grad=True) for shape in ((9, 19, 24), (9, 24), (9, 24, 2), (9, 2))]
     for samples in (1, 21):
-        networks.networks_op(torch.ones(samples, 19), *weights).sum().backward()
+        networks.networks(torch.ones(samples, 19), *weights).sum().backward()
+
+
+def test_every_kernel_runs(where):
+    """What compute-sanitizer watches on a GPU (bench/gpu.sh)."""
+    everything(torch.float32)
 
 
 @pytest.fixture(scope="module")

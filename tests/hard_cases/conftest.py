@@ -1,6 +1,6 @@
 """Every hard case on every backend, and the table of what was measured.
 
-`pytest tests/hard_cases --table docs/hard-cases.md` writes the table; see tests/ledger.py.
+`pytest tests/hard_cases --table docs/hard-cases.md` writes the table; see tests/helpers/ledger.py.
 """
 
 from __future__ import annotations
@@ -29,6 +29,19 @@ def backend(request):
         LEDGER.engine = None
 
 
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """Folder of a training that nobody disturbed, its overrides and its length [s]."""
+    from campaigns import brief, spectra
+    from crashes import DENSIFIED, run, training
+
+    folder = tmp_path_factory.mktemp("undisturbed")
+    settings = brief(spectra(folder / "own.npz"), *DENSIFIED)
+    code, seconds = run(training, str(folder / "whole"), settings)
+    assert code == 0
+    return folder / "whole", settings, seconds
+
+
 def pytest_addoption(parser):
     parser.addoption("--table", type=Path, help="write what was measured between the markers of this file")
     parser.addoption("--soak-minutes", type=float, help="length of test_soak.py instead of 40 s")
@@ -39,10 +52,10 @@ def pytest_runtest_setup(item):
 
 
 def pytest_runtest_logreport(report):
-    told = LEDGER.tests[Path(report.fspath).stem.removeprefix("test_")]
-    told.seconds += report.duration
-    told.passed += report.when == "call" and report.passed
-    told.failed += report.failed
+    outcome = LEDGER.tests[Path(report.fspath).stem.removeprefix("test_")]
+    outcome.seconds += report.duration
+    outcome.passed += report.when == "call" and report.passed
+    outcome.failed += report.failed
 
 
 def pytest_sessionfinish(session):

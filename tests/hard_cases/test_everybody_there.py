@@ -11,7 +11,7 @@ import pytest
 import torch
 from rasters import assert_equals_float64, one, origin, random_scene, render
 
-from gsparc.ops import SphereGrid, composite, make_plan, operators
+from gsparc.ops import SphereGrid, _native, composite, make_plan, operators
 
 GRID = SphereGrid.hemisphere()
 SMALL = SphereGrid.full_sphere(20, 40)
@@ -26,7 +26,7 @@ def test_a_giant_equals_float64(backend, projection, sigma):
 
 def test_one_giant_covers_every_strip():
     scene = one([1.0, 0.0, 1.0], sigma=40.0, opacity=0.5)
-    plan = make_plan(scene.means, scene.quats, scene.scales, scene.opacities, origin(), GRID)
+    plan = make_plan(*scene.model, origin(), GRID)
     assert plan.buffers[6].numel() == operators.strips(GRID.height)
     image = render(scene, origin(), GRID)["image"]
     assert torch.isfinite(image).all() and (image > 0.1).double().mean() > 0.8
@@ -34,7 +34,7 @@ def test_one_giant_covers_every_strip():
 
 def test_too_many_entries_are_refused_before_allocation(monkeypatch):
     scene = random_scene(n=300, size=4.0)
-    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    model = scene.model
     plan = make_plan(*model, origin(), GRID)
     entries = plan.buffers[6].numel()
     monkeypatch.setattr(operators, "MEMORY_BOUND", entries * 8 * 10)
@@ -46,7 +46,7 @@ def test_too_many_entries_are_refused_before_allocation(monkeypatch):
 
 def test_room_for_all_that_could_be_breaks():
     """Naive: a slot of gradients for every strip that a Gaussian might touch, a million of them, 16 poses."""
-    naive = 16 * 1_000_000 * operators.strips(GRID.height) * operators.built.kernels().MOMENTS * 4
+    naive = 16 * 1_000_000 * operators.strips(GRID.height) * _native.MOMENTS * 4
     assert naive > operators.MEMORY_BOUND
 
 

@@ -11,12 +11,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from campaigns import brief, compose, spectra
-from contexts import short
+from campaigns import spectra
+from contexts import trained
 from rasters import GRIDS, origin, random_scene, render
 
-from gsparc.data.load import load, split_for
-from gsparc.models.registry import build
 from gsparc.training.losses import spectrum_loss
 
 
@@ -27,12 +25,8 @@ def test_the_rasterizer_refuses_half_precision(backend, dtype):
 
 
 def fitted(folder, autocast: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    file = spectra(folder / "own.npz")
-    data = load({"name": "own", "file": str(file)})
-    method = build(compose(*brief(file, "model.refit=false")).model)
-    fold = split_for({"name": "random"}, data).folds[0]
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-        method.fit(data, fold, short(folder, 30))
+        method, data = trained(spectra(folder / "own.npz"), folder, 30)
         batch = data.batch(np.arange(8))
         mean = method.predict(batch.tx, batch.rx).mean
     assert mean.dtype == torch.float32 and mean.isfinite().all()

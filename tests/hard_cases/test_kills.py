@@ -16,32 +16,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from campaigns import brief, spectra
-from crashes import killed, moments, run, simulation, training
-from states import same
+from crashes import assert_same, killed, last_checkpoint, moments, run, simulation, training
 
 from gsparc.models import checkpoint
 
-STEPS = 42  # a multiple of 7: the last checkpoint of a stage is its end
-SETTINGS = (
-    f"trainer.max_steps={STEPS}",
-    "callbacks.checkpoint.every_n_train_steps=7",  # in the middle of an interval
-    "trainer.val_check_interval=20",
-    "callbacks=densify",
-    "callbacks.densify.start=10",
-    "callbacks.densify.interval=10",
-    "callbacks.densify.stop=35",
-    "callbacks.densify.grad_threshold=1e-5",
-    "callbacks.densify.max_gaussians=200",
-    "callbacks.reset.interval=20",
-)
 ROWS = 60
-
-
-def last_checkpoint(folder: Path) -> list[str]:
-    """The override that goes on: from the refit when it has begun to leave checkpoints."""
-    found = [p for p in (folder / "refit" / "last.ckpt", folder / "last.ckpt") if p.exists()]
-    return [f"ckpt_path={found[0]}"] if found else []
 
 
 def assert_whole(folder: Path) -> None:
@@ -71,20 +50,15 @@ def sooner(folder: Path):
         yield here, 0.4**attempt
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A training nobody disturbed, its data and its length."""
-    folder = tmp_path_factory.mktemp("kills")
-    settings = brief(spectra(folder / "own.npz"), *SETTINGS)
-    code, seconds = run(training, str(folder / "whole"), settings)
-    assert code == 0
-    return folder / "whole", settings, seconds
+CHAINS = pytest.mark.parametrize(
+    "chain", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 
 
-@pytest.mark.parametrize("chain", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_training_killed_again_and_again(trained, tmp_path, chain):
+@CHAINS
+def test_training_killed_again_and_again(undisturbed, tmp_path, chain):
     """Kills in a row, each of a run that goes on from what the one before it left."""
-    whole, settings, seconds = trained
+    whole, settings, seconds = undisturbed
     for folder, share in sooner(tmp_path):
         kills = 0
         for moment in moments(5, share * seconds, seed=chain):
@@ -95,13 +69,9 @@ def test_training_killed_again_and_again(trained, tmp_path, chain):
         if kills:
             break
     assert kills, "every run had ended before it was killed"
-    tmp_path = folder
-    code, _ = run(training, str(tmp_path), [*settings, *last_checkpoint(tmp_path)])
-    assert code == 0, (tmp_path / "error.txt").read_text()
-    one, two = (checkpoint.read(folder / "model.ckpt").state for folder in (whole, tmp_path))
-    assert same(one, two)
-    figures = [json.loads((folder / "summary.json").read_text()) for folder in (whole, tmp_path)]
-    assert figures[0]["test/psnr_db"] == figures[1]["test/psnr_db"]
+    code, _ = run(training, str(folder), [*settings, *last_checkpoint(folder)])
+    assert code == 0, (folder / "error.txt").read_text()
+    assert_same(whole, folder)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +83,7 @@ def simulated(tmp_path_factory):
     return out, seconds
 
 
-@pytest.mark.parametrize("chain", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@CHAINS
 def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
     whole, seconds = simulated
     for folder, share in sooner(tmp_path):
@@ -127,14 +97,13 @@ def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
         if kills:
             break
     assert kills, "every run had ended before it was killed"
-    tmp_path = folder
     if out.exists():  # killed when the file was whole: its parts are whole, too, or on their way out
-        left = tmp_path / "box.h5.parts"
+        left = folder / "box.h5.parts"
         assert not left.exists() or (left / "plan.json").exists()
     else:
         code, _ = run(simulation, str(out), ROWS)
         assert code == 0, out.with_suffix(".txt").read_text()
-        assert not (tmp_path / "box.h5.parts").exists()
+        assert not (folder / "box.h5.parts").exists()
     with h5py.File(whole) as one, h5py.File(out) as two:
         assert set(one) == set(two)
         assert all(np.array_equal(one[name][()], two[name][()]) for name in one)

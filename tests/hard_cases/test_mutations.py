@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import torch
 from campaigns import channels, spectra
+from contexts import loaded
 from ledger import LEDGER
 
-from gsparc.data.load import load, split_for
 from gsparc.data.own import load_own, write_own
 from gsparc.data.raw import read_raw
 from gsparc.models import checkpoint, loading
@@ -58,9 +58,8 @@ def files(tmp_path_factory) -> dict[str, Path]:
     raw = read_raw(channels(folder / "raw.npz"))
     for name in ("own.npz", "own.h5"):
         write_own(folder / name, raw.arrays, {"name": "room", "measured_by": "somebody"})
-    data = load({"name": "own", "file": str(spectra(folder / "spectra.npz"))})
     method = build({"_target_": "gsparc.models.baselines.idw.InverseDistance"})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(folder))
+    method.fit(*loaded(spectra(folder / "spectra.npz")), FitContext(folder))
     checkpoint.save(folder / "idw.ckpt", method, "seed: 3\n", {"train_s": 1.5})
     return {path.suffix: path for path in (folder / "own.npz", folder / "own.h5", folder / "idw.ckpt")}
 

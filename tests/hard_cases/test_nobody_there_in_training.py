@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, channels, compose, powers, spectra
-from contexts import short
+from contexts import trained
 
 from gsparc.commands.train import train
-from gsparc.data.load import load, split_for
-from gsparc.models.registry import build
 
 PRUNE = (
     "callbacks=densify",
@@ -55,11 +53,7 @@ def test_nobody_is_seen(tmp_path):
                 module.model.gaussians.log_scales.fill_(-3.0)
 
     file = spectra(tmp_path / "own.npz")
-    method = build(compose(*brief(file, "init=sphere", "model.refit=false")).model)
-    data = load({"name": "own", "file": str(file)})
-    method.fit(
-        data, split_for({"name": "random"}, data).folds[0], short(tmp_path, 10, callbacks=lambda: [Sink()])
-    )
+    method, data = trained(file, tmp_path, 10, "init=sphere", callbacks=lambda: [Sink()])
     batch = data.batch(np.arange(4))
     assert (method.predict(batch.tx, batch.rx).mean == 0).all()
     assert all(p.isfinite().all() for p in method.fitted().parameters())

@@ -8,13 +8,15 @@ The rasterizer's door refuses what is not finite or would overflow inside. Exact
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 
 import lightning.pytorch as L
 import numpy as np
 import pytest
 import torch
 from campaigns import brief, compose, spectra
-from contexts import short
+from contexts import loaded, short, trained
 from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.models import checkpoint
@@ -24,91 +26,68 @@ from gsparc.training.module import NonFiniteLoss
 
 
 class Spoil(L.Callback):
-    """Writes a NaN into one Gaussian in the middle of training."""
+    """Writes `value` into a parameter (of one Gaussian) before a step, or `after` it.
 
-    def __init__(self, step: int, name: str, row: int) -> None:
-        self.step, self.name, self.row = step, name, row
+    After it whatever comes before the next step meets it: a validation, a checkpoint.
+    """
 
-    def on_train_batch_start(self, trainer, module, *unused):
+    def __init__(
+        self, step: int, name: str, row: object, value: float = math.nan, after: bool = False
+    ) -> None:
+        self.step, self.name, self.row, self.value, self.after = step, name, row, value, after
+
+    def write(self, trainer, module) -> None:
         if trainer.global_step == self.step:
             with torch.no_grad():
-                dict(module.model.named_parameters())[self.name][self.row] = float("nan")
+                dict(module.model.named_parameters())[self.name][self.row] = self.value
 
+    def on_train_batch_start(self, trainer, module, *unused):
+        if not self.after:
+            self.write(trainer, module)
 
-def fit(data, fold, file, callbacks, **more) -> None:
-    method = build(compose(*brief(file, "model.refit=false")).model)
-    method.fit(data, fold, short(file.parent, 20, callbacks=lambda: list(callbacks), every=5, **more))
-
-
-@pytest.fixture
-def data(tmp_path):
-    from gsparc.data.load import load
-
-    return load({"name": "own", "file": str(spectra(tmp_path / "own.npz"))})
+    def on_train_batch_end(self, trainer, module, *unused):
+        if self.after:
+            self.write(trainer, module)
 
 
 @pytest.mark.parametrize(
-    "name", ["gaussians.means", "gaussians.opacity_logits", "emission.weight2", "emission.bias2"]
+    "spoil,offender,named",
+    [
+        *(
+            (Spoil(7, name, 3), f"Gaussian id 3, {name}", "at step 7 .*")
+            for name in ("gaussians.means", "gaussians.opacity_logits", "emission.weight2", "emission.bias2")
+        ),
+        # A NaN that a step itself makes is met one step later; no checkpoint is written in between.
+        (Spoil(10, "log_gain", ..., after=True), "log_gain", ""),
+        # Finite, but a Gaussian of 1e30 m: found when the rasterizer's door got limits.
+        (
+            Spoil(7, "gaussians.log_scales", 3, 70.0),
+            "Gaussian id 3: Gaussian 3 has scales that are not",
+            "at step 7 .*",
+        ),
+        # Before a validation the evidence is left, too.
+        (Spoil(9, "gaussians.means", 2, after=True), "Gaussian id 2, gaussians.means", ""),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_spoilt_parameter_stops_the_run_and_is_named(data, folds, tmp_path, name):
-    with pytest.raises(NonFiniteLoss, match=rf"at step 7 .*Gaussian id 3, {name}"):
-        fit(data, folds(len(data)).folds[0], tmp_path / "own.npz", [Spoil(7, name, 3)])
+def test_a_spoilt_parameter_stops_the_run_and_is_named(tmp_path, spoil, offender, named):
+    with pytest.raises(NonFiniteLoss, match=named + re.escape(offender)):
+        trained(
+            spectra(tmp_path / "own.npz"), tmp_path, 20, callbacks=lambda: [spoil], every=5,
+            validate_every=10 if spoil.step == 9 else 500,
+        )  # fmt: skip
     left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
-    assert left["step"] == 7 and left["state_dict"][name][3].isnan().any() and len(left["index"])
-    assert left["offender"] == f"Gaussian id 3, {name}" and left["sample"] in left["index"]
+    assert left["offender"].startswith(offender) and len(left["target"]) == len(left["index"])
+    assert left["step"] >= 7 and (spoil.step != 7 or left["step"] == 7)
+    spoilt = left["state_dict"][spoil.name][spoil.row]
+    assert spoilt.isnan().any() or (spoilt == spoil.value).all()
     good = checkpoint.read(tmp_path / "last.ckpt")
     assert good.extra["trainer"]["global_step"] == 5
     assert all(t.isfinite().all() for t in good.state["inner"]["model"].values())
 
 
-class SpoilAfterStep(Spoil):
-    """The same between a step and whatever comes before the next: a validation, a checkpoint."""
-
-    def on_train_batch_start(self, *unused):
-        pass
-
-    def on_train_batch_end(self, trainer, module, *unused):
-        Spoil.on_train_batch_start(self, trainer, module)
-
-
-def test_a_poisoned_state_replaces_no_checkpoint(data, folds, tmp_path):
-    """A NaN that a step itself makes is met one step later; a checkpoint must not be written in between."""
-    with pytest.raises(NonFiniteLoss, match="log_gain"):
-        fit(data, folds(len(data)).folds[0], tmp_path / "own.npz", [SpoilAfterStep(10, "log_gain", ...)])
-    assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
-    assert torch.load(tmp_path / "nonfinite.pt", weights_only=True)["offender"] == "log_gain"
-
-
-def test_a_parameter_that_would_overflow_stops_the_run_too(data, folds, tmp_path):
-    """Finite, but a Gaussian of 1e30 m: found when the rasterizer's door got limits."""
-
-    class Widen(Spoil):
-        def on_train_batch_start(self, trainer, module, *unused):
-            if trainer.global_step == self.step:
-                with torch.no_grad():
-                    module.model.gaussians.log_scales[self.row] = 70.0
-
-    with pytest.raises(NonFiniteLoss, match=r"at step 7 .*Gaussian id 3: Gaussian 3 has scales that are not"):
-        fit(data, folds(len(data)).folds[0], tmp_path / "own.npz", [Widen(7, "", 3)])
-    left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
-    assert "Gaussian id 3" in left["offender"] and len(left["target"]) == len(left["index"])
-    assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
-
-
-def test_a_run_that_is_poisoned_before_a_validation_leaves_the_evidence_too(data, folds, tmp_path):
-    with pytest.raises(NonFiniteLoss, match=r"Gaussian id 2, gaussians\.means"):
-        fit(
-            data,
-            folds(len(data)).folds[0],
-            tmp_path / "own.npz",
-            [SpoilAfterStep(9, "gaussians.means", 2)],
-            validate_every=10,
-        )
-    assert (tmp_path / "nonfinite.pt").exists()
-
-
-def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(data, folds, tmp_path):
-    fold = folds(len(data)).folds[0]
+def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(tmp_path):
+    data, fold = loaded(spectra(tmp_path / "own.npz"))
     target = data.target.astype(np.float32).copy()
     bad = int(fold.train[4])
     target[bad, 3, 3] = np.nan

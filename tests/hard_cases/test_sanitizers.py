@@ -94,9 +94,8 @@ def module() -> Path:
 @pytest.mark.parametrize("isa", [pytest.param("baseline", marks=pytest.mark.rare), "avx2", "avx512"])
 def test_nothing_is_found(module, isa):
     files = [f"tests/hard_cases/test_{case}.py" for case in CASES]
-    files += ["tests/ops/test_kernels.py", "tests/ops/test_face.py", "tests/ops/test_channels.py"]
-    files += ["tests/ops/test_networks.py", "tests/ops/test_similarity.py", "tests/ops/test_at_once.py"]
-    files += ["tests/ops/test_queries.py"]
+    ops = ("kernels", "face", "compute_kernels", "at_once", "queries")
+    files += [f"tests/ops/test_{name}.py" for name in ops]
     done = watched(module, isa, *files, "-m", "not slow", "-k", "not reference and not shim and not forked")
     if done.returncode == 99:
         pytest.skip(f"this machine has no {isa}")

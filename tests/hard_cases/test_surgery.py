@@ -13,21 +13,19 @@ import lightning.pytorch as L
 import numpy as np
 import pytest
 import torch
-from campaigns import brief, compose, spectra
-from contexts import short
+from campaigns import spectra
+from contexts import trained
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ledger import LEDGER
 
 from gsparc.callbacks import Densify, OpacityReset
-from gsparc.data.load import load, split_for
 from gsparc.data.schema import Site
 from gsparc.field.edit import row_parameters
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
-from gsparc.models.registry import build
 from gsparc.ops import Pose, SphereGrid
 from gsparc.training.module import NonFiniteLoss
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for
@@ -179,14 +177,10 @@ class Fire(L.Callback):
 def test_training_under_adversarial_gradients_ends_whole_or_stops_by_name(tmp_path, size):
     """Densified, pruned and reset all the while; a run never goes on with a NaN."""
     file = spectra(tmp_path / "own.npz")
-    data = load({"name": "own", "file": str(file)})
-    method = build(compose(*brief(file, "model.refit=false", "init=sphere")).model)
     densify = Densify(2, 30, 3, 0.0, 0.05, max_gaussians=80, min_gaussians=4, max_radius=50.0)
     made = [Fire(size, 0), densify, OpacityReset(5, 30, 0.05)]
     try:
-        method.fit(
-            data, split_for({"name": "random"}, data).folds[0], short(tmp_path, 24, callbacks=lambda: made)
-        )
+        method, _ = trained(file, tmp_path, 24, "init=sphere", callbacks=lambda: made)
     except NonFiniteLoss as stopped:
         assert "first offender: " in str(stopped) and (tmp_path / "nonfinite.pt").exists()
         assert not math.isfinite(size) or size > 1e18

@@ -9,6 +9,7 @@ import multiprocessing
 import numpy as np
 import pytest
 import torch
+from compute_kernels import assert_threads_agree
 from rasters import poses, random_scene, render
 
 from gsparc.ops import SphereGrid, freeze, make_plan, mean_weights, rasterize
@@ -16,44 +17,28 @@ from gsparc.ops import SphereGrid, freeze, make_plan, mean_weights, rasterize
 GRID = SphereGrid.hemisphere()
 
 
-@pytest.fixture(autouse=True)
-def _restore_threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 @pytest.mark.parametrize("count", [0, 3])
 def test_bit_identical(dtype, projection, count):
     scene = random_scene(n=700, seed=1, hides=True).to(dtype)
-    results = []
-    for threads in (1, 2, 5):
-        torch.set_num_threads(threads)
-        results.append(render(scene, poses(count), GRID, projection=projection, behind=False))
-    for other in results[1:]:
-        for name, value in results[0].items():
-            assert torch.equal(value, other[name]), name
+    optics = {"projection": projection, "behind": False}
+    assert_threads_agree(lambda: list(render(scene, poses(count), GRID, **optics).values()))
 
 
 def test_weights_are_bit_identical():
     scene = random_scene(n=700, seed=1).to(torch.float32)
-    results = []
-    for threads in (1, 2, 5):
-        torch.set_num_threads(threads)
-        model = [
-            getattr(scene, k).clone().requires_grad_() for k in ("means", "quats", "scales", "opacities")
-        ]
-        plan = make_plan(*model, poses(2), GRID)
-        seen = mean_weights(plan, *model)
+
+    def call():
+        model = [leaf.clone().requires_grad_() for leaf in scene.model]
+        seen = mean_weights(make_plan(*model, poses(2), GRID), *model)
         (seen.mean * torch.arange(700.0)).sum().backward()
-        results.append([seen.mean, seen.share, *(leaf.grad for leaf in model)])
         with torch.no_grad():
             view = freeze(make_plan(*model, poses(0), GRID), *model, version=0)
-            results[-1].append(view.render(scene.features, version=0))
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+            image = view.render(scene.features, version=0)
+        return [seen.mean, seen.share, *(leaf.grad for leaf in model), image]
+
+    assert_threads_agree(call)
 
 
 def test_adding_in_another_order_breaks():
@@ -76,9 +61,9 @@ def test_a_forked_child_can_render():
 
     The child calls nothing of torch's that uses OpenMP: libgomp does not survive a fork.
     """
+    scene, before = random_scene(n=50), torch.get_num_threads()
     torch.set_num_threads(2)
-    scene = random_scene(n=50)
-    inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.features)
+    inputs = (*scene.model, scene.features)
     want = _total(inputs)
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
@@ -87,5 +72,6 @@ def test_a_forked_child_can_render():
     try:
         assert queue.get(timeout=20) == want
     finally:
+        torch.set_num_threads(before)
         child.kill()
         child.join()

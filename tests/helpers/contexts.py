@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
+from campaigns import brief, compose
 
+from gsparc.data.load import load, split_for
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.method import Method
+from gsparc.models.registry import build
 from gsparc.training.context import FitContext
 from gsparc.training.fit import DEFAULTS
 
@@ -33,3 +39,18 @@ def short(
 
     trainer = partial(DEFAULTS, max_steps=steps, val_check_interval=validate_every)
     return FitContext(run_dir, batch_size=batch_size, trainer=trainer, callbacks=made, **more)
+
+
+def loaded(file: Path) -> tuple[Measurements, Fold]:
+    """A user's measurements and their random fold."""
+    data = load({"name": "own", "file": str(file)})
+    return data, split_for({"name": "random"}, data).folds[0]
+
+
+def trained(
+    file: Path, folder: Path, steps: int, *overrides: str, **more: Any
+) -> tuple[Method, Measurements]:
+    """The splatted field of `brief`, after so many steps on a user's file; `more` is for `short`."""
+    method, (data, fold) = build(compose(*brief(file, "model.refit=false", *overrides)).model), loaded(file)
+    method.fit(data, fold, short(folder, steps, **more))
+    return method, data

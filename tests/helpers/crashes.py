@@ -5,6 +5,8 @@ Equivalent to starting the command and killing it, except that 50 kills do not c
 
 from __future__ import annotations
 
+import contextlib
+import json
 import multiprocessing
 import os
 import random
@@ -14,11 +16,29 @@ import time
 from pathlib import Path
 
 from ledger import LEDGER
+from states import different
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
     ["crashes", "campaigns", "gsparc.commands.train", "gsparc.models.splat.method", "gsparc.callbacks"]
 )
+
+
+STEPS = 42  # a multiple of 7: the last checkpoint of a stage is its end
+DENSIFIED = (
+    f"trainer.max_steps={STEPS}",
+    "callbacks.checkpoint.every_n_train_steps=7",  # in the middle of an interval
+    "trainer.val_check_interval=20",
+    "callbacks=densify",
+    "callbacks.densify.start=10",
+    "callbacks.densify.interval=10",
+    "callbacks.densify.stop=35",
+    "callbacks.densify.grad_threshold=1e-5",
+    "callbacks.densify.max_gaussians=200",
+    "callbacks.reset.interval=20",
+)
+VARYING = ("time/", "machine/", "memory/", "git")
+TIMED = ("train_s", "render_ms", "ratio_to_copy")
 
 
 def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
@@ -105,6 +125,10 @@ def killed(target, *arguments, after_s: float) -> bool:
     child = CONTEXT.Process(target=target, args=arguments)
     child.start()
     child.join(timeout=after_s)
+    return _kill(child)
+
+
+def _kill(child: multiprocessing.Process) -> bool:
     if child.exitcode is None:
         os.kill(child.pid, signal.SIGKILL)
         child.join()
@@ -115,7 +139,46 @@ def killed(target, *arguments, after_s: float) -> bool:
     return True
 
 
+def killed_at(file: Path, saves: int, target, *arguments, after_s: float = 0.0) -> int:
+    """SIGKILL a run once `file` has been written `saves` times and `after_s` more; the step it holds."""
+    from gsparc.models import checkpoint
+
+    seen: set[int] = set()
+    child = CONTEXT.Process(target=target, args=arguments)
+    child.start()
+    while len(seen) < saves:
+        assert child.is_alive(), f"it ended before: {child.exitcode}"
+        with contextlib.suppress(FileNotFoundError):
+            seen.add(file.stat().st_mtime_ns)
+        time.sleep(0.001)
+    time.sleep(after_s)
+    assert _kill(child), "it had finished before the kill"
+    return checkpoint.read(file).extra["trainer"]["global_step"]
+
+
 def moments(count: int, longest_s: float, seed: int) -> list[float]:
     """Random moments of a run of that length [s], early enough that runs which go on are still running."""
     draw = random.Random(seed)
     return [draw.uniform(0.02, 0.5 * longest_s) for _ in range(count)]
+
+
+def last_checkpoint(folder: Path) -> list[str]:
+    """The override that goes on: from the refit when it has begun to leave checkpoints."""
+    left = [p for p in (folder / "refit" / "last.ckpt", folder / "last.ckpt") if p.exists()]
+    return [f"ckpt_path={left[0]}"] if left else []
+
+
+def assert_same(whole: Path, resumed: Path) -> None:
+    """Figures, model, optimizer and gathered statistics of two runs are identical."""
+    from gsparc.models import checkpoint
+
+    folders, facts = (whole, resumed), []
+    for folder in folders:
+        every = json.loads((folder / "summary.json").read_text()).items()
+        facts.append({k: v for k, v in every if not k.startswith(VARYING) and not any(t in k for t in TIMED)})
+    assert facts[0] == facts[1]
+    assert different(*(checkpoint.read(folder / "model.ckpt").state for folder in folders)) == []
+    last = [checkpoint.read(folder / "refit" / "last.ckpt").extra["trainer"] for folder in folders]
+    assert different(*(state["optimizer_states"] for state in last), "optimizer") == []
+    gathered = [state["callbacks"]["Densify"] for state in last]
+    assert different(*gathered, "statistics") == [] and gathered[0]["statistics"]["seen"].any()

@@ -74,10 +74,10 @@ class Drawn:
 
 
 @st.composite
-def fields(draw, most: int = 8, hides: bool | None = None, grids: st.SearchStrategy = GRIDS) -> Drawn:
-    """Up to `most` Gaussians before one receiver a little off the origin."""
+def fields(draw, hides: bool | None = None, grids: st.SearchStrategy = GRIDS) -> Drawn:
+    """Up to 8 Gaussians before one receiver a little off the origin."""
     noise = torch.Generator().manual_seed(draw(st.integers(0, 2**20)))
-    count = draw(st.integers(0, most))
+    count = draw(st.integers(0, 8))
     rows: list[tuple] = []
     for _ in range(count):
         if rows and draw(st.integers(0, 5)) == 0:

@@ -1,4 +1,4 @@
-"""What the tests measured while they ran: worst errors, examples, seconds and counts, case by case.
+"""What the tests measured while they ran: errors, seconds and counts, case by case.
 
 `tests/hard_cases/conftest.py` says which test is running and writes the table of docs/hard-cases.md from it.
 """
@@ -7,36 +7,10 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from statistics import median
 
 
 @dataclass
-class Tally:
-    """What one engine in one precision did for one case.
-
-    Attributes:
-        times: seconds of each forward and backward pass.
-        worst: part ("forward", "backward") -> largest error, relative to one plus the largest value wanted.
-        share: part -> the same error as a share of what was allowed.
-    """
-
-    times: list[float] = field(default_factory=list)
-    worst: dict[str, float] = field(default_factory=dict)
-    share: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def examples(self) -> int:
-        """Number of passes."""
-        return len(self.times)
-
-    @property
-    def median_ms(self) -> float:
-        """Their median time [ms]."""
-        return 1e3 * median(self.times)
-
-
-@dataclass
-class Told:
+class Outcome:
     """How the tests of one case ended, and their time [s]."""
 
     passed: int = 0
@@ -44,26 +18,36 @@ class Told:
     seconds: float = 0.0
 
 
+@dataclass
 class Ledger:
-    """One per test session."""
+    """One per test session.
 
-    def __init__(self) -> None:
-        self.case = "other"
-        self.engine: str | None = None  # who stands in for the CPU's kernels; None: nobody
-        self.tallies: dict[tuple[str, str, str], Tally] = defaultdict(Tally)
-        self.tests: dict[str, Told] = defaultdict(Told)
-        self.counts: dict[str, Counter[str]] = defaultdict(Counter)
-        self.seeds: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    Attributes:
+        case: what is being tested.
+        engine: who stands in for the CPU's kernels; None: nobody.
+        passes: case, engine, precision and seconds of each forward and backward pass.
+        errors: case, engine, precision, part ("forward", "backward"), error relative to one plus the largest
+            value wanted, and its share of what was allowed.
+        tests: outcomes by case.
+        counts: by what is counted, then by case.
+        seeds: error of each seed's short run [dB relative to the power] and its seconds, by dataset.
+    """
+
+    case: str = "other"
+    engine: str | None = None
+    passes: list[tuple[str, str, str, float]] = field(default_factory=list)
+    errors: list[tuple[str, str, str, str, float, float]] = field(default_factory=list)
+    tests: dict[str, Outcome] = field(default_factory=lambda: defaultdict(Outcome))
+    counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    seeds: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
 
     def rendered(self, engine: str, precision: str, seconds: float) -> None:
         """One forward and backward pass."""
-        self.tallies[self.case, engine, precision].times.append(seconds)
+        self.passes.append((self.case, engine, precision, seconds))
 
     def compared(self, engine: str, precision: str, part: str, error: float, allowed: float) -> None:
         """An error against the float64 reference, and what was allowed."""
-        tally = self.tallies[self.case, engine, precision]
-        tally.worst[part] = max(tally.worst.get(part, 0.0), error)
-        tally.share[part] = max(tally.share.get(part, 0.0), error / allowed)
+        self.errors.append((self.case, engine, precision, part, error, error / allowed))
 
     def count(self, what: str, number: int = 1) -> None:
         """Examples of a property, bad inputs, kills, seeds."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
+import pytest
 import torch
 from ledger import LEDGER
 from torch import Tensor
@@ -30,10 +31,18 @@ class Scene:
     extinctions: Tensor | None = None
     ids: Tensor | None = None
 
+    @property
+    def model(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What planning takes."""
+        return self.means, self.quats, self.scales, self.opacities
+
     def to(self, dtype: torch.dtype) -> Scene:
         return replace(
             self, **{k: v.to(dtype) for k, v in vars(self).items() if v is not None and v.is_floating_point()}
         )
+
+    def on(self, device: str) -> Scene:
+        return replace(self, **{k: v.to(device) for k, v in vars(self).items() if v is not None})
 
     def permuted(self, order: Tensor) -> Scene:
         parts = {k: v[order] for k, v in vars(self).items() if v is not None and k != "features"}
@@ -160,6 +169,18 @@ def assert_close(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: flo
 
 
 TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-4}
+PROJECTED = ("tangent", "equirect")
+PROJECTIONS = pytest.mark.parametrize("projection", PROJECTED)
+
+
+def assert_equals_reference(
+    scene: Scene, pose: Pose, grid: SphereGrid, dtype: torch.dtype = torch.float64, **optics
+) -> tuple[Outcome, Outcome]:
+    """The kernels in `dtype` against the reference in float64; both are returned."""
+    want = render(scene, pose, grid, "reference", **optics)
+    got = render(scene.to(dtype), pose, grid, **optics)
+    assert_close(got, want, TOLERANCES[dtype])
+    return got, want
 
 
 def assert_equals_float64(

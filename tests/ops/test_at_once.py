@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from compute_kernels import assert_threads_agree
 from rasters import GRIDS, poses, random_scene
 
 from gsparc.ops import Pose, composite, make_plan, native, operators, rasterize
@@ -26,7 +27,7 @@ def at_once(monkeypatch):
 
 def both(scene, pose, grid=GRIDS["hemisphere"], **optics):
     """Rasters in one call and in two."""
-    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    model = scene.model
     options = {"extinctions": scene.extinctions, "ids": scene.ids}
     plan = make_plan(*model, pose, grid, **options, **optics)
     apart = composite(plan, *model, scene.features, extinctions=scene.extinctions)
@@ -75,14 +76,9 @@ def test_hard_cases_are_the_same_bits(at_once, name, scene, projection):
 
 
 def test_any_number_of_threads_is_the_same_bits(at_once):
-    before, images = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            images.append(assert_alike(both(random_scene(n=3000).to(torch.float32), poses(3))).image)
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2]) and len(at_once) == 3
+    scene = random_scene(n=3000).to(torch.float32)
+    assert_threads_agree(lambda: [assert_alike(both(scene, poses(3))).image])
+    assert len(at_once) == 3
 
 
 def test_gradients_take_the_plan(at_once):
@@ -120,7 +116,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_the_same_refusals(at_once, name):
     scene, pose = WRONG[name]
-    model, grid = (scene.means, scene.quats, scene.scales, scene.opacities), GRIDS["sphere"]
+    model, grid = scene.model, GRIDS["sphere"]
     with pytest.raises(ValueError) as one:
         rasterize(*model, scene.features, pose, grid, ids=scene.ids)
     with pytest.raises(ValueError) as two:
@@ -140,7 +136,7 @@ def test_too_many_entries_are_refused_before_allocation(at_once, monkeypatch):
     monkeypatch.setattr(operators, "MEMORY_BOUND", 100)
     with pytest.raises(MemoryError, match="use fewer or smaller Gaussians"):
         both(scene, poses(0))
-    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    model = scene.model
     with pytest.raises(MemoryError, match="use fewer or smaller Gaussians"):
         rasterize(*model, scene.features, poses(0), GRIDS["sphere"])
     assert len(at_once) == 1

@@ -1,9 +1,12 @@
-"""Five hundred random and nasty fields against pictures drawn from the definitions alone."""
+"""Five hundred random and nasty fields against pictures drawn from the definitions alone.
+
+That gradients are the slopes of these pictures: test_kernels.py::test_gradcheck.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -54,20 +57,17 @@ class Field:
             for part, pose in zip(parts, poses, strict=True)
         ]
 
-    def rendered(self, backend: str, dtype: torch.dtype = torch.float64, *leaves: torch.Tensor) -> Raster:
-        """By a backend; `leaves` are the first six fields instead of the arrays."""
-        given = [torch.from_numpy(np.ascontiguousarray(part)).to(dtype) for part in self.drawn()]
-        *model, extinctions, features = leaves or given
+    def rendered(self, backend: str, dtype: torch.dtype = torch.float64) -> Raster:
+        """By a backend."""
+        parts = (self.means, self.quats, self.scales, self.opacities, self.extinctions, self.features)
+        given = (torch.from_numpy(np.ascontiguousarray(part)).to(dtype) for part in parts)
+        *model, extinctions, features = given
         optics = {name: getattr(self.optics, name) for name in self.optics.__dataclass_fields__}
         pose = Pose(torch.from_numpy(self.positions), torch.from_numpy(self.rotations))
         return rasterize(
             *model, features, pose, self.grid, **optics,
             extinctions=extinctions, ids=torch.from_numpy(self.ids), backend=backend,
         )  # fmt: skip
-
-    def drawn(self) -> tuple[np.ndarray, ...]:
-        """The first six fields."""
-        return self.means, self.quats, self.scales, self.opacities, self.extinctions, self.features
 
 
 @cache
@@ -169,64 +169,3 @@ def test_pictures_in_float32(backend, first):
             off += (want.certain & (gaps > 1e-3 * (1 + np.abs(want.image).max(initial=0)))).sum()
             pixels += want.certain.sum()
     assert off < 0.02 * pixels
-
-
-def gentle(number: int) -> Field:
-    """Of the same draw without its corners, which no difference may step over."""
-    rng = np.random.default_rng([19, number])
-    field, count = drawn(number), 4
-    return replace(
-        field,
-        means=rng.normal(size=(count, 3)) + np.sign(rng.normal(size=(count, 3))) * [0.5, 0.5, 0.2],
-        quats=rng.normal(size=(count, 4)),
-        scales=rng.uniform(0.1, 0.5, (count, 3)),
-        opacities=rng.uniform(0.1, 0.9, count),
-        extinctions=rng.uniform(0.1, 0.9, count),
-        features=rng.normal(size=(1, count, 2)),
-        ids=np.arange(count),
-        positions=0.1 * rng.normal(size=(1, 3)),
-        rotations=field.rotations[:1],
-        grid=GRIDS[number % 3],
-        optics=replace(
-            field.optics,
-            projection=("tangent", "equirect")[number % 2],
-            cutoff=Cutoff(1e-14, 0.0, relative=bool(number % 3)),
-        ),
-    )
-
-
-@cache
-def slopes(number: int) -> list[np.ndarray]:
-    """Central differences of a weighted sum of the oracle's picture and transmittance."""
-    field, step = gentle(number), 1e-6
-    names = ("means", "quats", "scales", "opacities", "extinctions", "features")
-
-    def total(name: str, values: np.ndarray) -> float:
-        (seen,) = replace(field, **{name: values}).seen()
-        parts = seen.image, seen.transmittance
-        return sum((part * weight).sum() for part, weight in zip(parts, weights(field), strict=True))
-
-    found = []
-    for name in names:
-        values = getattr(field, name)
-        moves = step * np.eye(values.size).reshape(values.size, *values.shape)
-        ends = [(total(name, values + move), total(name, values - move)) for move in moves]
-        found.append(np.reshape([(a - b) / (2 * step) for a, b in ends], values.shape))
-    return found
-
-
-def weights(field: Field) -> tuple[np.ndarray, np.ndarray]:
-    rng, size = np.random.default_rng(20), (field.grid.height, field.grid.width)
-    return rng.normal(size=(1, field.features.shape[2], *size)), rng.normal(size=size)
-
-
-@BACKENDS
-@pytest.mark.parametrize("number", range(12))
-def test_gradients_are_the_slopes_of_the_definitions(backend, number):
-    field = gentle(number)
-    leaves = [torch.from_numpy(part).requires_grad_() for part in field.drawn()]
-    raster = field.rendered(backend, torch.float64, *leaves)
-    image, behind = (torch.from_numpy(weight) for weight in weights(field))
-    ((raster.image * image).sum() + (raster.transmittance[0] * behind).sum()).backward()
-    for leaf, want in zip(leaves, slopes(number), strict=True):
-        assert np.abs(leaf.grad.numpy() - want).max() < 1e-6 * (1 + np.abs(want).max())

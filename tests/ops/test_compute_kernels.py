@@ -1,0 +1,100 @@
+"""Kernels of networks, channels and the similarity against their definitions in PyTorch."""
+
+import pytest
+import torch
+from compute_kernels import (
+    KIND_SHAPES,
+    KINDS,
+    SETS,
+    TONES,
+    assert_equals_reference,
+    assert_threads_agree,
+    evaluated,
+    instruction_set,
+    layers,
+    sources,
+)
+
+from gsparc.ops.channels import channels
+from gsparc.ops.networks import networks
+
+LARGE = {"networks": (6, 700, 3, 16, 2), "channels": (2, 301, 5, 26), "similarity": (5, 30, 50)}
+
+
+@SETS
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("kind,shape", KIND_SHAPES, ids=str)
+def test_equals_reference(kind, shape, dtype, name):
+    if dtype not in KINDS[kind].tolerance:
+        pytest.skip("in float64 no kernel computes the similarity")
+    with instruction_set(name):
+        assert_equals_reference(kind, shape, dtype)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bit_identical_for_any_threads(kind):
+    of = KINDS[kind]
+    assert_threads_agree(lambda: evaluated(of.kernel, of, LARGE[kind], torch.float32))
+
+
+def test_networks_gradients():
+    """By the kernel for the weights, by matrix products for the position."""
+    encoded, *weights = layers(3, 5, 4, 8, 2)
+    leaves = [layer.clone().requires_grad_() for layer in weights]
+    assert torch.autograd.gradcheck(lambda *w: networks(encoded, *w), leaves)
+    assert torch.autograd.gradcheck(lambda x: networks(x, *weights), (encoded.clone().requires_grad_(),))
+
+
+def test_networks_strides():
+    encoded, weight1, *rest = layers(3, 5, 4, 8, 2)
+    wide = torch.empty(5, 8, 4, dtype=torch.float64).mT
+    wide.copy_(weight1)
+    assert torch.equal(networks(encoded, wide, *rest), networks(encoded, weight1, *rest))
+
+
+def test_phase_after_ten_kilometres_at_60_ghz():
+    """10 km is two million turns: the recurrence starts from turns reduced in float64."""
+    gains, steering = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[1.0, 0.0]]])
+    delays = torch.tensor([1e4 / 299_792_458.0], dtype=torch.float64)
+    got = torch.view_as_complex(channels(gains, steering, delays, 60e9, 120e3, 512))[0, 0]
+    turns = (60e9 + 120e3 * torch.arange(512, dtype=torch.float64)) * delays
+    want = torch.polar(torch.ones(512, dtype=torch.float64), -2 * torch.pi * turns.frac())
+    assert (got - want).abs().max() < 1e-4
+    naive = torch.polar(
+        torch.ones(512), -2 * torch.pi * (60e9 + 120e3 * torch.arange(512.0)) * delays.float()
+    )
+    assert (naive - want).abs().max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "part,shape",
+    [(0, (2, 2)), (0, (2, 200)), (1, (4, 15)), (2, (0,)), (2, (4, 2)), (3, (2, 5, 2)), (3, (4, 3, 2)),
+     (4, (4, 1))],
+    ids=str,
+)  # fmt: skip
+def test_network_shapes_that_the_kernel_read_out_of_bounds(part, shape):
+    """An empty bias was a segmentation fault, a bias (N, 1) other numbers than the products'."""
+    tensors = layers(2, 4, 3, 5, 2)
+    tensors[part] = torch.ones(shape, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"weights \(N, E, H\) and \(N, H, C\) with biases .* are needed"):
+        networks(*tensors)
+
+
+@pytest.mark.parametrize("part", range(5))
+def test_network_dtypes_that_the_kernel_misread(part):
+    tensors = layers(2, 4, 3, 5, 2)
+    tensors[part] = tensors[part].float()
+    with pytest.raises(TypeError, match="encoded, weights and biases share a dtype"):
+        networks(*tensors)
+
+
+def test_channels_refuse_what_does_not_fit():
+    gains, steering, delays = sources(1, 3, 2)
+    for given, count, error, message in (
+        ((gains, steering, delays.float()), 4, TypeError, "delays are float64"),
+        ((gains, steering, delays[:2]), 4, ValueError, "are needed"),
+        ((gains.half(), steering.half(), delays), 4, TypeError, "both float32 or both float64"),
+        ((gains, steering, delays), -1, ValueError, "-1 subcarriers are none"),
+    ):
+        with pytest.raises(error, match=message):
+            channels(*given, *TONES, count)
