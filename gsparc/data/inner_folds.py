@@ -15,13 +15,12 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
+from gsparc.data.splits import CORNERS, FileSettings, Fold, SplitSettings, make_split
 
 FARTHER = 2.0  # times the usual distance to the nearest training row, from which validation rows are apart
 SIDES = np.sqrt(2) ** np.arange(9)  # of squares tried for a file's gap, in units of that gap
 HALVINGS = 6  # of the side of squares, where too few squares hold training rows
 DRAWS = 12  # of squares per fold, of which those are taken that share the fewest rows
-CORNERS = ("--", "-+", "+-", "++")
 NOT_TESTED = -1  # unit of a row that no fold leaves out
 
 

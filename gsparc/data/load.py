@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -16,7 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, nearest
-from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
+from gsparc.data.instantiate import find, from_settings, refuse_foreign, suggest, targets
+from gsparc.data.limits import SettingError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
 
@@ -56,6 +58,9 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     try:  # under its key, which errors then name
         found = instantiate({"dataset": settings}, _convert_="all")["dataset"]
     except InstantiationException as error:
+        where = re.search(r"full_key: (\S+)", str(error))
+        if isinstance(error.__cause__, SettingError) and where:
+            raise SettingError(f"{where[1]}.{error.__cause__}") from None
         if isinstance(error.__cause__, ValueError):
             raise error.__cause__ from None
         raise
@@ -96,8 +101,8 @@ def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
         DataError: unknown name or key, or impossible shares.
     """
     if config.get("name") == "file":
-        return FileSettings(**known_keys(config, FileSettings, "split", "setting of split=file"))
-    return SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
+        return from_settings(FileSettings, config, "split", "setting of split=file")
+    return from_settings(SplitSettings, config, "split")
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:

@@ -98,11 +98,12 @@ class Checker:
                 want is None or want == got for want, got in zip(shape, array.shape, strict=True)
             ):
                 return True
-        turned = any(array.shape[::-1] == s for s in shapes) or array.shape[:1] == (3,)
+        turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
         constrained = any(count is not None for shape in shapes for count in shape)
         here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
         found = f"{array.shape}{'; transposed?' if turned else ''}"
-        self.refuse(name, f"expected shape {FIELDS[name].shape}{here}, found {found}")
+        known = f" {FIELDS[name].shape}" if name in FIELDS else ""
+        self.refuse(name, f"expected shape{known}{here}, found {found}")
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:

@@ -17,6 +17,7 @@ import numpy as np
 from gsparc.data.blocks import taken
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
+from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
 from gsparc.data.links.stations import station_number
 from gsparc.data.raw import Noted, Raw, numbered_rows
 from gsparc.data.schema import FIELDS, MEASUREMENTS, axes_from
@@ -30,8 +31,22 @@ ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", F
 SPLIT = ("split_train", "split_test")
 
 
+def _listed(given: Any) -> Any:
+    return (given,) if isinstance(given, str | int) else given
+
+
+def _are_names(given: Any) -> bool:
+    names = _listed(given)
+    if not isinstance(names, Sequence) or not names:
+        return False
+    return all(isinstance(name, str | int) and not isinstance(name, bool) for name in names)
+
+
+NAMED = or_null(Limit("a list of names like [A,B]", _are_names))
+
+
 @dataclass(frozen=True)
-class Selection:
+class Selection(Checked):
     """The settings `dataset.stations`, `runs`, `min_rssi_db` and `max_rows`; None leaves everything in.
 
     Attributes:
@@ -41,24 +56,19 @@ class Selection:
         max_rows: largest number of rows (places of a wide file, links of a long one).
 
     Raises:
-        DataError: a setting that cannot be.
+        SettingError: a setting that cannot be.
     """
 
-    stations: Sequence[str | int] | None = None
-    runs: Sequence[str | int] | None = None
-    min_rssi_db: float | None = None
-    max_rows: int | None = None
+    stations: Sequence[str | int] | None = setting(None, NAMED)
+    runs: Sequence[str | int] | None = setting(None, NAMED)
+    min_rssi_db: float | None = setting(None, or_null(number(-math.inf)))
+    max_rows: int | None = setting(None, or_null(whole(FEWEST)))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("stations", "runs"):
-            given = getattr(self, name)
-            if given is not None:
-                object.__setattr__(self, name, _listed(name, given))
-        level, rows = self.min_rssi_db, self.max_rows
-        if level is not None and not (_is_number(level) and math.isfinite(level)):
-            raise DataError(f"dataset.min_rssi_db={level}: expected a level in dB, e.g. -75")
-        if rows is not None and not (isinstance(rows, int) and _is_number(rows) and rows >= FEWEST):
-            raise DataError(f"dataset.max_rows={rows}: expected a whole number, at least {FEWEST}")
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, tuple(_listed(getattr(self, name))))
 
 
 def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
@@ -68,14 +78,11 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
     notes: list[str] = []
-    steps: tuple[tuple[Callable[..., Noted], Any], ...] = (
-        *((keep_stations, selection.stations), (keep_runs, selection.runs)),
-        *((keep_above, selection.min_rssi_db), (keep_rows, selection.max_rows)),
-    )
-    for keep, setting in steps:
-        if setting is not None:
-            raw, said = keep(raw, setting, source)
-            notes += said
+    steps: tuple[Callable[..., Noted], ...] = (keep_stations, keep_runs, keep_above, keep_rows)
+    for keep, value in zip(steps, vars(selection).values(), strict=True):
+        if value is not None:
+            raw, more = keep(raw, value, source)
+            notes += more
     return Noted(raw, tuple(notes))
 
 
@@ -248,18 +255,6 @@ def _stations(raw: Raw, said: str, source: str | Path) -> int:
     if count is None:
         raise DataError(f"{said}: {source} has no stations; expected station_position")
     return count
-
-
-def _listed(name: str, given: Any) -> tuple[str | int, ...]:
-    """One name, or several, as a tuple."""
-    listed = (given,) if isinstance(given, str | int) else tuple(given)
-    if not listed or not all(isinstance(x, str | int) and not isinstance(x, bool) for x in listed):
-        raise DataError(f"dataset.{name}={given}: expected names, e.g. dataset.{name}=[A,B]")
-    return listed
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def parts_of(number: int, names: Sequence[str]) -> list[int]:

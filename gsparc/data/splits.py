@@ -13,12 +13,14 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError, nearest, reason
+from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
+from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 
 log = logging.getLogger(__name__)
 
 NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs")
+CORNERS = ("--", "-+", "+-", "++")
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
@@ -57,16 +59,27 @@ class Split:
 
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""
-        for number, fold in enumerate(self.folds):
+        for i, fold in enumerate(self.folds):
             if len(fold.train) < LEAST_ROWS or not len(fold.test):
                 raise DataError(
-                    f"split={self.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} "
+                    f"split={self.name}: fold {i} has {len(fold.train)} training and {len(fold.test)} "
                     f"test rows; at least {LEAST_ROWS} and 1 are needed"
                 )
 
 
+def _are_rows(given: Any) -> bool:
+    listed = given.tolist() if isinstance(given, np.ndarray) else given
+    if isinstance(listed, str) or not isinstance(listed, Sequence):
+        return isinstance(listed, str) and listed == "outliers"
+    return all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
+
+
+ROWS = Limit("outliers, or a list of rows like [3, 17],", _are_rows)
+KNOWN = Limit(f"one of {', '.join(NAMES)}, file", lambda name: name in NAMES, (*NAMES, "file"))
+
+
 @dataclass(frozen=True)
-class SplitSettings:
+class SplitSettings(Checked):
     """How to split; one instance of the config group `split`.
 
     Attributes:
@@ -90,53 +103,31 @@ class SplitSettings:
             are held out together, drawn by seed (0: each one in its turn).
     """
 
-    name: str = "random"
-    seed: int = 0
-    val_fraction: float = 0.1
-    test_fraction: float = 0.2
+    name: str = setting("random", KNOWN)
+    seed: int = setting(0, whole(0))
+    val_fraction: float = setting(0.1, number(0, 1, open_high=True))
+    test_fraction: float = setting(0.2, SHARE)
     redraw: bool = False
-    folds: int = 5
-    stretches_per_fold: int = 1
-    side_m: float | None = None
-    share: float = 0.2
-    buffer_m: float = 0.03
-    corner: str = "++"
-    train_fraction: float = 0.1
-    train_count: int | None = None
-    thin: float = 1.0
-    spacing_m: float | None = None
+    folds: int = setting(5, whole(2))
+    stretches_per_fold: int = setting(1, whole(1))
+    side_m: float | None = setting(None, or_null(POSITIVE))
+    share: float = setting(0.2, SHARE)
+    buffer_m: float = setting(0.03, number(0))
+    corner: str = setting("++", choice(*CORNERS))
+    train_fraction: float = setting(0.1, SHARE)
+    train_count: int | None = setting(None, or_null(whole(1)))
+    thin: float = setting(1.0, number(0, 1, open_low=True))
+    spacing_m: float | None = setting(None, or_null(POSITIVE))
     leave_out: Sequence[int] | Literal["outliers"] | int = ()
 
     def __post_init__(self) -> None:
-        if self.name not in NAMES:
-            hint = nearest(self.name, (*NAMES, "file"), 0.6)
-            raise DataError(f"split: {self.name!r} is none of {', '.join(NAMES)}, file{hint}")
-        if not isinstance(self.seed, int):
-            raise DataError(f"split.seed={self.seed}: a whole number is needed")
-        spacing, count = self.spacing_m, self.train_count
-        for key, good, expected in (
-            ("test_fraction", 0 < self.test_fraction < 1, "a share between 0 and 1"),
-            ("train_fraction", 0 < self.train_fraction < 1, "a share between 0 and 1"),
-            ("val_fraction", 0 <= self.val_fraction < 1, "a share from 0 to below 1"),
-            ("thin", 0 < self.thin <= 1, "a share above 0, at most 1"),
-            ("train_count", count is None or count >= 1, "at least 1 row"),
-            ("spacing_m", spacing is None or 0 < spacing < np.inf, "metres, above 0"),
-            ("side_m", self.side_m is None or 0 < self.side_m < np.inf, "metres, above 0"),
-            ("share", 0 < self.share < 1, "a share between 0 and 1"),
-            ("buffer_m", 0 <= self.buffer_m < np.inf, "metres, at least 0"),
-        ):
-            if not good:
-                raise DataError(f"split.{key}={getattr(self, key)}: expected {expected}")
+        super().__post_init__()
         if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
-            _check_rows(self.leave_out)
-        if self.folds < 2 or self.stretches_per_fold < 1:
-            raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
-        if len(self.corner) != 2 or set(self.corner) - set("+-"):
-            raise DataError(f"split.corner={self.corner!r}: expected one of --, -+, +-, ++")
+            ROWS.check("leave_out", self.leave_out)
 
 
 @dataclass(frozen=True)
-class FileSettings:
+class FileSettings(Checked):
     """The folds of an index file: the config group `split` with the name `file`.
 
     Attributes:
@@ -146,12 +137,12 @@ class FileSettings:
 
     name: str = "file"
     path: str = ""
-    leave_out: Sequence[int] | Literal["outliers"] = ()
+    leave_out: Sequence[int] | Literal["outliers"] = setting((), ROWS)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not isinstance(self.path, str | Path) or str(self.path) in ("", "???"):
             raise DataError("split.path is not set; say split.path=split.json for split=file")
-        _check_rows(self.leave_out)
 
 
 def make_split(
@@ -325,17 +316,6 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     return Split(name, folds, stored_hash)
 
 
-def _check_rows(given: Any) -> None:
-    """Refuse what `leave_out` cannot be (DataError)."""
-    listed = given.tolist() if isinstance(given, np.ndarray) else given
-    if isinstance(listed, str) or not isinstance(listed, Sequence):
-        good = isinstance(listed, str) and listed == "outliers"
-    else:
-        good = all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
-    if not good:
-        raise DataError(f"split.leave_out={given}: expected outliers, or numbers of rows like [3, 17]")
-
-
 def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.ndarray, np.ndarray]]:
     """Each fold tests on whole stretches of the path, training rows near them dropped."""
     order = path_order(positions)
@@ -395,8 +375,8 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     draw = np.random.default_rng(settings.seed).permutation(count)
     held = [draw[:together]] if together else [np.array([t]) for t in range(count)]
     folds = []
-    for number, test in enumerate(held):
-        rest = np.random.default_rng([settings.seed, number, 2]).permutation(
+    for fold, test in enumerate(held):
+        rest = np.random.default_rng([settings.seed, fold, 2]).permutation(
             np.setdiff1d(np.arange(count), test)
         )
         chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]

@@ -148,7 +148,7 @@ def test_bad_index_files_are_refused(tmp_path):
 @pytest.mark.parametrize(
     "settings, pattern",
     [
-        ({"name": "grouped", "folds": 1}, "folds of at least 2"),
+        ({"name": "grouped", "folds": 1}, "folds=1: a whole number of at least 2"),
         ({"name": "groupd"}, "did you mean 'grouped'"),
         ({"val_fraction": 1.0}, "val_fraction=1.0"),
         ({"test_fraction": 0.0}, "test_fraction=0.0"),

@@ -11,6 +11,7 @@ from gsparc.data.schema import ENDS, Measurements, Site
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.ops import SphereGrid
 
+TINY_DEGREES = 1.0  # a campaign's extent in degrees
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 
@@ -115,10 +116,12 @@ def _moving(data: Measurements) -> str:
 
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
-    site, ends = data.site, np.concatenate([data.tx, data.rx_position])
+    site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
     found = []
-    if site.georeference is None:  # degrees became metres: no unit to mistake
-        found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
+    if not np.ptp(data.moving, axis=0).any():
+        found = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
+    elif site.georeference is None:  # degrees became metres: no unit to mistake
+        found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3] + site.origin)
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
@@ -142,15 +145,27 @@ def suspicious_values(data: Measurements) -> list[str]:
 
 
 def _units(positions: np.ndarray) -> list[str]:
-    """Warnings that positions (n, 3) may not be metres."""
-    extent = np.ptp(positions, axis=0)
-    height, width = float(extent[2]), float(extent.max())
+    """Warnings that positions (n, 3), in the world, may not be metres."""
+    extent, middle = np.ptp(positions, axis=0), np.abs(np.median(positions[:, :2], axis=0))
+    height, width, across = float(extent[2]), float(extent.max()), float(extent[:2].max())
+    reach = np.abs(positions[:, :2]).max(axis=0)
+    on_earth = reach.max() <= 180 and reach.min() <= 90
+    if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
+        near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
+        return [
+            f"positions near {near} within {across:.2g}: degrees? then give them as latitude and longitude"
+        ]
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
         hint = f"if these are {unit}, the box is {size} m: convert to metres"
         far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
         return [f"{far}; {hint}"]
+    if across > 1000 and (positions % 1 == 0).all():
+        size = " x ".join(f"{e / 1000:.4g}" for e in extent)
+        return [
+            f"positions are whole numbers up to {across:.0f} apart: millimetres? the box is {size} m then"
+        ]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []

@@ -15,6 +15,7 @@ from gsparc.data.assemble import FARTHEST, bad_positions
 from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, Problems
+from gsparc.data.files import read_text
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
@@ -148,6 +149,55 @@ def write_split(folder: Path, count: int, seed: int, first: int = 0, form: str =
         np.savetxt(folder / f"{name}_index.txt", np.sort(rows), fmt=form)
 
 
+def read_split(
+    folder: Path, count: int | None, problems: Problems, first: int = 0
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """(train, test) rows from 0 that `train_index.txt` and `test_index.txt` name; None where there are none.
+
+    Args:
+        folder: of the release.
+        count: number of rows; None: unknown.
+        problems: takes what is wrong.
+        first: number of the first row in the files.
+    """
+    paths = [folder / "train_index.txt", folder / "test_index.txt"]
+    present = [path for path in paths if path.exists()]
+    if not present:
+        return None
+    if len(present) == 1:
+        absent = next(path for path in paths if path not in present)
+        return problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
+    train, test = (_read_index(path, count, problems, first) for path in paths)
+    if train is None or test is None:
+        return None
+    both = np.intersect1d(train, test)
+    problems.add_rows(paths[1], (f"index {i + first:05d}" for i in both), "also in train_index.txt")
+    return train, test
+
+
+def _read_index(path: Path, count: int | None, problems: Problems, first: int) -> np.ndarray | None:
+    """Rows (n,) from 0, sorted."""
+    text = problems.attempt(lambda: read_text(path, "missing"))
+    lines: dict[int, int] = {}  # in which each row was named first
+    for number, line in enumerate((text or "").split("\n"), start=1):
+        for word in line.split():
+            where, digits = f"{path}, line {number}", word.removesuffix(".png")
+            if not (digits.isascii() and digits.isdigit() and len(digits) <= LONGEST):
+                problems.add(where, f"expected the number of a row like {first:05d}, found {word!r}")
+            elif count is not None and not first <= int(digits) < count + first:
+                last = count + first - 1
+                problems.add(where, f"index {digits} is out of range; rows are {first} to {last}")
+            elif int(digits) - first in lines:
+                before = lines[int(digits) - first]
+                problems.add(where, f"index {digits} appears twice, first in line {before}")
+            else:
+                lines[int(digits) - first] = number
+    if text is not None and not lines:
+        return problems.add(path, "no usable index in it; expected one number of a row per line")
+    return np.sort(np.array(list(lines), dtype=np.int64)) if lines else None
+
+
+LONGEST = 18  # digits of an index
 REAL, COMPLEX, FLAGS, TEXT, LABELS = "iuf", "c", "biuf", "US", "USiu"  # kinds of NumPy's dtypes
 IN_WORDS = {
     REAL: "real numbers",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsparc.data.datasets.ble import raw_of_ble
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.datasets.newrf import is_newrf, read_newrf
+from gsparc.data.datasets.newrf import raw_of_newrf
 from gsparc.data.datasets.powder import raw_of_powder
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
@@ -56,6 +56,7 @@ LOADERS: dict[str, Callable[[Path], Raw]] = {
     "techtile": raw_of_techtile,
     "powder": raw_of_powder,
     "ble": raw_of_ble,
+    "newrf": raw_of_newrf,
 }
 PLANE = 2  # coordinates of places in POWDER's files
 
@@ -68,7 +69,7 @@ def campaign_of(raw: Raw) -> str | None:
     if {"mobile_position", "rssi_db"} <= set(held):
         flat = held["mobile_position"].ndim == 2 and held["mobile_position"].shape[1] == PLANE
         return "powder" if flat else "ble"
-    return None
+    return "newrf" if {"tx_pos", "rx_pos"} <= set(held) else None
 
 
 def read_any(
@@ -97,7 +98,7 @@ def read_any(
     campaign = campaign_of(raw)
     if campaign is not None:
         raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
-    reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+    reading = interpret(raw, path)
     return Reading(reading.data, (*notes, *reading.notes))
 
 

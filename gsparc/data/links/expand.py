@@ -303,11 +303,9 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
         check.refuse(names[1], f"{len(longitude)} values for {len(latitude)} latitudes")
         return np.zeros(0), np.zeros(0)
     absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
-    for row in np.flatnonzero(~absent).tolist() if bad_degrees(latitude, longitude) else ():
-        fault = bad_degrees(latitude[row], longitude[row])
-        if fault:
-            check.refuse(names[0], f"row {row}: {fault}")
-            break
+    fault = bad_degrees(*np.where(absent, 0, (latitude, longitude)))
+    if fault:
+        check.refuse(names[0], "row {}: {}".format(*fault))
     none = (latitude == 0) & (longitude == 0)
     # (0, 0) is a place, too, for who measures there.
     if none.any() and max(abs(np.median(latitude)), abs(np.median(longitude))) > 1:

@@ -192,7 +192,8 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     for i, head in enumerate(heads):
         if head and head in heads[:i]:
             where = f"columns {heads.index(head) + 1} and {i + 1}"
-            raise DataError(f"{source}: {where} are both named {head!r}; rename one")
+            hint = "; is there no line of heads?" if _is_number(head) else "; rename one"
+            raise DataError(f"{source}: {where} are both named {head!r}{hint}")
     if not rows:
         raise DataError(f"{source}: line {min(lines)} names columns, but there are no rows below it")
     frame = pd.DataFrame(rows, dtype=object)
