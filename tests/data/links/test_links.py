@@ -16,6 +16,7 @@ RNG = np.random.default_rng(0)
 WALK = RNG.uniform(0, 20, (PLACES, 3))
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
 LEVELS = RNG.uniform(-90, -40, (PLACES, STATIONS))
+LONG = {"tx_position": np.repeat(WALK, STATIONS, axis=0), "station": np.tile(np.arange(STATIONS), PLACES)}
 
 
 def town(**changes):
@@ -47,9 +48,7 @@ def test_a_wide_file_is_a_row_for_each_link():
 
 
 def test_a_long_file_is_the_same_measurements():
-    which = np.tile(np.arange(STATIONS), PLACES)
-    long = town(tx_position=np.repeat(WALK, STATIONS, axis=0), rssi_db=LEVELS.reshape(-1), station=which)
-    one, other = read(long).data, read(town()).data
+    one, other = read(town(**LONG, rssi_db=LEVELS.reshape(-1))).data, read(town()).data
     np.testing.assert_array_equal(one.station, other.station)
     np.testing.assert_array_equal(one.target, other.target)
     first = np.unique(one.place, return_index=True)[1]
@@ -178,11 +177,9 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("case", SPOILT)
-def test_what_is_wrong_is_one_line(case):
-    arrays, words = SPOILT[case]
-    with pytest.raises(DataError, match=words) as refused:
-        read(arrays)
-    assert "\n" not in str(refused.value)
+def test_what_is_wrong_is_one_line(refused, case):
+    arrays, says = SPOILT[case]
+    refused(says, read, arrays)
 
 
 def test_hdf5_and_npz_alike(tmp_path):
@@ -228,22 +225,38 @@ def test_degrees_that_are_none_are_one_line(case):
     assert "\n" not in str(refused.value)
 
 
-def test_messages_name_the_rows_of_the_file():
+def changed(array, *changes):
+    """The array with other values at some indices."""
+    array = array.copy()
+    for index, value in changes:
+        array[index] = value
+    return array
+
+
+OF_ROWS = [
+    (
+        {
+            "rx_position": WALK,
+            "tx_position": POSTS[0],
+            "rssi_db": changed(LEVELS[:, 0], (3, np.nan), (7, np.inf)),
+        },
+        "rssi_db, row 7: not finite",
+    ),
+    (
+        town(**LONG, rssi_db=changed(LEVELS.reshape(-1), (17, np.inf))),
+        "rssi_db, row 17, station roof: not finite",
+    ),
+    (
+        town(rssi_db=changed(LEVELS, ((4, 1), -120)), sensitivity_db=np.array(-100.0)),
+        "row 4, station east: rssi_db is -120, below -100",
+    ),
+]
+
+
+@pytest.mark.parametrize(("arrays", "says"), OF_ROWS)
+def test_messages_name_the_rows_of_the_file(refused, arrays, says):
     """Rows were counted after those without a value were gone, or places, or links were."""
-    one = {"rx_position": WALK, "tx_position": POSTS[0]}
-    levels_db = LEVELS[:, 0].copy()
-    levels_db[[3, 7]] = np.nan, np.inf
-    with pytest.raises(DataError, match="rssi_db, row 7: not finite"):
-        read({**one, "rssi_db": levels_db})
-    walk, which = np.repeat(WALK, STATIONS, axis=0), np.tile(np.arange(STATIONS), PLACES)
-    levels_db = LEVELS.reshape(-1).copy()
-    levels_db[17] = np.inf
-    with pytest.raises(DataError, match="rssi_db, row 17, station roof: not finite"):
-        read(town(tx_position=walk, station=which, rssi_db=levels_db))
-    levels_db = LEVELS.copy()
-    levels_db[4, 1] = -120
-    with pytest.raises(DataError, match="row 4, station east: rssi_db is -120, below -100"):
-        read(town(rssi_db=levels_db, sensitivity_db=np.array(-100.0)))
+    refused(says, read, arrays)
 
 
 def test_rows_keep_their_numbers_when_a_part_is_taken():
@@ -270,11 +283,10 @@ def test_powers_of_zero_raise_a_warning():
     assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in suspicious_values(data)[0]
 
 
-def test_nothing_heard_in_any_row_was_zero_everywhere():
+def test_nothing_heard_in_any_row_was_zero_everywhere(refused):
     """It said that every measured value is zero."""
     arrays = {"rx_position": np.eye(3) * 4, "rssi_db": np.full(3, np.nan), "sensitivity_db": np.array(-100.0)}
-    with pytest.raises(DataError, match="rssi_db: nothing was heard in any row"):
-        interpret(Raw(arrays), "drive")
+    refused("rssi_db: nothing was heard in any row", read, arrays)
 
 
 @pytest.mark.parametrize("what", ["masked", "dark"])
