@@ -107,14 +107,13 @@ TECHTILE = {
 }
 
 
-@EVERY_KIND
 @pytest.mark.parametrize("case", TECHTILE)
-def test_spoilt_techtile_releases(tmp_path, refused, kind, case):
+def test_spoilt_techtile_releases(tmp_path, refused, case):
     change, says = TECHTILE[case]
     variables = {
         name: value for name, value in {**release_variables(), **change}.items() if value is not None
     }
-    refused(says, raw_of_techtile, write_release(tmp_path, kind, variables))
+    refused(says, raw_of_techtile, write_release(tmp_path, variables=variables))
 
 
 ONE_CHANNEL, NAN_CHANNEL = "channels: [{x: 1, y: 2, z: 3}]", "channels: {1: {x: .nan, y: 2, z: 3}}"
@@ -383,15 +382,6 @@ def test_techtile_is_links_to_antennas(tmp_path, caplog):
     runs = arrays["run"][data.place]
     assert len(set(zip(runs, data.run, strict=True))) == 2
     assert "1 of 15 cycles left out: no position" in caplog.text
-
-
-def test_one_run_of_techtile(tmp_path, caplog):
-    settings = {"file": str(write_release(tmp_path)), "runs": ["EXP005"], "stations": ["B05", "A05"]}
-    with caplog.at_level(logging.WARNING):
-        data = load({"name": "techtile", **settings})
-    assert data.site.stations.name == ("A05", "B05") and len(data) == 2 * CYCLES - 1
-    assert "dataset.runs=EXP005: 6 of 14 rows left out" in caplog.text
-    assert "dataset.stations: 1 of 3 stations left out" in caplog.text
 
 
 @pytest.mark.parametrize("form", ["npz", "csv"])
