@@ -391,6 +391,16 @@ FIELDS: dict[str, Field] = {
     ]
 }
 
+# Kinds of NumPy's dtypes that an array may be of, and how messages call them; arrays are real otherwise.
+REAL, WHOLE, COMPLEX, FLAGS, TEXT, LABELS, POWER = "iuf", "iu", "c", "biuf", "US", "USiu", "uf"
+KIND_WORDS = {
+    **{REAL: "real numbers", WHOLE: "whole numbers", COMPLEX: "complex numbers", FLAGS: "True and False"},
+    **{TEXT: "text", LABELS: "text or whole numbers", POWER: "uint8 or floating point numbers"},
+}
+KINDS = {
+    **{"spectrum": POWER, "csi": COMPLEX, "mask": FLAGS, "run": LABELS, "station": WHOLE},
+    **dict.fromkeys(("path_offsets", "split_train", "split_test"), WHOLE),
+}
 MEASUREMENTS = ("spectrum", "csi", "rssi", "rssi_db")
 NORMALISATIONS = ("max", "minmax", "power", "none")
 

@@ -18,7 +18,7 @@ from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import KIND_WORDS, REAL, Measurements
 from gsparc.data.selection import Selection, rows_by_station, select, split_stations
 
 log = logging.getLogger(__name__)
@@ -198,14 +198,6 @@ def _read_index(path: Path, count: int | None, problems: Problems, first: int) -
 
 
 LONGEST = 18  # digits of an index
-REAL, COMPLEX, FLAGS, TEXT, LABELS = "iuf", "c", "biuf", "US", "USiu"  # kinds of NumPy's dtypes
-IN_WORDS = {
-    REAL: "real numbers",
-    COMPLEX: "complex numbers",
-    FLAGS: "True and False",
-    TEXT: "text",
-    LABELS: "text or whole numbers",
-}
 
 
 @dataclass(frozen=True)
@@ -214,7 +206,7 @@ class Expected:
 
     Attributes:
         shape: per axis a size, or a letter that stands for the same size in all arrays.
-        kinds: allowed kinds of NumPy's dtypes, one of those above.
+        kinds: allowed kinds of NumPy's dtypes, a key of `KIND_WORDS`.
         place: whether rows are coordinates [m], all of which must be finite and on Earth.
         optional: whether the array may be absent.
         field: of the schema that it is read as; None: the one of its name.
@@ -239,9 +231,9 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
         where, array = f"{source}, {name}", raw.arrays.get(name)
         if array is None:
             if not expected.optional:
-                problems.add(where, f"missing; expected {IN_WORDS[expected.kinds]} {_text(expected.shape)}")
+                problems.add(where, f"missing; expected {KIND_WORDS[expected.kinds]} {_text(expected.shape)}")
         elif array.dtype.kind not in expected.kinds:
-            problems.add(where, f"expected {IN_WORDS[expected.kinds]}, found dtype {array.dtype}")
+            problems.add(where, f"expected {KIND_WORDS[expected.kinds]}, found dtype {array.dtype}")
         elif not _fits(array.shape, expected.shape, sizes):
             problems.add(where, _misfit(array.shape, expected.shape, sizes))
         else:

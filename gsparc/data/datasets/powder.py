@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
 from gsparc.data.errors import DataError, Problems, shortened
 from gsparc.data.files import read_text
 from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw, read_raw
+from gsparc.data.schema import TEXT
 
 CARRIER_HZ = 462.7e6
 NO_VALUE_DB = -101.0

@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import COMPLEX, FLAGS, LABELS, TEXT, Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
 from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf, read_raw
+from gsparc.data.schema import COMPLEX, FLAGS, LABELS, TEXT
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
 CHANNEL = 1  # of the two antennas of a tile, the one that received

@@ -238,11 +238,9 @@ def _heights(check: Checker) -> bool:
 
 def _run(check: Checker, rows: int) -> np.ndarray | None:
     """(S,) int64, the number of each row's run; runs may have names."""
-    given = check.raw.arrays.get("run")
-    if given is None or not check.fits("run", given, (rows,)):
+    given = check.array("run", (rows,))
+    if given is None:
         return None
-    if given.dtype.kind not in "iuUS":
-        return check.refuse("run", f"expected names or numbers of runs, found dtype {given.dtype}")
     check.raw.arrays.pop("run")
     return np.unique(given, return_inverse=True)[1].reshape(-1).astype(np.int64)
 

@@ -153,7 +153,7 @@ def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
 
 SPOILT = {
     "station out of range": (town(station=np.full(PLACES, 3), rssi_db=LEVELS[:, 0]), "row 0 is of station 3"),
-    "station by name": (town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]), "numbers of stations"),
+    "station by name": (town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]), "expected whole numbers"),
     "columns": (town(rssi_db=LEVELS[:, :2]), r"expected shape \(S, 3, ...\), a column for each station"),
     "names": (town(station_name=np.array(["a", "a", "b"])), "'a' twice"),
     "fewer names": (town(station_name=np.array(["a", "b"])), r"station_name: expected shape \(T,\)"),
@@ -173,7 +173,7 @@ SPOILT = {
         town(tx_position=None, rx_position=WALK, station_orientation=np.eye(4)[:3]), "are not turned",
     ),
     "orientation": (town(station_orientation=np.ones((3, 4))), "row 0: expected a quaternion"),
-    "runs of floats": (town(run=np.zeros(PLACES)), "run: expected names or numbers"),
+    "runs of floats": (town(run=np.zeros(PLACES)), "run: expected text or whole numbers"),
     "mask of another shape": (town(mask=np.ones(PLACES, bool)), "mask: expected shape"),
     "NaN under a mask": (town(rssi_db=LEVELS * np.nan, mask=np.ones_like(LEVELS, bool)), "not finite"),
     "carriers in MHz": (town(carrier_hz=np.array([460.0, 461, 462])), r"expected Hz"),
