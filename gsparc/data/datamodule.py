@@ -144,8 +144,8 @@ class DataModule(pl.LightningDataModule, ABC):
     def measurements(self) -> Measurements:
         """All measurements, read when first asked for; rows far beyond all others are warned of."""
         data = self.load()
-        for said in outliers.warnings(data):
-            log.warning("%s: %s", self.name, said)
+        for warning in outliers.warnings(data):
+            log.warning("%s: %s", self.name, warning)
         return data
 
     def use(self, fold: Fold, seed: int = 0) -> Self:

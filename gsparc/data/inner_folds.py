@@ -209,8 +209,8 @@ def _drawn(
     first, *rest = {fold.test.tobytes(): fold for fold in drawn}.values()
     chosen = [first]
     while rest and len(chosen) < count:
-        seen = np.concatenate([fold.test for fold in chosen])
-        shared = [float(np.isin(fold.test, seen).mean()) for fold in rest]
+        tested = np.concatenate([fold.test for fold in chosen])
+        shared = [float(np.isin(fold.test, tested).mean()) for fold in rest]
         chosen.append(rest.pop(int(np.argmin(shared))))
     return tuple(chosen)
 

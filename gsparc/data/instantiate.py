@@ -68,8 +68,8 @@ def refuse_foreign(path: Any) -> None:
         ValueError: it is none.
     """
     ours = isinstance(path, str) and path.startswith("gsparc.")
-    found = find(path) if ours else None
-    if isinstance(found, type) and found.__module__.startswith("gsparc."):
+    target = find(path) if ours else None
+    if isinstance(target, type) and target.__module__.startswith("gsparc."):
         return  # before plugins are looked for: that reads the notes of all installed packages
     if not any(path in plugins(group).values() for group in GROUPS):
         raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")
@@ -86,11 +86,11 @@ def plugins(group: str) -> dict[str, str]:
 
 def settings_of(kind: type) -> dict[str, Any]:
     """What `kind.__init__` takes, with its defaults; `???` where there is none, classes left out."""
-    taken = inspect.signature(kind).parameters.values()
-    named = [p for p in taken if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-    found = {p.name: "???" if p.default is p.empty else p.default for p in named}
+    parameters = inspect.signature(kind).parameters.values()
+    named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    settings = {p.name: "???" if p.default is p.empty else p.default for p in named}
     return {
         name: list(v) if isinstance(v, tuple) else v
-        for name, v in found.items()
+        for name, v in settings.items()
         if isinstance(v, (*PLAIN, tuple))
     }

@@ -254,11 +254,11 @@ def _rows(
     values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
 ) -> np.ndarray:
     """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
-    found = []
+    flags = []
     for part in blocks(values):
         passed = test(values[part]) if mask is None else test(values[part]) & mask[part]
-        found.append(passed.reshape(len(passed), -1).any(1))
-    return np.concatenate(found)
+        flags.append(passed.reshape(len(passed), -1).any(1))
+    return np.concatenate(flags)
 
 
 def _infinite(values: np.ndarray) -> np.ndarray:

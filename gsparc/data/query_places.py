@@ -64,9 +64,9 @@ def read_query_places(
     try:
         if is_table(path):
             return _of_table(path, moving, columns)
-        told = [name for name, value in columns.items() if value is not None]
-        if told:
-            raise DataError(f"columns.{told[0]}: goes with tables (*.csv, *.parquet), not with {path}")
+        named = [name for name, value in columns.items() if value is not None]
+        if named:
+            raise DataError(f"columns.{named[0]}: goes with tables (*.csv, *.parquet), not with {path}")
         return _of_arrays(read_raw(path), str(path), moving)
     except DataError as error:
         # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
@@ -145,9 +145,9 @@ def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
 
 def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     check = Checker(raw, source)
-    found = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
+    given = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
     check.problems.raise_if_any()
-    ends: dict[End, Places] = {end: where for end, where in found.items() if where is not None}
+    ends: dict[End, Places] = {end: where for end, where in given.items() if where is not None}
     count = {end: len(where.across) for end, where in ends.items()}
     if len(set(count.values())) > 1:
         raise DataError(f"{source}: {count['tx']} places of the transmitter, {count['rx']} of the receiver")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.blocks import taken
+from gsparc.data.blocks import take
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
@@ -100,16 +100,16 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     numbers = [known_station(w, names, count, f"dataset.stations={w}", source) for w in stations]
     chosen = np.unique([part for number in numbers for part in parts_of(number, names)])
     note = f"dataset.stations: {count - len(chosen)} of {count} stations left out"
-    kept = take_stations(raw, chosen, source)
-    kept.arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
-    if "station" in kept.arrays:
+    part = take_stations(raw, chosen, source)
+    part.arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
+    if "station" in part.arrays:
         of_row = raw.arrays["station"]
         rows = np.flatnonzero(np.isin(of_row, chosen))
         _left(rows, "dataset.stations", source)
-        kept = take_rows(kept, rows, source)
-        kept.arrays["station"] = np.searchsorted(chosen, of_row[rows])
+        part = take_rows(part, rows, source)
+        part.arrays["station"] = np.searchsorted(chosen, of_row[rows])
         note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
-    return Noted(kept, (note,))
+    return Noted(part, (note,))
 
 
 def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
@@ -134,9 +134,9 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     Raises:
         DataError: the file holds no powers, or none is left.
     """
-    name, said = _measurement(raw, source), f"dataset.min_rssi_db={min_rssi_db:g}"
+    name, option = _measurement(raw, source), f"dataset.min_rssi_db={min_rssi_db:g}"
     if name not in ("rssi", "rssi_db"):
-        raise DataError(f"{said}: {source} holds {name}; expected powers, rssi or rssi_db")
+        raise DataError(f"{option}: {source} holds {name}; expected powers, rssi or rssi_db")
     values = raw.arrays[name]
     with np.errstate(divide="ignore", invalid="ignore"):
         low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
@@ -145,11 +145,11 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
         raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {given.shape}")
     low &= True if given is None else given.astype(bool)
     if low.ndim == 1:
-        return _kept(raw, ~low, said, source)
+        return _kept(raw, ~low, option, source)
     measured = ~low & measured_links(raw, source)
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
-    links = (f"{said}: {int(low.sum())} links left out",) if low.any() else ()
-    rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), said, source)
+    links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
+    rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
     return Noted(rest.raw, (*links, *rest.notes))
 
 
@@ -196,16 +196,16 @@ def rows_of(
 
     Rows that a split names and that there are not are left for whoever reads the split to refuse.
     """
-    found = dict(arrays)
+    selected = dict(arrays)
     for name, array in arrays.items():
         if _per_row(name, array, stations) and array.ndim and len(array) == count:
-            found[name] = taken(array, rows)
+            selected[name] = take(array, rows)
         elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
             order = np.argsort(rows, kind="stable")
             first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
             outside = array[(array < 0) | (array >= count)]
-            found[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
-    return found
+            selected[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
+    return selected
 
 
 def take_stations(raw: Raw, stations: np.ndarray, source: str | Path) -> Raw:
@@ -250,10 +250,10 @@ def station_count(raw: Raw) -> int | None:
     return None
 
 
-def _stations(raw: Raw, said: str, source: str | Path) -> int:
+def _stations(raw: Raw, option: str, source: str | Path) -> int:
     count = station_count(raw)
     if count is None:
-        raise DataError(f"{said}: {source} has no stations; expected station_position")
+        raise DataError(f"{option}: {source} has no stations; expected station_position")
     return count
 
 
@@ -264,7 +264,9 @@ def parts_of(number: int, names: Sequence[str]) -> list[int]:
     return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
 
 
-def known_station(wanted: str | int, names: Sequence[str], count: int, said: str, source: str | Path) -> int:
+def known_station(
+    wanted: str | int, names: Sequence[str], count: int, option: str, source: str | Path
+) -> int:
     """`station_number`; the setting `said` is named in errors.
 
     Raises:
@@ -274,15 +276,15 @@ def known_station(wanted: str | int, names: Sequence[str], count: int, said: str
     if number is not None:
         return number
     if not names or (isinstance(wanted, int) and not any(name.isdigit() for name in names)):
-        raise DataError(f"{said}: {source} has stations 0 to {count - 1}")
-    raise DataError(f"{said}: no station {wanted} in {source}{suggest(str(wanted), names)}")
+        raise DataError(f"{option}: {source} has stations 0 to {count - 1}")
+    raise DataError(f"{option}: no station {wanted} in {source}{suggest(str(wanted), names)}")
 
 
 def _measurement(raw: Raw, source: str | Path) -> str:
-    held, named = [n for n in MEASUREMENTS if n in raw.arrays], raw.attributes.get("measurement")
-    if not held:
+    present, named = [n for n in MEASUREMENTS if n in raw.arrays], raw.attributes.get("measurement")
+    if not present:
         raise DataError(f"{source}: expected one of {', '.join(MEASUREMENTS)}; found none of them")
-    return str(named) if named in held else held[0]
+    return str(named) if named in present else present[0]
 
 
 def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
@@ -320,27 +322,27 @@ def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[s
         raise DataError(f"{source}, path_offsets: expected {count + 1} whole numbers, found {offsets.shape}")
     offsets = offsets.astype(np.int64)
     lengths = np.diff(offsets).clip(0)[rows]
-    found = {"path_offsets": np.concatenate([[0], np.cumsum(lengths)])}
+    parts = {"path_offsets": np.concatenate([[0], np.cumsum(lengths)])}
     for name in PATH_AXES:
         if name in raw.arrays:
             if len(raw.arrays[name]) != offsets[-1]:
                 raise DataError(f"{source}, {name}: expected {offsets[-1]} paths as path_offsets says")
-            found[name] = raw.arrays[name][_runs(offsets[rows], lengths)]
-    return found
+            parts[name] = raw.arrays[name][_runs(offsets[rows], lengths)]
+    return parts
 
 
-def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Noted:
+def _kept(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
     rows = np.flatnonzero(keep)
-    _left(rows, said, source)
+    _left(rows, option, source)
     if len(rows) == len(keep):
         return Noted(raw)
-    note = f"{said}: {len(keep) - len(rows)} of {len(keep)} rows left out"
+    note = f"{option}: {len(keep) - len(rows)} of {len(keep)} rows left out"
     return Noted(take_rows(raw, rows, source), (note,))
 
 
-def _left(rows: np.ndarray, said: str, source: str | Path) -> None:
+def _left(rows: np.ndarray, option: str, source: str | Path) -> None:
     if len(rows) < FEWEST:
-        raise DataError(f"{said}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
+        raise DataError(f"{option}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
 
 
 def rows_by_station(given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -349,7 +351,7 @@ def rows_by_station(given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     Raises:
         DataError: what it holds is not lists of rows.
     """
-    found = {}
+    steps = {}
     for station, firsts in given.items():
         rows = (firsts,) if isinstance(firsts, int) else firsts
         good = isinstance(rows, Sequence) and not isinstance(rows, str) and len(rows) > 0
@@ -357,8 +359,8 @@ def rows_by_station(given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
             raise DataError(
                 f"dataset.level_steps.{station}={firsts}: expected first rows after steps, like [1162]"
             )
-        found[str(station)] = tuple(rows)
-    return found
+        steps[str(station)] = tuple(rows)
+    return steps
 
 
 def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | Path) -> Raw:
@@ -379,12 +381,12 @@ def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | P
 
 
 def _split(raw: Raw, station: str, first: int, source: str | Path) -> Raw:
-    rows, said = row_count(raw, source), f"dataset.level_steps.{station}={first}"
-    count = _stations(raw, said, source)
+    rows, option = row_count(raw, source), f"dataset.level_steps.{station}={first}"
+    count = _stations(raw, option, source)
     if not 0 < first < rows:
-        raise DataError(f"{said}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
+        raise DataError(f"{option}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
     names = [str(name) for name in raw.arrays.get("station_name", np.arange(count)).ravel()]
-    number = known_station(station, names, count, said, source)
+    number = known_station(station, names, count, option, source)
     last = parts_of(number, names)[-1]  # later steps divide the part after earlier ones
     doubled = np.array([*range(count), last])
     raw = replace(raw, arrays={**raw.arrays, "station_name": np.array(names)})

@@ -168,21 +168,22 @@ def make_split(
     """
     rows, left = len(positions), settings.leave_out
     absent = np.zeros(0, np.int64) if isinstance(left, int) else left_out(left, outliers, rows)
-    kept = np.setdiff1d(np.arange(rows), absent)
-    first = which = np.arange(len(kept))  # of the rows that stand for their places, and the place of each row
+    rows_left = np.setdiff1d(np.arange(rows), absent)
+    # Of the rows that stand for their places, and the place of each row.
+    first = which = np.arange(len(rows_left))
     if settings.name in ("stations", "runs"):
-        found = _whole(None if station is None else station[kept], settings)
+        found = _whole(None if station is None else station[rows_left], settings)
     else:
         named = release_split if settings.name == "random" and not settings.redraw else None
         if named is not None:
-            train, test = (np.searchsorted(kept, np.intersect1d(part, kept)) for part in named)
+            train, test = (np.searchsorted(rows_left, np.intersect1d(part, rows_left)) for part in named)
             named = train, test
         elif place is not None:
-            _, first, which = np.unique(place[kept], return_index=True, return_inverse=True)
-        where = positions[kept][first]
+            _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
+        where = positions[rows_left][first]
         pairs = enumerate(_pairs(where, settings, named))
         found = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
-    folds = tuple(fold.each(lambda part: kept[np.isin(which.reshape(-1), part)]) for fold in found)
+    folds = tuple(fold.each(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in found)
     return Split(settings.name, folds, indices_hash(folds))
 
 
@@ -257,12 +258,12 @@ def far_from(
 def far_apart(positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int]) -> np.ndarray:
     """A largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m]."""
     tree, free = cKDTree(positions[rows]), np.ones(len(rows), dtype=bool)
-    kept = []
+    subset = []
     for i in np.random.default_rng(seed).permutation(len(rows)):
         if free[i]:
-            kept.append(i)
+            subset.append(i)
             free[tree.query_ball_point(positions[rows[i]], distance)] = False
-    return rows[np.sort(kept)]
+    return rows[np.sort(subset)]
 
 
 def indices_hash(folds: tuple[Fold, ...]) -> str:
@@ -373,9 +374,9 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
         remain = "two at least must remain" if least == 2 else "one must remain"
         raise DataError(f"split={name}: {count} {name}; {remain} to learn from and to choose on")
     draw = np.random.default_rng(settings.seed).permutation(count)
-    held = [draw[:together]] if together else [np.array([t]) for t in range(count)]
+    test_units = [draw[:together]] if together else [np.array([t]) for t in range(count)]
     folds = []
-    for fold, test in enumerate(held):
+    for fold, test in enumerate(test_units):
         rest = np.random.default_rng([settings.seed, fold, 2]).permutation(
             np.setdiff1d(np.arange(count), test)
         )

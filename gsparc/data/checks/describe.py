@@ -29,7 +29,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("moves", _moving(data)),
         ("neighbours", neighbours(places_of(data), site.wavelength)),
         *(("units?", hint) for hint in suspicious_values(data)),
-        *(("outliers?", said) for said in outliers.warnings(data)),
+        *(("outliers?", warning) for warning in outliers.warnings(data)),
         ("carrier", carrier),
     ]
     if tones is not None and len(tones) > 1:
@@ -117,31 +117,31 @@ def _moving(data: Measurements) -> str:
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
-    found = []
+    hints = []
     if not np.ptp(data.moving, axis=0).any():
-        found = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
+        hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is None:  # degrees became metres: no unit to mistake
-        found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3] + site.origin)
+        hints = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3] + site.origin)
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
             waves = f"{reach / site.wavelength:.3g} wavelengths"
-            found.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
+            hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
     if site.grid is not None:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         if abs(turn / (2 * np.pi) - 1) < 0.02:
-            found.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
+            hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
     if site.kind == "rssi" and (data.target == 0).any():
         count = int((data.target == 0).sum())
-        found.append(
+        hints.append(
             f"{count} powers are exactly 0, learned as -300 dB: not heard? make them NaN, or give "
             "rssi_db and sensitivity_db"
         )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
         if 0 < spread < 0.1:
-            found.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
-    return found
+            hints.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
+    return hints
 
 
 def _units(positions: np.ndarray) -> list[str]:

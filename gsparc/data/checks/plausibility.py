@@ -58,34 +58,38 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     if not np.ptp(values):
         return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
     marks = _marks(values)
-    found = _said_of(marks, values)
+    warnings = _mark_warnings(marks, values)
     for mark, _ in marks:
         values = values[values != mark]
     low, high = float(values.min()), float(values.max())
     if low >= 0 and high <= 1:
-        found.append(f"all levels lie between {low:g} and {high:g}: linear power? then give it as rssi, in W")
+        warnings.append(
+            f"all levels lie between {low:g} and {high:g}: linear power? then give it as rssi, in W"
+        )
     elif high > HIGHEST_DBM and low >= 0:
-        found.append(
+        warnings.append(
             f"levels from {low:g} to {high:g} are all positive: losses, percent, or linear? expected dBm"
         )
     elif high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
-        found.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
+        warnings.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
     elif low >= 0 and (values % 1 == 0).all():
-        found.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
-    return found
+        warnings.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
+    return warnings
 
 
-def _said_of(marks: list[tuple[float, bool]], values: np.ndarray) -> list[str]:
-    said = []
+def _mark_warnings(marks: list[tuple[float, bool]], values: np.ndarray) -> list[str]:
+    warnings = []
     for mark, apart in marks:
         count, shown = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
         share = f"{count} of {len(values)} levels are exactly {shown}"
         if apart:
-            said.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
+            warnings.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
         else:
-            said.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={shown}")
-    return said
+            warnings.append(
+                f"{share}, the least: not heard? leave them empty and give sensitivity_db={shown}"
+            )
+    return warnings
 
 
 def _marks(values: np.ndarray) -> list[tuple[float, bool]]:
@@ -93,14 +97,14 @@ def _marks(values: np.ndarray) -> list[tuple[float, bool]]:
     different, counts = np.unique(values, return_counts=True)
     if len(different) < 4:
         return []
-    found = []
+    marks = []
     for i, inner in ((0, 1), (len(different) - 1, len(different) - 2)):
         distance = abs(different[i] - different[inner])
         apart = distance > 20 and distance > 0.3 * abs(different[-2] - different[1]) and counts[i] >= 3
         pile = i == 0 and counts[0] > max(0.05 * len(values), 5 * float(np.median(counts)), 10)
         if apart or pile:
-            found.append((float(different[i]), bool(apart)))
-    return found
+            marks.append((float(different[i]), bool(apart)))
+    return marks
 
 
 def direction_warnings(levels: LinkLevels) -> list[str]:
@@ -133,27 +137,27 @@ def copies(levels: LinkLevels) -> list[str]:
     table = pd.DataFrame({"link": where, "level": levels.level_db, "row": range(len(rows))})
     table = table[np.isfinite(table["level"])].sort_values("link", kind="stable")
     first = table.groupby(["link", "level"])["row"].transform("first")
-    found = []
+    warnings = []
     same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        found.append(f"copies (same place, station and level): {some(same)}; leave them out")
+        warnings.append(f"copies (same place, station and level): {some(same)}; leave them out")
     spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
     if len(spreads):
-        found.append(
+        warnings.append(
             f"{len(spreads)} places were measured more than once by one station, with different levels "
             f"(standard deviation {spreads.median():.2g} dB, median)"
         )
-    return found
+    return warnings
 
 
 def wild_rows(levels: LinkLevels) -> list[str]:
     """Single rows whose level is far from those of the rows before and after them at the same station."""
-    found = []
+    warnings = []
     for t, bad, most in wild_of(levels):
         where = f"station {levels.names[t]}: " if len(levels.names) > 1 else ""
         rows = some([levels.rows[i] for i in bad])
-        found.append(f"{where}{rows}: up to {most:.0f} dB from the rows around; wrong?")
-    return found
+        warnings.append(f"{where}{rows}: up to {most:.0f} dB from the rows around; wrong?")
+    return warnings
 
 
 def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
@@ -176,7 +180,7 @@ def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
 
 def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Stations whose level changes at a row though the places do not explain it (`level_steps`)."""
-    names, rows, found = levels.names, levels.rows, []
+    names, rows, warnings = levels.names, levels.rows, []
     for t, step in steps:
         who = f"station {names[t]}" if len(names) > 1 else "the level"
         verb = "rises" if step.change_db > 0 else "falls"
@@ -184,17 +188,17 @@ def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -
         what, _, number = after.partition(" ")
         named = what == "row" and number.isdigit() and len(names) > 1
         setting = f"{{{names[t]}:[{number}]}}" if named else "{STATION:[ROW]}"
-        found.append(
+        warnings.append(
             f"{who} {verb} by {abs(step.change_db):.0f} dB between {before} and {after}, which the places do "
             f"not explain: another gain or antenna? dataset.level_steps={setting} makes it another station "
             "from there on"
         )
-    return found
+    return warnings
 
 
 def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     """Stations and their steps, which name rows of `levels`."""
-    found = []
+    steps = []
     stations = np.unique(levels.station)
     blocks = int(np.clip(20 * MOST_BLOCKS / len(stations), 200, MOST_BLOCKS)) if len(stations) else 0
     for t in stations:
@@ -202,8 +206,8 @@ def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
         where = None if levels.station_position is None else levels.station_position[t]
         where = where if where is not None and np.isfinite(where).all() else None
         for step in level_steps(levels.position[used], levels.level_db[used], where, blocks):
-            found.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
-    return found
+            steps.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
+    return steps
 
 
 def gaps(levels: LinkLevels) -> list[str]:
@@ -247,27 +251,27 @@ def gaps(levels: LinkLevels) -> list[str]:
             faint.append((str(names[t]), scattered, float(level[~missing].min())))
         elif scattered:
             plain.append((str(names[t]), scattered))
-    found = [
+    warnings = [
         f"no level in the {lengths[key]} rows from {key[0]} to {key[1]}{_of(who, len(names))}: an outage; "
         "these rows are not used"
         for key, who in sorted(long.items(), key=lambda item: -lengths[item[0]])
     ]
     if silent:
-        found.append(f"no level in any row{_of(silent, len(names))}")
+        warnings.append(f"no level in any row{_of(silent, len(names))}")
     if faint:
         count, least = sum(n for _, n, _ in faint), min(v for _, _, v in faint)
         who = _of([name for name, _, _ in faint], len(names))
-        found.append(
+        warnings.append(
             f"{count} levels missing{who}, beside the weakest ones: not heard? then give sensitivity_db "
             f"(the least level is {least:.4g} dB), and they count as below it"
         )
     if plain:
         count = sum(n for _, n in plain)
-        found.append(
+        warnings.append(
             f"{count} single levels missing{_of([n for n, _ in plain], len(names))}, few or beside strong "
             "ones: lost rather than not heard; they are not used"
         )
-    return found
+    return warnings
 
 
 def _of(who: list[str], total: int) -> str:

@@ -65,8 +65,8 @@ class Campaign(DataModule):
         raw = self.raw()
         selected = select(split_stations(raw, self.level_steps, self.file), self.selection, self.file)
         reading = interpret(selected.raw, self.file)
-        said = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*said, *selected.notes, *reading.notes):
+        left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
+        for note in (*left_out, *selected.notes, *reading.notes):
             log.warning("%s: %s", self.file, note)
         for hint in suspicious_values(reading.data):
             log.warning("%s: units? %s", self.file, hint)

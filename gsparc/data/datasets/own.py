@@ -63,13 +63,13 @@ PLANE = 2  # coordinates of places in POWDER's files
 
 def campaign_of(raw: Raw) -> str | None:
     """The choice of conf/dataset that reads a file with these arrays; None where it is of none of them."""
-    held = raw.arrays
-    if {"rx_antenna_position", "csi"} <= set(held):
+    arrays = raw.arrays
+    if {"rx_antenna_position", "csi"} <= set(arrays):
         return "techtile"
-    if {"mobile_position", "rssi_db"} <= set(held):
-        flat = held["mobile_position"].ndim == 2 and held["mobile_position"].shape[1] == PLANE
+    if {"mobile_position", "rssi_db"} <= set(arrays):
+        flat = arrays["mobile_position"].ndim == 2 and arrays["mobile_position"].shape[1] == PLANE
         return "powder" if flat else "ble"
-    return "newrf" if {"tx_pos", "rx_pos"} <= set(held) else None
+    return "newrf" if {"tx_pos", "rx_pos"} <= set(arrays) else None
 
 
 def read_any(
@@ -114,8 +114,8 @@ def raw_of(
         DataError: not readable, or columns that nothing can be made of.
     """
     if cell_m is None and not is_table(path):
-        told = any(value is not None for value in (columns or {}).values())
-        for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
+        named = any(value is not None for value in (columns or {}).values())
+        for name in [name for name, given in (("columns", named), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return Noted(read_raw(path))
     from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import

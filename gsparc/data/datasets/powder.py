@@ -81,14 +81,14 @@ def raw_of_powder(
 
 
 def _of_npz(raw: Raw, path: Path) -> Raw:
-    held = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
-    parts = [held.pop(name) for name in ("latitude", "longitude") if name in held]
+    arrays = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
+    parts = [arrays.pop(name) for name in ("latitude", "longitude") if name in arrays]
     if len(parts) == 2:
         degrees = np.stack(parts, axis=1).astype(np.float64)
-        stations = _degrees_of(held.pop("station_position"), held.pop("tx_position"), degrees, path)
-        held |= {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
-        held |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
-    return Raw(held, raw.attributes)
+        stations = _degrees_of(arrays.pop("station_position"), arrays.pop("tx_position"), degrees, path)
+        arrays |= {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
+        arrays |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
+    return Raw(arrays, raw.attributes)
 
 
 def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: Path) -> np.ndarray:
@@ -121,7 +121,7 @@ def _of_csv(path: Path, table: Path) -> Raw:
     plain = {head.lower().replace(" ", "_"): head for head in sheet.heads}
     if sum(name.startswith("tx") and name.endswith(("_x_coord", "_lat", "_latitude")) for name in plain) > 1:
         raise DataError(f"{path}, line 1: two transmitters in a row; expected one, as in single_tx.csv")
-    chosen = {}
+    chosen: dict[str, tuple[Column, ...]] = {}
     for role, names in (("tx_latitude", LATITUDES), ("tx_longitude", LONGITUDES)):
         head = next((plain[name] for name in names if name in plain), None)
         if head is None:
@@ -201,11 +201,11 @@ def _listed(path: Path) -> Mapping[str, Any]:
     from gsparc.data.tables.sheet import sheet_of
 
     sheet, _ = sheet_of(path)
-    found, _ = read_stations(sheet)
+    stations, _ = read_stations(sheet)
     sheet.problems.raise_if_any()
-    if found is None or not found.places.degrees:
+    if stations is None or not stations.places.degrees:
         raise DataError(f"{path}, line 1: expected the columns name, latitude, longitude")
-    return dict(zip(found.names, found.places.across.tolist(), strict=True))
+    return dict(zip(stations.names, stations.places.across.tolist(), strict=True))
 
 
 class Powder(Campaign):

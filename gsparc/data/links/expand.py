@@ -152,18 +152,18 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     axes = tuple(range(1, values.ndim))
     gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
     unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
-    told = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
+    marked = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
     censored = np.zeros(len(values), bool)
     if level is not None:
-        censored = unknown & told
+        censored = unknown & marked
         floor = np.broadcast_to(np.atleast_1d(level)[of_level if level.size > 1 else 0], (len(values),))
-        below = ~unknown & told & (values < floor)
+        below = ~unknown & marked & (values < floor)
         if below.any():
             row = int(np.flatnonzero(below)[0])
             named = links.named([str(name) for name in arrays["row_name"]])[row]
             wrong = f"{named}: {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
             return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
-        highest, weakest = floor[censored].max(initial=-np.inf), values[~unknown & told].min(initial=np.inf)
+        highest, weakest = floor[censored].max(initial=-np.inf), values[~unknown & marked].min(initial=np.inf)
         if FAR_BELOW_DB < weakest - highest < np.inf:
             check.notes.append(
                 f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
@@ -173,7 +173,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
     if mask is not None and lost.any():
         return links  # marked as measured, and is not: refused where values are read
-    keep = told & ~lost
+    keep = marked & ~lost
     if silent and values.any():
         keep &= values.any(axis=axes)
     if not (keep & ~censored).any():
@@ -199,8 +199,8 @@ def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, ce
         text = f"{int((~keep).sum())} of {len(keep)} values are missing{silent}"
         if links.stations is not None and links.station is not None:
             lost = np.bincount(links.station[~keep], minlength=len(links.stations))
-            told = ", ".join(f"{links.stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i])
-            text += f" (most: {told})"
+            most = [f"{links.stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i]]
+            text += f" (most: {', '.join(most)})"
         weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
         check.notes.append(text + weak)
     if censored.any():

@@ -153,7 +153,7 @@ def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
 
 SPOILT = {
     "station out of range": (town(station=np.full(PLACES, 3), rssi_db=LEVELS[:, 0]), "row 0 is of station 3"),
-    "station by name": (town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]), "expected whole numbers"),
+    "station by name": (town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]), "whole numbers"),
     "columns": (town(rssi_db=LEVELS[:, :2]), r"expected shape \(S, 3, ...\), a column for each station"),
     "names": (town(station_name=np.array(["a", "a", "b"])), "'a' twice"),
     "fewer names": (town(station_name=np.array(["a", "b"])), r"station_name: expected shape \(T,\)"),
