@@ -18,13 +18,6 @@ from gsparc.data.load import load
 from gsparc.data.own import from_arrays, load_own, write_own
 
 
-@pytest.mark.parametrize("case", SPOILT)
-def test_rfid_folder(rfid_folder, refused, case):
-    spoil, says = SPOILT[case]
-    spoil(rfid_folder)
-    assert str(rfid_folder) in str(refused(says, load_rfid, rfid_folder))
-
-
 def test_rfid_unknown_gateway(rfid_folder, refused):
     says = "no gateway named 'gateway9'; there are gateway1, gateway2"
     refused(says, load_rfid, rfid_folder, gateway="gateway9")
@@ -79,10 +72,8 @@ CSI = {
     "misspelt": (_without("tx_position", "tx_positon"), "unknown name; did you mean tx_position"),
     "NeWRF's name": (_without("tx_position", "tx_pos"), "unknown name; did you mean tx_position"),
     "real csi": (_set("csi", np.ones((12, 2, 3))), "csi: expected complex numbers, found dtype float64"),
-    "csi of text": (_set("csi", np.array(["1+1j"] * 12)), "expected complex numbers"),
     "csi 4-dimensional": (_set("csi", np.ones((12, 1, 1, 1), complex)), r"csi: expected shape \(S,\)"),
     "csi nan": (_entry("csi", (5, 1, 1), np.nan), "csi, row 5: not finite"),
-    "csi infinite": (_entry("csi", (5, 1, 1), np.inf), "csi, row 5: not finite"),
     "csi silent": (_set("csi", np.zeros((12, 2, 3), complex)), "every measured value is zero"),
     "one sample": (_together(_set("csi", np.ones((1, 2, 3), complex)),
                              _set("rx_position", np.ones((1, 3)))), "two rows or more"),
@@ -92,19 +83,14 @@ CSI = {
     "two coordinates": (_set("rx_position", np.ones((12, 2))), "rx_position: two coordinates.* rx_height"),
     "position nan": (_entry("rx_position", (5, 1), np.nan), "rx_position, row 5 = .*three finite coordinates"),
     "position 1e38": (_entry("rx_position", (5, 1), 1e38), "rx_position, row 5 = .*none beyond"),
-    "position complex": (_set("tx_position", np.ones(3, complex)), "tx_position: expected real numbers"),
     "nothing moves": (_set("rx_position", np.ones(3)), "neither end moves"),
     "GHz": (_set("frequency_hz", np.array([2.40, 2.41, 2.42])), r"expected Hz \(not MHz or GHz\)"),
-    "negative frequency": (_set("frequency_hz", -np.array([2.4e9, 2.41e9, 2.42e9])), "expected Hz"),
-    "frequency nan": (_set("frequency_hz", np.array([2.4e9, np.nan, 2.42e9])), "expected Hz"),
     "frequency twice": (_set("frequency_hz", np.array([2.4e9, 2.4e9, 2.42e9])), "same frequency twice"),
     "too few frequencies": (_set("frequency_hz", np.array([2.4e9, 2.41e9])), "frequency_hz: expected shape"),
     "one frequency for three": (_set("frequency_hz", np.array(2.4e9)), "one frequency, but csi has 3 columns"),
-    "carrier zero": (_set("carrier_hz", np.array(0.0)), "carrier_hz: .*expected Hz"),
     "antennas differ": (_set("array_position", np.ones((3, 3))), "array_position: expected shape"),
     "antenna nan": (_entry("array_position", (0, 0), np.nan), "array_position: not finite"),
     "zero quaternion": (_set("rx_orientation", np.zeros(4)), r"rx_orientation, row 0 = .*\(w, x, y, z\) of length 1"),
-    "quaternion nan": (_set("rx_orientation", np.array([1.0, np.nan, 0, 0])), "length 1"),
     "two orientations": (_set("rx_rotation", np.eye(3)), "both given; expected one"),
     "a mirror": (_together(_without("rx_orientation"), _set("rx_rotation", np.diag([1.0, 1, -1]))),
                  "determinant [+]1"),
