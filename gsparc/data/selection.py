@@ -42,18 +42,26 @@ def _are_names(given: Any) -> bool:
     return all(isinstance(name, str | int) and not isinstance(name, bool) for name in names)
 
 
+def _are_steps(given: Any) -> bool:
+    rows = [_listed(firsts) for firsts in given.values()] if isinstance(given, Mapping) else [()]
+    lists = all(isinstance(firsts, Sequence) and firsts for firsts in rows)
+    return lists and all(type(row) is int for firsts in rows for row in firsts)
+
+
+STEPS = or_null(Limit("first rows after steps by station, like {roof: [1162]},", _are_steps))
 NAMED = or_null(Limit("a list of names like [A,B]", _are_names))
 
 
 @dataclass(frozen=True)
 class Selection(Checked):
-    """The settings `dataset.stations`, `runs`, `min_rssi_db` and `max_rows`; None leaves everything in.
+    """The settings `dataset.stations`, `runs`, ..., of a part of a campaign; None leaves everything in.
 
     Attributes:
         stations: names, or numbers from 0, of the stations to keep.
         runs: names of the runs to keep.
         min_rssi_db: level [dB] below which powers are left out, as faults of the receiver.
         max_rows: largest number of rows (places of a wide file, links of a long one).
+        level_steps: by station, rows (from 0) from which it counts as another.
 
     Raises:
         SettingError: a setting that cannot be.
@@ -63,23 +71,26 @@ class Selection(Checked):
     runs: Sequence[str | int] | None = setting(None, NAMED)
     min_rssi_db: float | None = setting(None, or_null(number(-math.inf)))
     max_rows: int | None = setting(None, or_null(whole(FEWEST)))
+    level_steps: Mapping[str, Sequence[int]] | None = setting(None, STEPS)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("stations", "runs"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, tuple(_listed(getattr(self, name))))
+        steps = {str(name): tuple(_listed(rows)) for name, rows in (self.level_steps or {}).items()}
+        object.__setattr__(self, "level_steps", steps)
 
 
 def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
-    """Apply all settings: stations, runs, level, then number of rows.
+    """Apply all settings: steps of levels, stations, runs, level, then number of rows.
 
     Raises:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
-    notes: list[str] = []
+    raw, notes = split_stations(raw, selection.level_steps or {}, source), list[str]()
     steps: tuple[Callable[..., Noted], ...] = (keep_stations, keep_runs, keep_above, keep_rows)
-    for keep, value in zip(steps, vars(selection).values(), strict=True):
+    for keep, value in zip(steps, vars(selection).values(), strict=False):  # the last are level steps
         if value is not None:
             raw, more = keep(raw, value, source)
             notes += more
@@ -106,7 +117,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
         of_row = raw.arrays["station"]
         rows = np.flatnonzero(np.isin(of_row, chosen))
         _left(rows, "dataset.stations", source)
-        part = take_rows(part, rows, source)
+        part = _rows_of(part, rows, source)
         part.arrays["station"] = np.searchsorted(chosen, of_row[rows])
         note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
     return Noted(part, (note,))
@@ -170,42 +181,34 @@ def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
     return _kept(raw, keep, f"dataset.max_rows={max_rows}", source)
 
 
-def take_rows(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
-    """The same file with the rows (n,) only, in their order; the file's own split and paths follow them.
-
-    Raises:
-        DataError: an array has another number of rows than the measurement.
-    """
-    count = row_count(raw, source)
-    named = {"row_name": numbered_rows(count), **raw.arrays}  # numbers stay the file's
-    for name, array in named.items():
-        if _per_row(name, array, station_count(raw)) and (found := len(array) if array.ndim else 0) != count:
-            raise DataError(f"{source}, {name}: expected {count} rows as the measurement has, found {found}")
-    arrays = rows_of(named, rows, count, station_count(raw))
-    if "path_offsets" in arrays:
-        arrays |= _paths(raw, rows, count, source)
-    if any(name in arrays and not len(arrays[name]) for name in SPLIT):
-        arrays = {name: array for name, array in arrays.items() if name not in SPLIT}
-    return replace(raw, arrays=arrays)
-
-
-def rows_of(
+def take_rows(
     arrays: Mapping[str, np.ndarray], rows: np.ndarray, count: int, stations: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits are renumbered.
+    """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits and paths follow.
 
-    Rows that a split names and that there are not are left for whoever reads the split to refuse.
+    Arrays of another number of rows, and rows that a split names and that there are not, are left for whoever
+    reads them to refuse. Splits without rows are left out.
     """
-    selected = dict(arrays)
+    part = dict(arrays)
     for name, array in arrays.items():
         if _per_row(name, array, stations) and array.ndim and len(array) == count:
-            selected[name] = take(array, rows)
+            part[name] = take(array, rows)
         elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
             order = np.argsort(rows, kind="stable")
             first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
             outside = array[(array < 0) | (array >= count)]
-            selected[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
-    return selected
+            part[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
+    offsets = arrays.get("path_offsets")
+    if offsets is not None and offsets.shape == (count + 1,) and offsets.dtype.kind in "iu":
+        offsets = offsets.astype(np.int64)
+        lengths = np.diff(offsets).clip(0)[rows]
+        part["path_offsets"] = np.concatenate([[0], np.cumsum(lengths)])
+        for name in PATH_AXES:
+            if name in arrays and arrays[name].shape[:1] == (offsets[-1],):
+                part[name] = arrays[name][_runs(offsets[rows], lengths)]
+    if any(name in part and not len(part[name]) for name in SPLIT):
+        return {name: array for name, array in part.items() if name not in SPLIT}
+    return part
 
 
 def take_stations(raw: Raw, stations: np.ndarray, source: str | Path) -> Raw:
@@ -316,51 +319,24 @@ def _runs(first: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.repeat(first - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
 
 
-def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[str, np.ndarray]:
-    offsets = raw.arrays["path_offsets"]
-    if offsets.shape != (count + 1,) or offsets.dtype.kind not in "iu":
-        raise DataError(f"{source}, path_offsets: expected {count + 1} whole numbers, found {offsets.shape}")
-    offsets = offsets.astype(np.int64)
-    lengths = np.diff(offsets).clip(0)[rows]
-    parts = {"path_offsets": np.concatenate([[0], np.cumsum(lengths)])}
-    for name in PATH_AXES:
-        if name in raw.arrays:
-            if len(raw.arrays[name]) != offsets[-1]:
-                raise DataError(f"{source}, {name}: expected {offsets[-1]} paths as path_offsets says")
-            parts[name] = raw.arrays[name][_runs(offsets[rows], lengths)]
-    return parts
-
-
 def _kept(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
     rows = np.flatnonzero(keep)
     _left(rows, option, source)
     if len(rows) == len(keep):
         return Noted(raw)
     note = f"{option}: {len(keep) - len(rows)} of {len(keep)} rows left out"
-    return Noted(take_rows(raw, rows, source), (note,))
+    return Noted(_rows_of(raw, rows, source), (note,))
+
+
+def _rows_of(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
+    count = row_count(raw, source)
+    named = {"row_name": numbered_rows(count), **raw.arrays}  # numbers stay the file's
+    return replace(raw, arrays=take_rows(named, rows, count, station_count(raw)))
 
 
 def _left(rows: np.ndarray, option: str, source: str | Path) -> None:
     if len(rows) < FEWEST:
         raise DataError(f"{option}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
-
-
-def rows_by_station(given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """The setting `dataset.level_steps`, checked.
-
-    Raises:
-        DataError: what it holds is not lists of rows.
-    """
-    steps = {}
-    for station, firsts in given.items():
-        rows = (firsts,) if isinstance(firsts, int) else firsts
-        good = isinstance(rows, Sequence) and not isinstance(rows, str) and len(rows) > 0
-        if not good or not all(type(row) is int for row in rows):
-            raise DataError(
-                f"dataset.level_steps.{station}={firsts}: expected first rows after steps, like [1162]"
-            )
-        steps[str(station)] = tuple(rows)
-    return steps
 
 
 def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | Path) -> Raw:

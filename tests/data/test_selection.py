@@ -8,6 +8,7 @@ import pytest
 from measured import ble_arrays, techtile_arrays
 from releases import real
 
+from gsparc.data import selection
 from gsparc.data.own import from_arrays
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.selection import (
@@ -17,7 +18,6 @@ from gsparc.data.selection import (
     keep_runs,
     keep_stations,
     select,
-    take_rows,
 )
 
 
@@ -157,11 +157,15 @@ def test_the_number_of_rows_is_met(most):
     assert kept.notes == (notes if most < 40 else ())
 
 
+def take_rows(raw: Raw, rows: np.ndarray) -> dict[str, np.ndarray]:
+    return selection.take_rows(raw.arrays, rows, len(raw.arrays["rssi_db"]))
+
+
 def test_the_file_s_split_follows_its_rows():
     raw = plain(10, split_train=np.arange(7), split_test=np.array([9, 8, 7]))
-    kept = take_rows(raw, np.array([1, 3, 8, 9]), "file").arrays
+    kept = take_rows(raw, np.array([1, 3, 8, 9]))
     assert kept["split_train"].tolist() == [0, 1] and kept["split_test"].tolist() == [2, 3]
-    assert "split_train" not in take_rows(raw, np.array([1, 3]), "file").arrays
+    assert "split_train" not in take_rows(raw, np.array([1, 3]))
 
 
 def test_paths_follow_their_rows():
@@ -171,14 +175,14 @@ def test_paths_follow_their_rows():
         path_gain=np.arange(6.0),
         path_last_point=np.arange(18.0).reshape(6, 3),
     )
-    kept = take_rows(raw, np.array([0, 2]), "file").arrays
+    kept = take_rows(raw, np.array([0, 2]))
     assert kept["path_offsets"].tolist() == [0, 2, 5] and kept["path_gain"].tolist() == [0, 1, 2, 3, 4]
     assert kept["path_last_point"].shape == (5, 3)
 
 
 def test_a_static_end_is_no_row():
     raw = plain(3, tx_position=np.arange(3.0), rx_orientation=np.array([1.0, 0, 0, 0]))
-    kept = take_rows(raw, np.array([0, 2]), "file").arrays
+    kept = take_rows(raw, np.array([0, 2]))
     assert kept["tx_position"].tolist() == [0, 1, 2] and kept["rx_position"].shape == (2, 3)
 
 
@@ -208,10 +212,10 @@ CANNOT = {
     "half a row": (plain, {"max_rows": 2.5}, "max_rows=2.5: a whole number"),
     "rows by True": (plain, {"max_rows": True}, "max_rows=True: a whole number"),
     "no measurement": (lambda: Raw({"rx_position": np.zeros((3, 3))}), {"max_rows": 2}, "found none of them"),
-    "places of other rows": (
-        lambda: Raw({**plain(40).arrays, "rx_position": np.zeros((39, 3))}), {"max_rows": 9},
-        "file, rx_position: expected 40 rows as the measurement has, found 39",
-    ),
+    "steps in words": (wide, {"level_steps": {"sensor11": "x"}}, "level_steps={'sensor11': 'x'}: first rows after steps"),
+    "no steps": (wide, {"level_steps": {"sensor11": []}}, "first rows after steps by station"),
+    "step at half a row": (wide, {"level_steps": {"sensor11": [1.5]}}, "first rows after steps by station"),
+    "step at True": (wide, {"level_steps": {"sensor11": [True]}}, "first rows after steps by station"),
     "columns of other stations": (
         lambda: Raw({**wide().arrays, "rssi_db": np.zeros((15, 5))}), {"stations": [0]},
         "rssi_db: expected a column for each of the 4 stations",
@@ -227,6 +231,7 @@ def test_what_cannot_be_is_one_line(refused, case):
 
 def test_one_name_needs_no_brackets():
     assert Selection(stations="A05").stations == ("A05",) and Selection(runs=3).runs == (3,)
+    assert Selection(level_steps={"b": 5, 3: [6, 7]}).level_steps == {"b": (5,), "3": (6, 7)}
 
 
 def test_the_faulty_rows_of_the_measured_plane():

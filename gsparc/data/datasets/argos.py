@@ -213,6 +213,7 @@ class Argos(Release):
     """
 
     called, reader = "Argos", staticmethod(load_argos)
+    hint = "It comes with the code of FIRE and NeRF2: put csidata.npy and base-station.yml into a folder"
 
     def __init__(
         self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
@@ -221,14 +222,6 @@ class Argos(Release):
         file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
         super().__init__(root, **rest)
         self.encoder = (room, EncoderSettings(**given), file)
-
-    def missing(self) -> str:
-        """See `Release`."""
-        where = "dataset.root is not set" if self.root is None else f"{self.root} is not there"
-        return (
-            f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
-            "csidata.npy and base-station.yml into a folder and set dataset.root=FOLDER."
-        )
 
     def read(self, folder: Path) -> Measurements:
         """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from gsparc.data.files import read_text
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements
-from gsparc.data.selection import Selection, rows_by_station, select, split_stations
+from gsparc.data.selection import Selection, select
 
 log = logging.getLogger(__name__)
 
@@ -30,8 +29,7 @@ class Campaign(DataModule):
     Args:
         file: what `raw` reads.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
-        stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
-        level_steps: by station, rows from which it counts as another; see `gsparc.data.selection`.
+        stations, runs, min_rssi_db, max_rows, level_steps: see `gsparc.data.selection.Selection`.
         **settings: what `reader` takes besides.
     """
 
@@ -53,8 +51,7 @@ class Campaign(DataModule):
         super().__init__(name or self.choice, batch_size)
         self.file = str(file) if "://" in str(file) else Path(file)  # which would make one of two slashes
         self.settings = settings
-        self.selection = Selection(stations, runs, min_rssi_db, max_rows)
-        self.level_steps = rows_by_station(level_steps or {})
+        self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
 
     def raw(self) -> Raw:
         """The file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
@@ -63,7 +60,7 @@ class Campaign(DataModule):
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
         raw = self.raw()
-        selected = select(split_stations(raw, self.level_steps, self.file), self.selection, self.file)
+        selected = select(raw, self.selection, self.file)
         reading = interpret(selected.raw, self.file)
         left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
         for note in (*left_out, *selected.notes, *reading.notes):
@@ -95,6 +92,7 @@ class Release(DataModule):
     """
 
     called = ""  # the release, in messages; in small letters the choice of conf/dataset
+    hint = ""  # how to get it
     reader: ClassVar[Callable[..., Measurements]]  # what a folder holds
 
     def __init__(
@@ -108,9 +106,10 @@ class Release(DataModule):
         super().__init__(name or self.called.lower(), batch_size)
         self.root, self.stand_in, self.settings = None if root is None else Path(root), stand_in, settings
 
-    @abstractmethod
     def missing(self) -> str:
         """Why the release is not used, and how to get it."""
+        root = f"dataset.root={self.root} does not exist" if self.root else "dataset.root is not set"
+        return f"{root}: the {self.called} release is NOT on disk. {self.hint}, then set dataset.root=FOLDER."
 
     def read(self, folder: Path) -> Measurements:
         """A folder in the release's layout; `DataError` where something is missing or wrong."""

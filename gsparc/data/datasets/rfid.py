@@ -192,17 +192,10 @@ class RFID(Release):
     """The RFID release (NeRF2, set s23) or any folder in its layout; settings of `load_rfid`, `Release`."""
 
     called, reader = "RFID", staticmethod(load_rfid)
-
-    def missing(self) -> str:
-        """See `Release`."""
-        wanted = (
-            "dataset.root is not set" if self.root is None else f"dataset.root={self.root} does not exist"
-        )
-        return (
-            f"{wanted}: the RFID release is NOT on disk. Get it from the NeRF2 project "
-            "(https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, tx_pos.csv, spectrum/), "
-            "then set dataset.root=DIR."
-        )
+    hint = (
+        "Get it from the NeRF2 project (https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, "
+        "tx_pos.csv, spectrum/)"
+    )
 
     def read(self, folder: Path) -> Measurements:
         """Spectra (S, 90, 360) uint8 of tags that move about a static gateway; stand-ins have no settings."""

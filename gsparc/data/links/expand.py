@@ -17,7 +17,7 @@ from gsparc.data.links.stations import by_carrier, ends_of, numbered, station_of
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links
-from gsparc.data.selection import rows_of
+from gsparc.data.selection import take_rows
 
 POWERS = ("rssi", "rssi_db")
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
@@ -127,7 +127,7 @@ def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
         if array.shape[:2] == (rows, count):
             wide[name] = array.reshape(rows * count, *array.shape[2:])
     other = {name: array for name, array in raw.arrays.items() if name not in (*MEASUREMENTS, "mask")}
-    return replace(raw, arrays=rows_of(other, np.repeat(np.arange(rows), count), rows, count) | wide)
+    return replace(raw, arrays=take_rows(other, np.repeat(np.arange(rows), count), rows, count) | wide)
 
 
 def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
@@ -181,7 +181,8 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
         _note_lost(check, measured, links, keep, censored)
-        arrays.update(rows_of(arrays, np.flatnonzero(keep), len(keep)))
+        arrays = take_rows(arrays, np.flatnonzero(keep), len(keep))
+        check.raw = replace(check.raw, arrays=arrays)
         parts = {name: getattr(links, name) for name in ("station", "place", "run")}
         pick = {name: value[keep] for name, value in parts.items() if value is not None}
         links = replace(links, **pick)

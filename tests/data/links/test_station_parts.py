@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
-from gsparc.data.selection import keep_stations, rows_by_station, split_stations
+from gsparc.data.selection import keep_stations, split_stations
 
 
 def wide(**more: np.ndarray) -> Raw:
@@ -91,10 +90,3 @@ def test_a_step_that_cannot_be_is_one_line(refused, make, steps, says):
 def test_a_station_with_a_name_was_unknown_by_its_number():
     by_name, by_number = (split_stations(wide(), {who: (5,)}, "file").arrays for who in ("b", "1"))
     assert by_name["station_name"].tolist() == by_number["station_name"].tolist()
-
-
-@pytest.mark.parametrize("given", ["x", [], [1.5], [True], None])
-def test_the_setting_holds_lists_of_rows(given):
-    with pytest.raises(DataError, match=r"level_steps\.b=.*expected first rows"):
-        rows_by_station({"b": given})
-    assert rows_by_station({"b": 5, 3: [6, 7]}) == {"b": (5,), "3": (6, 7)}
