@@ -80,15 +80,15 @@ def identity(data: Measurements) -> str:
     """
     directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
     auxiliary = content_hash({**directions, "uplink": data.uplink})
-    return hashlib.sha256(f"{_told(data.site)} {auxiliary}".encode()).hexdigest()
+    return hashlib.sha256(f"{_fact_text(data.site)} {auxiliary}".encode()).hexdigest()
 
 
-def _told(fact: Any) -> str:
+def _fact_text(fact: Any) -> str:
     """A fact of a site as text: the same before and after a checkpoint."""
     if isinstance(fact, np.ndarray):
         return content_hash({"": fact})
     if is_dataclass(fact):
-        return str({one.name: _told(getattr(fact, one.name)) for one in fields(fact)})
+        return str({one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact)})
     return repr(fact.item() if isinstance(fact, np.generic) else fact)
 
 

@@ -88,7 +88,7 @@ def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     return scratch(shape, dtype) if large else np.empty(shape, dtype)
 
 
-def taken(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def take(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Rows (n,) of an array, on disk where they are many and lie there already."""
     if not isinstance(array, np.memmap) or len(rows) * array[:1].nbytes < BIG:
         return array[rows]

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gsparc.data.checks import outliers
+from gsparc.data.limits import check_arguments, whole
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold
 
@@ -121,13 +122,12 @@ class DataModule(pl.LightningDataModule, ABC):
         batch_size: rows of a training step, shared by all devices.
 
     Raises:
-        ValueError: a batch without rows.
+        SettingError: a batch without rows.
     """
 
     def __init__(self, name: str, batch_size: int = 16) -> None:
         super().__init__()
-        if type(batch_size) is not int or batch_size < 1:
-            raise ValueError(f"dataset.batch_size={batch_size!r}: a whole number of at least 1 is needed")
+        check_arguments(locals(), batch_size=whole(1))
         self.name, self.batch_size = name, batch_size
         self.fold: Fold | None = None
         self.seed = 0
@@ -144,8 +144,8 @@ class DataModule(pl.LightningDataModule, ABC):
     def measurements(self) -> Measurements:
         """All measurements, read when first asked for; rows far beyond all others are warned of."""
         data = self.load()
-        for said in outliers.warnings(data):
-            log.warning("%s: %s", self.name, said)
+        for warning in outliers.warnings(data):
+            log.warning("%s: %s", self.name, warning)
         return data
 
     def use(self, fold: Fold, seed: int = 0) -> Self:

@@ -95,7 +95,7 @@ def each(
     """
     total, ended = sum(map(cost, pieces)), 0.0
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
-    began = said = time.monotonic()
+    began = logged = time.monotonic()
     if not elsewhere():
         here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
         found = _jobs(here, threads, "threading")
@@ -107,9 +107,9 @@ def each(
             if isinstance(result, Exception):
                 raise result
             ended += cost(pieces[number])
-            if what and count < len(pieces) and time.monotonic() - said > SAY_S:
-                said = time.monotonic()
-                left = (said - began) * (total / max(ended, 1e-9) - 1)
+            if what and count < len(pieces) and time.monotonic() - logged > SAY_S:
+                logged = time.monotonic()
+                left = (logged - began) * (total / max(ended, 1e-9) - 1)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
             yield number, result
 

@@ -6,7 +6,7 @@ cut) may extrapolate badly into a square of floor that nobody walked (blocks), a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -15,13 +15,12 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
+from gsparc.data.splits import CORNERS, FileSettings, Fold, SplitSettings, make_split
 
 FARTHER = 2.0  # times the usual distance to the nearest training row, from which validation rows are apart
 SIDES = np.sqrt(2) ** np.arange(9)  # of squares tried for a file's gap, in units of that gap
 HALVINGS = 6  # of the side of squares, where too few squares hold training rows
 DRAWS = 12  # of squares per fold, of which those are taken that share the fewest rows
-CORNERS = ("--", "-+", "+-", "++")
 NOT_TESTED = -1  # unit of a row that no fold leaves out
 
 
@@ -79,16 +78,21 @@ def inner_folds(
         raise DataError(f"{len(where)} training places are too few to leave any out; measure more")
     settings = _inside(positions, fold, split)
     rng = np.random.default_rng([seed, 4])
-    unit = np.full(len(positions), NOT_TESTED)
+    cut = None
     if settings.name in ("stations", "runs"):
-        stations = None if station is None else np.unique(station[known], return_inverse=True)[1].reshape(-1)
-        cut = None if stations is None or stations.max() == 0 else _stations(stations, settings, count, rng)
-        if stations is not None and cut is not None:
-            return _of_all(known, settings.name, cut, stations, unit)
+        if station is not None:
+            unit = np.unique(station[known], return_inverse=True)[1].reshape(-1)
+            cut = _stations(unit, settings, count, rng)
         settings = replace(settings, name="random", leave_out=())
-    found = _cut(where, settings, count, rng)
-    folds = [one.each(lambda part: np.flatnonzero(np.isin(which, part))) for one in found.folds]
-    return _of_all(known, found.name, folds, found.unit[which], unit)
+    if cut is None:
+        cut = _cut(where, settings, count, rng)
+    else:
+        which = np.arange(len(known))  # folds of rows, not of places
+    folds = tuple(one.each(lambda part: known[np.isin(which, part)]) for one in cut.folds)
+    units = np.full(len(positions), NOT_TESTED)
+    tested = np.isin(known, np.concatenate([one.test for one in folds]))
+    units[known[tested]] = cut.unit[which][tested]
+    return InnerFolds(cut.name, folds, units)
 
 
 def cut_inside(
@@ -178,7 +182,12 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.
         with suppress(DataError):
             cut = [f for corner in corners for f in make_split(where, replace(settings, corner=corner)).folds]
             chosen = rng.permutation(len(cut))[:count] if settings.name == "grouped" else range(len(cut))
-            return _by_fold(settings.name, [cut[i] for i in chosen], len(where))
+            unit = np.full(len(where), NOT_TESTED)
+            for number, i in reversed(
+                list(enumerate(chosen))
+            ):  # a row of two folds is counted with the first
+                unit[cut[i].test] = number
+            return InnerFolds(settings.name, tuple(cut[i] for i in chosen), unit)
     settings = replace(settings, name="random")
     folds = tuple(
         make_split(where, settings, pair).folds[0] for pair in _pieces(len(where), settings, count, rng)
@@ -210,46 +219,31 @@ def _drawn(
     first, *rest = {fold.test.tobytes(): fold for fold in drawn}.values()
     chosen = [first]
     while rest and len(chosen) < count:
-        seen = np.concatenate([fold.test for fold in chosen])
-        shared = [float(np.isin(fold.test, seen).mean()) for fold in rest]
+        tested = np.concatenate([fold.test for fold in chosen])
+        shared = [float(np.isin(fold.test, tested).mean()) for fold in rest]
         chosen.append(rest.pop(int(np.argmin(shared))))
     return tuple(chosen)
 
 
 def _stations(
     station: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator
-) -> list[Fold]:
-    """Folds of rows of stations or runs (n,), at least two of them, that leave out whole ones."""
-    number = int(station.max()) + 1
+) -> InnerFolds | None:
+    """Folds of rows of stations or runs (n,) that leave out whole ones; None where there is one alone."""
+    number, name = int(station.max()) + 1, settings.name
+    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
+    if name == "runs":
+        together = max(round(settings.test_fraction * number), 1)
+    together = min(together, number - 2)
+    settings = replace(settings, name="stations", leave_out=max(together, 0))
+    where = np.zeros((len(station), 3))
+    if number == 1:
+        return None
     if number == 2:  # one to learn from; none is left to choose on
         none = np.zeros(0, np.int64)
-        return [Fold(np.flatnonzero(station != t), none, np.flatnonzero(station == t)) for t in range(2)]
-    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
-    if settings.name == "runs":
-        together = max(round(settings.test_fraction * number), 1)
-        settings = replace(settings, name="stations")
-    together = min(together, number - 2)
-    where = np.zeros((len(station), 3))
-    settings = replace(settings, leave_out=together)
-    if together <= 1:
+        folds = [Fold(np.flatnonzero(station != t), none, np.flatnonzero(station == t)) for t in range(2)]
+    elif together <= 1:
         every = make_split(where, replace(settings, leave_out=0), station=station).folds
-        return [every[i] for i in rng.permutation(number)[:count]]
-    return list(_drawn(where, settings, count, rng, station))
-
-
-def _by_fold(name: str, folds: list[Fold], places: int) -> InnerFolds:
-    """Each fold's test rows are one unit; a row of two is counted with the first."""
-    unit = np.full(places, NOT_TESTED)
-    for number, fold in reversed(list(enumerate(folds))):
-        unit[fold.test] = number
-    return InnerFolds(name, tuple(folds), unit)
-
-
-def _of_all(
-    known: np.ndarray, name: str, folds: Sequence[Fold], unit: np.ndarray, every: np.ndarray
-) -> InnerFolds:
-    """Folds of rows counted within `known` (n,) as rows of all, their units (n,) among those of all (S,)."""
-    whole = tuple(fold.each(lambda part: known[part]) for fold in folds)
-    tested = np.isin(known, np.concatenate([fold.test for fold in whole]))
-    every[known[tested]] = unit[tested]
-    return InnerFolds(name, whole, every)
+        folds = [every[i] for i in rng.permutation(number)[:count]]
+    else:
+        folds = list(_drawn(where, settings, count, rng, station))
+    return InnerFolds(name, tuple(folds), station)

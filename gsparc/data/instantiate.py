@@ -7,9 +7,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, TypeVar
 
 from gsparc.data.errors import DataError, nearest
+from gsparc.data.limits import SettingError
+
+_Kind = TypeVar("_Kind")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
@@ -18,13 +21,20 @@ def suggest(name: str, known: Iterable[str]) -> str:
     return nearest(name, known) or f"; there are {', '.join(sorted(known))}"
 
 
-def known_keys(config: Mapping[str, Any], kind: type, group: str, noun: str) -> Mapping[str, Any]:
-    """`config` when all its keys are fields of the dataclass `kind`; else a `DataError` names one `noun`."""
-    known = {field.name for field in fields(kind)}
+def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun: str = "setting") -> _Kind:
+    """The dataclass `kind` with the values of a config group.
+
+    Raises:
+        DataError: a key that is no field (a `noun`), or, a `SettingError`, a value that cannot be.
+    """
+    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
     for key in config:
         if key not in known:
             raise DataError(f"{group}.{key}: no such {noun}; there are {', '.join(sorted(known))}")
-    return config
+    try:
+        return kind(**config)
+    except SettingError as error:
+        raise SettingError(f"{group}.{error}") from None
 
 
 def targets(node: Any) -> Iterator[Any]:
@@ -58,8 +68,8 @@ def refuse_foreign(path: Any) -> None:
         ValueError: it is none.
     """
     ours = isinstance(path, str) and path.startswith("gsparc.")
-    found = find(path) if ours else None
-    if isinstance(found, type) and found.__module__.startswith("gsparc."):
+    target = find(path) if ours else None
+    if isinstance(target, type) and target.__module__.startswith("gsparc."):
         return  # before plugins are looked for: that reads the notes of all installed packages
     if not any(path in plugins(group).values() for group in GROUPS):
         raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")

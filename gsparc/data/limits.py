@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import nearest
+from gsparc.data.errors import DataError, nearest
 
 
-class SettingError(ValueError):
+class SettingError(DataError):
     """A setting that cannot be; the text begins with its name, an equals sign and the value."""
 
 
@@ -52,7 +52,7 @@ def whole(least: int, most: int | None = None) -> Limit:
 
 def number(low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False) -> Limit:
     """A finite number between `low` and `high`."""
-    words = f"a number {'above' if open_low else 'of at least'} {low:g}"
+    words = f"a number {'above' if open_low else 'of at least'} {low:g}" if low > -math.inf else "a number"
     words += "" if high == math.inf else f" and {'below' if open_high else 'at most'} {high:g}"
     return Limit(
         words,

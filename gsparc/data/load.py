@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -16,7 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, nearest
-from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
+from gsparc.data.instantiate import find, from_settings, refuse_foreign, suggest, targets
+from gsparc.data.limits import SettingError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
 
@@ -54,14 +56,17 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
         raise DataError(f"dataset._target_={target} is no gsparc.data.datamodule.DataModule{only}")
     settings = _checked(settings, kind)
     try:  # under its key, which errors then name
-        found = instantiate({"dataset": settings}, _convert_="all")["dataset"]
+        module = instantiate({"dataset": settings}, _convert_="all")["dataset"]
     except InstantiationException as error:
+        where = re.search(r"full_key: (\S+)", str(error))
+        if isinstance(error.__cause__, SettingError) and where:
+            raise SettingError(f"{where[1]}.{error.__cause__}") from None
         if isinstance(error.__cause__, ValueError):
             raise error.__cause__ from None
         raise
-    if not isinstance(found, DataModule):
+    if not isinstance(module, DataModule):
         raise DataError(f"dataset._target_={target} makes no gsparc.data.datamodule.DataModule")
-    return found
+    return module
 
 
 def load(config: Mapping[str, Any]) -> Measurements:
@@ -96,8 +101,8 @@ def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
         DataError: unknown name or key, or impossible shares.
     """
     if config.get("name") == "file":
-        return FileSettings(**known_keys(config, FileSettings, "split", "setting of split=file"))
-    return SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
+        return from_settings(FileSettings, config, "split", "setting of split=file")
+    return from_settings(SplitSettings, config, "split")
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:
@@ -107,13 +112,13 @@ def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:
 
 def _choices() -> dict[str, DictConfig]:
     """What conf/dataset holds, by name; settings that come from other groups are left to their defaults."""
-    found: dict[str, DictConfig] = {}
+    choices: dict[str, DictConfig] = {}
     for file in files("gsparc.conf").joinpath("dataset").iterdir():
         if file.name.endswith(".yaml"):
             settings = yaml.safe_load(file.read_text(encoding="utf-8"))
             settings.pop("defaults", None)
-            found[file.name.removesuffix(".yaml")] = DictConfig(settings)
-    return found
+            choices[file.name.removesuffix(".yaml")] = DictConfig(settings)
+    return choices
 
 
 def _named(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
@@ -142,16 +147,16 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
     known = _parameters(kind)
     if any(p.kind is p.VAR_KEYWORD for p in known.values()):
         return settings
-    kept, name = {}, settings.get("name")
+    accepted, name = {}, settings.get("name")
     for key, value in settings.items():
         if key in known or key.startswith("_"):
-            kept[key] = value
+            accepted[key] = value
         elif value is not None:
             other = PATHS.get(key)
             if other in known:
                 raise DataError(f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=...")
             raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest(key, known)}")
     for key, parameter in known.items():
-        if parameter.default is parameter.empty and kept.get(key) in (None, "", "???"):
+        if parameter.default is parameter.empty and accepted.get(key) in (None, "", "???"):
             raise DataError(f"dataset.{key} is not set; say dataset.{key}={key.upper()} for dataset={name}")
-    return kept
+    return accepted

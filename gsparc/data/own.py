@@ -25,10 +25,10 @@ from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measu
 log = logging.getLogger(__name__)
 
 SSIM_WINDOW = 11  # pixels along each side; as in losses and metrics, which data do not import
-DTYPES: dict[str, tuple[str, str, tuple[tuple[None, ...], ...]]] = {  # in words, kinds of NumPy, shapes
-    "spectrum": ("uint8 or floating point", "uf", ((None, None, None),)),
-    "csi": ("complex", "c", ((None,), (None, None), (None, None, None))),
-    "rssi": ("real", "iuf", ((None,),)),
+SHAPES: dict[str, tuple[tuple[None, ...], ...]] = {
+    "spectrum": ((None, None, None),),
+    "csi": ((None,), (None, None), (None, None, None)),
+    "rssi": ((None,),),
 }
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
@@ -198,14 +198,9 @@ def _attributes(check: Checker, stem: str) -> dict[str, Any]:
 
 def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
     """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
-    array = check.raw.arrays[name]
     kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    wanted, dtypes, shapes = DTYPES[kind]
-    if array.dtype.kind not in dtypes or (
-        kind == "spectrum" and array.dtype.kind == "u" and array.itemsize > 1
-    ):
-        return check.refuse(name, f"expected {wanted} numbers, found dtype {array.dtype}"), kind
-    if not check.fits(name, array, *shapes):
+    array = check.array(name, *SHAPES[kind])
+    if array is None:
         return None, kind
     if kind == "csi" and array.size:
         array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
@@ -259,11 +254,11 @@ def _rows(
     values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
 ) -> np.ndarray:
     """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
-    found = []
+    flags = []
     for part in blocks(values):
         passed = test(values[part]) if mask is None else test(values[part]) & mask[part]
-        found.append(passed.reshape(len(passed), -1).any(1))
-    return np.concatenate(found)
+        flags.append(passed.reshape(len(passed), -1).any(1))
+    return np.concatenate(flags)
 
 
 def _infinite(values: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems
 from gsparc.data.raw import Raw
-from gsparc.data.schema import FIELDS, MEASUREMENTS
+from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL
 from gsparc.ops import SphereGrid
 
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
@@ -82,14 +82,21 @@ class Checker:
             self.row_names = [str(name) for name in names]
         return self.row_names
 
-    def real(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """Array `name` as float64 when it is real and fits one of `shapes` (None: any length)."""
-        array = self.raw.arrays.get(name)
+    def array(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
+        """Array `name` when it is of its kinds of dtypes and fits one of `shapes` (None: any length)."""
+        array, kinds = self.raw.arrays.get(name), KINDS.get(name, REAL)
         if array is None:
             return None
-        if array.dtype.kind not in "iuf":
-            return self.refuse(name, f"expected real numbers, found dtype {array.dtype}")
-        return array.astype(np.float64) if self.fits(name, array, *shapes) else None
+        if array.dtype.kind not in kinds or (
+            kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
+        ):
+            return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
+        return array if self.fits(name, array, *shapes) else None
+
+    def real(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
+        """The same as float64."""
+        array = self.array(name, *shapes)
+        return None if array is None else array.astype(np.float64)
 
     def fits(self, name: str, array: np.ndarray, *shapes: tuple[int | None, ...]) -> bool:
         """Whether `array` has one of `shapes`; notes it when not."""
@@ -98,11 +105,12 @@ class Checker:
                 want is None or want == got for want, got in zip(shape, array.shape, strict=True)
             ):
                 return True
-        turned = any(array.shape[::-1] == s for s in shapes) or array.shape[:1] == (3,)
+        turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
         constrained = any(count is not None for shape in shapes for count in shape)
         here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
         found = f"{array.shape}{'; transposed?' if turned else ''}"
-        self.refuse(name, f"expected shape {FIELDS[name].shape}{here}, found {found}")
+        known = f" {FIELDS[name].shape}" if name in FIELDS else ""
+        self.refuse(name, f"expected shape{known}{here}, found {found}")
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
@@ -130,11 +138,11 @@ class Checker:
 
     def mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
         """Bool, like the measurement; None when all was measured. Only `censored` rows may be empty."""
-        array = self.raw.arrays.get("mask")
-        if array is None or not self.fits("mask", array, shape):
+        array = self.array("mask", shape)
+        if array is None:
             return None
-        if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
-            return self.refuse("mask", f"expected True and False, found dtype {array.dtype}")
+        if not np.isin(array, (0, 1)).all():
+            return self.refuse("mask", f"expected True and False, found {array.dtype} of other values")
         mask = array.astype(bool)
         empty = ~mask.reshape(len(mask), -1).max(axis=1)
         if censored is not None:
@@ -216,13 +224,13 @@ class Checker:
 
     def ragged(self, rows: int) -> np.ndarray | None:
         """path_offsets (S + 1,) int64."""
-        offsets = self.raw.arrays.get("path_offsets")
         per_path = self.given(*(n for n in FIELDS if n.startswith("path_") and n != "path_offsets"))
+        if per_path and "path_offsets" not in self.raw.arrays:
+            return self.refuse("path_offsets", f"missing, but {per_path[0]} is given")
+        offsets = self.array("path_offsets", (rows + 1,))
         if offsets is None:
-            return self.refuse("path_offsets", f"missing, but {per_path[0]} is given") if per_path else None
-        if not self.fits("path_offsets", offsets, (rows + 1,)):
             return None
-        if offsets.dtype.kind not in "iu" or offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any():
+        if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any():
             return self.refuse("path_offsets", "expected integers that start at 0 and never decrease")
         for name in per_path:
             found, count = self.raw.arrays[name].shape[:1], int(offsets[-1])
@@ -239,11 +247,9 @@ class Checker:
             return None
         parts = []
         for name in given:
-            index = self.raw.arrays[name]
-            if not self.fits(name, index, (None,)):
-                return None
-            if index.dtype.kind not in "iu" or index.size == 0:
-                return self.refuse(name, "expected row numbers (integers), at least one")
+            index = self.array(name, (None,))
+            if index is None or index.size == 0:
+                return None if index is None else self.refuse(name, "expected a row number or more")
             out = index[(index < 0) | (index >= rows)]
             values, counts = np.unique(index, return_counts=True)
             self._refuse_numbers(name, out, f"out of range; rows are 0 to {rows - 1}")

@@ -49,12 +49,12 @@ def places(model: Autoencoder, uplink: np.ndarray) -> np.ndarray:
     Raises:
         DataError: the encoder was made for other antennas or tones.
     """
-    seen = torch.from_numpy(features(uplink))
-    if seen.shape[1] != len(model.mean):
+    inputs = torch.from_numpy(features(uplink))
+    if inputs.shape[1] != len(model.mean):
         trained = f"the encoder was trained on {len(model.mean)} features"
-        raise DataError(f"{trained}, these uplinks have {seen.shape[1]}")
+        raise DataError(f"{trained}, these uplinks have {inputs.shape[1]}")
     with torch.no_grad():
-        return model.code(seen).double().numpy() * model.settings.size_m / 2
+        return model.code(inputs).double().numpy() * model.settings.size_m / 2
 
 
 def encoder_for(

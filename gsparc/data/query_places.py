@@ -10,6 +10,7 @@ import numpy as np
 
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import bad_degrees
+from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import ENDS, End
 from gsparc.data.tables import is_table
@@ -63,9 +64,9 @@ def read_query_places(
     try:
         if is_table(path):
             return _of_table(path, moving, columns)
-        told = [name for name, value in columns.items() if value is not None]
-        if told:
-            raise DataError(f"columns.{told[0]}: goes with tables (*.csv, *.parquet), not with {path}")
+        named = [name for name, value in columns.items() if value is not None]
+        if named:
+            raise DataError(f"columns.{named[0]}: goes with tables (*.csv, *.parquet), not with {path}")
         return _of_arrays(read_raw(path), str(path), moving)
     except DataError as error:
         # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
@@ -90,7 +91,10 @@ def read_times(path: str | Path) -> np.ndarray | None:
         raw = read_raw(path)
         if "time_s" not in raw.arrays:
             return None
-        times = _numbers(raw, str(path), "time_s", 1)
+        check = Checker(raw, str(path))
+        times = check.real("time_s", (), (None,))
+        check.problems.raise_if_any()
+        times = np.atleast_1d(np.asarray(times))
         rows = tuple(f"row {i}" for i in range(len(times)))
     assert times is not None
     if not np.isfinite(times).all():
@@ -140,33 +144,10 @@ def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
 
 
 def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
-    ends: dict[End, Places] = {}
-    for end in moving:
-        alone = len(moving) == 1
-        position = [n for n in (f"{end}_position", *(("position",) if alone else ())) if n in raw.arrays]
-        pair = [n for n in ("latitude", "longitude") if n in raw.arrays and alone]
-        if position and pair:
-            raise DataError(f"{source}: {position[0]} and {pair[0]} both say where; leave one out")
-        if len(pair) == 1 or not (position or pair):
-            wanted = "latitude and longitude, or " if alone else ""
-            raise DataError(f"{source}: no places of the {ENDS[end]}; expected {wanted}{end}_position")
-        if pair:
-            shapes = [str(raw.arrays[name].shape) for name in pair]
-            if shapes[0] != shapes[1]:
-                both = f"latitude and longitude have shapes {' and '.join(shapes)}"
-                raise DataError(f"{source}: {both}; expected one shape")
-            across = np.column_stack([_numbers(raw, source, name, 1) for name in pair])
-        else:
-            across = _numbers(raw, source, position[0], 2)
-            if across.shape[1] not in (2, 3):
-                raise DataError(
-                    f"{source}, {position[0]}: expected shape (n, 3) or (n, 2), found {across.shape}"
-                )
-        height = across[:, 2] if across.shape[1] == 3 else None
-        for name in (f"{end}_height", *(("height",) if alone else ())):
-            if name in raw.arrays and height is None:
-                height = _height(raw, source, name, len(across))
-        ends[end] = Places(across[:, :2], height, bool(pair))
+    check = Checker(raw, source)
+    given = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
+    check.problems.raise_if_any()
+    ends: dict[End, Places] = {end: where for end, where in given.items() if where is not None}
     count = {end: len(where.across) for end, where in ends.items()}
     if len(set(count.values())) > 1:
         raise DataError(f"{source}: {count['tx']} places of the transmitter, {count['rx']} of the receiver")
@@ -176,22 +157,32 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     return _checked(QueryPlaces(source, ends, rows, _stations(raw, source, len(rows))))
 
 
-def _numbers(raw: Raw, source: str, name: str, axes: int) -> np.ndarray:
-    array = raw.arrays[name]
-    if array.dtype.kind not in "iuf":
-        raise DataError(f"{source}, {name}: expected real numbers, found dtype {array.dtype}")
-    if array.ndim == axes - 1:  # one place
-        array = array[None]
-    if array.ndim != axes:
-        raise DataError(f"{source}, {name}: expected {axes} axes, found shape {array.shape}")
-    return array.astype(np.float64)
-
-
-def _height(raw: Raw, source: str, name: str, count: int) -> np.ndarray:
-    height = _numbers(raw, source, name, 1)
-    if len(height) not in (1, count):
-        raise DataError(f"{source}, {name}: {len(height)} heights for {count} places")
-    return np.broadcast_to(height, (count,))
+def _end(check: Checker, end: End, alone: bool) -> Places | None:
+    """Places (n,) of an end; those without its name are of the one that is `alone`."""
+    position = check.given(f"{end}_position", *(("position",) if alone else ()))[:1]
+    pair = check.given("latitude", "longitude") if alone else []
+    if position and pair:
+        fault = f"{position[0]} and {pair[0]} both say where; leave one out"
+        return check.problems.add(check.source, fault)
+    if len(pair) == 1 or not (position or pair):
+        wanted = "latitude and longitude, or " if alone else ""
+        fault = f"no places of the {ENDS[end]}; expected {wanted}{end}_position"
+        return check.problems.add(check.source, fault)
+    shapes = ((2,), (3,), (None, 2), (None, 3)) if position else ((), (None,))
+    parts = [check.real(name, *shapes) for name in position or pair]
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return None
+    if len({part.shape for part in known}) > 1:
+        shown = " and ".join(str(part.shape) for part in known)
+        fault = f"latitude and longitude have shapes {shown}; expected one shape"
+        return check.problems.add(check.source, fault)
+    across = np.column_stack(known) if pair else np.atleast_2d(known[0])
+    height = across[:, 2] if across.shape[1] == 3 else None
+    for name in check.given(f"{end}_height", *(("height",) if alone else ())):
+        given = None if height is not None else check.real(name, (), (1,), (len(across),))
+        height = height if given is None else np.broadcast_to(given, (len(across),))
+    return Places(across[:, :2], height, bool(pair))
 
 
 def _stations(raw: Raw, source: str, count: int) -> np.ndarray | None:
@@ -222,8 +213,7 @@ def _checked(queries: QueryPlaces) -> QueryPlaces:
             row, axis = wrong[0]
             fault = f"{names[axis]} of the {ENDS[end]} is {values[row, axis]}; expected a finite number"
             raise DataError(f"{queries.source}, {queries.rows[row]}: {fault}")
-        if where.degrees and bad_degrees(*where.across.T) is not None:
-            faults = (bad_degrees(latitude, longitude) for latitude, longitude in where.across)
-            row, fault = next((i, fault) for i, fault in enumerate(faults) if fault is not None)
-            raise DataError(f"{queries.source}, {queries.rows[row]}: {fault}")
+        off_earth = bad_degrees(*where.across.T) if where.degrees else None
+        if off_earth is not None:
+            raise DataError(f"{queries.source}, {queries.rows[off_earth[0]]}: {off_earth[1]}")
     return queries

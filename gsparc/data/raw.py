@@ -332,8 +332,8 @@ def read_netcdf(path: str | Path) -> Raw:
 
 def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     with netcdf_file(str(path), "r", mmap=False) as file:
-        held = file.variables.items()
-        return {name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in held}
+        variables = file.variables.items()
+        return {name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in variables}
 
 
 def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
@@ -341,8 +341,8 @@ def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     if fault is not None:
         raise DataError(f"{path}: damaged ({fault})")
     with h5py.File(path, "r") as file:
-        held = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
-        return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in held}
+        items = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
+        return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in items}
 
 
 def _of_netcdf(array: np.ndarray, fill: Any) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.blocks import taken
+from gsparc.data.blocks import take
 from gsparc.ops import Pose, SphereGrid
 
 if TYPE_CHECKING:
@@ -285,11 +285,11 @@ class Measurements:
         """Rows (n,) alone, seen as measurements of `site`."""
 
         def of(value: Any) -> Any:
-            return [value[i] for i in rows] if isinstance(value, list) else taken(value, rows)
+            return [value[i] for i in rows] if isinstance(value, list) else take(value, rows)
 
         whole = ("site", "provenance", "release_split")
-        given = {name: value for name, value in vars(self).items() if value is not None and name not in whole}
-        parts = {name: of(value) for name, value in given.items()}
+        arrays = {name: value for name, value in vars(self).items() if name not in whole}
+        parts = {name: of(value) for name, value in arrays.items() if value is not None}
         return Measurements(site=site or self.site, provenance=self.provenance, **parts)
 
     def batch(self, index: np.ndarray | Tensor) -> Batch:
@@ -300,15 +300,15 @@ class Measurements:
             rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
         else:
             rx = Pose(self._f32(self.rx_position[rows]), self._f32(self.rx_rotation[rows]))
-        given = ((name, getattr(self, name)) for name in ("mask", "uplink", "station", "run"))
-        held: dict[str, Any] = {name: torch.from_numpy(v[rows]) for name, v in given if v is not None}
+        optional = ((name, getattr(self, name)) for name in ("mask", "uplink", "station", "run"))
+        parts: dict[str, Any] = {name: torch.from_numpy(v[rows]) for name, v in optional if v is not None}
         return Batch(
             index=torch.from_numpy(rows.astype(np.int64)),
             tx=self._f32(self.tx[rows]),
             rx=rx,
             target=self.targets(rows),
             noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
-            **held,
+            **parts,
         )
 
     @staticmethod
@@ -391,11 +391,21 @@ FIELDS: dict[str, Field] = {
     ]
 }
 
+# Kinds of NumPy's dtypes that an array may be of, and how messages call them; arrays are real otherwise.
+REAL, WHOLE, COMPLEX, FLAGS, TEXT, LABELS, POWER = "iuf", "iu", "c", "biuf", "US", "USiu", "uf"
+KIND_WORDS = {
+    **{REAL: "real numbers", WHOLE: "whole numbers", COMPLEX: "complex numbers", FLAGS: "True and False"},
+    **{TEXT: "text", LABELS: "text or whole numbers", POWER: "uint8 or floating point numbers"},
+}
+KINDS = {
+    **{"spectrum": POWER, "csi": COMPLEX, "mask": FLAGS, "run": LABELS, "station": WHOLE},
+    **dict.fromkeys(("path_offsets", "split_train", "split_test"), WHOLE),
+}
 MEASUREMENTS = ("spectrum", "csi", "rssi", "rssi_db")
 NORMALISATIONS = ("max", "minmax", "power", "none")
 
 
 def axes_from(letter: str) -> dict[str, set[int]]:
     """Arrays that may have a row per sample (S), station (T) or path (P), and then their numbers of axes."""
-    found = {name: re.findall(rf"\({letter}(,[^)]*)\)", field.shape) for name, field in FIELDS.items()}
-    return {name: {1 + len(re.findall(r"\w+", s)) for s in rest} for name, rest in found.items() if rest}
+    shapes = {name: re.findall(rf"\({letter}(,[^)]*)\)", field.shape) for name, field in FIELDS.items()}
+    return {name: {1 + len(re.findall(r"\w+", s)) for s in rest} for name, rest in shapes.items() if rest}

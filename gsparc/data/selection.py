@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.blocks import taken
+from gsparc.data.blocks import take
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
+from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
 from gsparc.data.links.stations import station_number
 from gsparc.data.raw import Noted, Raw, numbered_rows
 from gsparc.data.schema import FIELDS, MEASUREMENTS, axes_from
@@ -30,52 +31,69 @@ ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", F
 SPLIT = ("split_train", "split_test")
 
 
+def _listed(given: Any) -> Any:
+    return (given,) if isinstance(given, str | int) else given
+
+
+def _are_names(given: Any) -> bool:
+    names = _listed(given)
+    if not isinstance(names, Sequence) or not names:
+        return False
+    return all(isinstance(name, str | int) and not isinstance(name, bool) for name in names)
+
+
+def _are_steps(given: Any) -> bool:
+    rows = [_listed(firsts) for firsts in given.values()] if isinstance(given, Mapping) else [()]
+    lists = all(isinstance(firsts, Sequence) and firsts for firsts in rows)
+    return lists and all(type(row) is int for firsts in rows for row in firsts)
+
+
+STEPS = or_null(Limit("first rows after steps by station, like {roof: [1162]},", _are_steps))
+NAMED = or_null(Limit("a list of names like [A,B]", _are_names))
+
+
 @dataclass(frozen=True)
-class Selection:
-    """The settings `dataset.stations`, `runs`, `min_rssi_db` and `max_rows`; None leaves everything in.
+class Selection(Checked):
+    """The settings `dataset.stations`, `runs`, ..., of a part of a campaign; None leaves everything in.
 
     Attributes:
         stations: names, or numbers from 0, of the stations to keep.
         runs: names of the runs to keep.
         min_rssi_db: level [dB] below which powers are left out, as faults of the receiver.
         max_rows: largest number of rows (places of a wide file, links of a long one).
+        level_steps: by station, rows (from 0) from which it counts as another.
 
     Raises:
-        DataError: a setting that cannot be.
+        SettingError: a setting that cannot be.
     """
 
-    stations: Sequence[str | int] | None = None
-    runs: Sequence[str | int] | None = None
-    min_rssi_db: float | None = None
-    max_rows: int | None = None
+    stations: Sequence[str | int] | None = setting(None, NAMED)
+    runs: Sequence[str | int] | None = setting(None, NAMED)
+    min_rssi_db: float | None = setting(None, or_null(number(-math.inf)))
+    max_rows: int | None = setting(None, or_null(whole(FEWEST)))
+    level_steps: Mapping[str, Sequence[int]] | None = setting(None, STEPS)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("stations", "runs"):
-            given = getattr(self, name)
-            if given is not None:
-                object.__setattr__(self, name, _listed(name, given))
-        level, rows = self.min_rssi_db, self.max_rows
-        if level is not None and not (_is_number(level) and math.isfinite(level)):
-            raise DataError(f"dataset.min_rssi_db={level}: expected a level in dB, e.g. -75")
-        if rows is not None and not (isinstance(rows, int) and _is_number(rows) and rows >= FEWEST):
-            raise DataError(f"dataset.max_rows={rows}: expected a whole number, at least {FEWEST}")
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, tuple(_listed(getattr(self, name))))
+        steps = {str(name): tuple(_listed(rows)) for name, rows in (self.level_steps or {}).items()}
+        object.__setattr__(self, "level_steps", steps)
 
 
 def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
-    """Apply all settings: stations, runs, level, then number of rows.
+    """Apply all settings: steps of levels, stations, runs, level, then number of rows.
 
     Raises:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
-    notes: list[str] = []
-    steps: tuple[tuple[Callable[..., Noted], Any], ...] = (
-        *((keep_stations, selection.stations), (keep_runs, selection.runs)),
-        *((keep_above, selection.min_rssi_db), (keep_rows, selection.max_rows)),
-    )
-    for keep, setting in steps:
-        if setting is not None:
-            raw, said = keep(raw, setting, source)
-            notes += said
+    raw, notes = split_stations(raw, selection.level_steps or {}, source), list[str]()
+    steps: tuple[Callable[..., Noted], ...] = (keep_stations, keep_runs, keep_above, keep_rows)
+    for keep, value in zip(steps, vars(selection).values(), strict=False):  # the last are level steps
+        if value is not None:
+            raw, more = keep(raw, value, source)
+            notes += more
     return Noted(raw, tuple(notes))
 
 
@@ -93,16 +111,16 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     numbers = [known_station(w, names, count, f"dataset.stations={w}", source) for w in stations]
     chosen = np.unique([part for number in numbers for part in parts_of(number, names)])
     note = f"dataset.stations: {count - len(chosen)} of {count} stations left out"
-    kept = take_stations(raw, chosen, source)
-    kept.arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
-    if "station" in kept.arrays:
+    part = take_stations(raw, chosen, source)
+    part.arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
+    if "station" in part.arrays:
         of_row = raw.arrays["station"]
         rows = np.flatnonzero(np.isin(of_row, chosen))
         _left(rows, "dataset.stations", source)
-        kept = take_rows(kept, rows, source)
-        kept.arrays["station"] = np.searchsorted(chosen, of_row[rows])
+        part = _rows_of(part, rows, source)
+        part.arrays["station"] = np.searchsorted(chosen, of_row[rows])
         note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
-    return Noted(kept, (note,))
+    return Noted(part, (note,))
 
 
 def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
@@ -127,9 +145,9 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     Raises:
         DataError: the file holds no powers, or none is left.
     """
-    name, said = _measurement(raw, source), f"dataset.min_rssi_db={min_rssi_db:g}"
+    name, option = _measurement(raw, source), f"dataset.min_rssi_db={min_rssi_db:g}"
     if name not in ("rssi", "rssi_db"):
-        raise DataError(f"{said}: {source} holds {name}; expected powers, rssi or rssi_db")
+        raise DataError(f"{option}: {source} holds {name}; expected powers, rssi or rssi_db")
     values = raw.arrays[name]
     with np.errstate(divide="ignore", invalid="ignore"):
         low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
@@ -138,11 +156,11 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
         raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {given.shape}")
     low &= True if given is None else given.astype(bool)
     if low.ndim == 1:
-        return _kept(raw, ~low, said, source)
+        return _kept(raw, ~low, option, source)
     measured = ~low & measured_links(raw, source)
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
-    links = (f"{said}: {int(low.sum())} links left out",) if low.any() else ()
-    rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), said, source)
+    links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
+    rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
     return Noted(rest.raw, (*links, *rest.notes))
 
 
@@ -163,42 +181,34 @@ def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
     return _kept(raw, keep, f"dataset.max_rows={max_rows}", source)
 
 
-def take_rows(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
-    """The same file with the rows (n,) only, in their order; the file's own split and paths follow them.
-
-    Raises:
-        DataError: an array has another number of rows than the measurement.
-    """
-    count = row_count(raw, source)
-    named = {"row_name": numbered_rows(count), **raw.arrays}  # numbers stay the file's
-    for name, array in named.items():
-        if _per_row(name, array, station_count(raw)) and (found := len(array) if array.ndim else 0) != count:
-            raise DataError(f"{source}, {name}: expected {count} rows as the measurement has, found {found}")
-    arrays = rows_of(named, rows, count, station_count(raw))
-    if "path_offsets" in arrays:
-        arrays |= _paths(raw, rows, count, source)
-    if any(name in arrays and not len(arrays[name]) for name in SPLIT):
-        arrays = {name: array for name, array in arrays.items() if name not in SPLIT}
-    return replace(raw, arrays=arrays)
-
-
-def rows_of(
+def take_rows(
     arrays: Mapping[str, np.ndarray], rows: np.ndarray, count: int, stations: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits are renumbered.
+    """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits and paths follow.
 
-    Rows that a split names and that there are not are left for whoever reads the split to refuse.
+    Arrays of another number of rows, and rows that a split names and that there are not, are left for whoever
+    reads them to refuse. Splits without rows are left out.
     """
-    found = dict(arrays)
+    part = dict(arrays)
     for name, array in arrays.items():
         if _per_row(name, array, stations) and array.ndim and len(array) == count:
-            found[name] = taken(array, rows)
+            part[name] = take(array, rows)
         elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
             order = np.argsort(rows, kind="stable")
             first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
             outside = array[(array < 0) | (array >= count)]
-            found[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
-    return found
+            part[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
+    offsets = arrays.get("path_offsets")
+    if offsets is not None and offsets.shape == (count + 1,) and offsets.dtype.kind in "iu":
+        offsets = offsets.astype(np.int64)
+        lengths = np.diff(offsets).clip(0)[rows]
+        part["path_offsets"] = np.concatenate([[0], np.cumsum(lengths)])
+        for name in PATH_AXES:
+            if name in arrays and arrays[name].shape[:1] == (offsets[-1],):
+                part[name] = arrays[name][_runs(offsets[rows], lengths)]
+    if any(name in part and not len(part[name]) for name in SPLIT):
+        return {name: array for name, array in part.items() if name not in SPLIT}
+    return part
 
 
 def take_stations(raw: Raw, stations: np.ndarray, source: str | Path) -> Raw:
@@ -243,23 +253,11 @@ def station_count(raw: Raw) -> int | None:
     return None
 
 
-def _stations(raw: Raw, said: str, source: str | Path) -> int:
+def _stations(raw: Raw, option: str, source: str | Path) -> int:
     count = station_count(raw)
     if count is None:
-        raise DataError(f"{said}: {source} has no stations; expected station_position")
+        raise DataError(f"{option}: {source} has no stations; expected station_position")
     return count
-
-
-def _listed(name: str, given: Any) -> tuple[str | int, ...]:
-    """One name, or several, as a tuple."""
-    listed = (given,) if isinstance(given, str | int) else tuple(given)
-    if not listed or not all(isinstance(x, str | int) and not isinstance(x, bool) for x in listed):
-        raise DataError(f"dataset.{name}={given}: expected names, e.g. dataset.{name}=[A,B]")
-    return listed
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def parts_of(number: int, names: Sequence[str]) -> list[int]:
@@ -269,7 +267,9 @@ def parts_of(number: int, names: Sequence[str]) -> list[int]:
     return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
 
 
-def known_station(wanted: str | int, names: Sequence[str], count: int, said: str, source: str | Path) -> int:
+def known_station(
+    wanted: str | int, names: Sequence[str], count: int, option: str, source: str | Path
+) -> int:
     """`station_number`; the setting `said` is named in errors.
 
     Raises:
@@ -279,15 +279,15 @@ def known_station(wanted: str | int, names: Sequence[str], count: int, said: str
     if number is not None:
         return number
     if not names or (isinstance(wanted, int) and not any(name.isdigit() for name in names)):
-        raise DataError(f"{said}: {source} has stations 0 to {count - 1}")
-    raise DataError(f"{said}: no station {wanted} in {source}{suggest(str(wanted), names)}")
+        raise DataError(f"{option}: {source} has stations 0 to {count - 1}")
+    raise DataError(f"{option}: no station {wanted} in {source}{suggest(str(wanted), names)}")
 
 
 def _measurement(raw: Raw, source: str | Path) -> str:
-    held, named = [n for n in MEASUREMENTS if n in raw.arrays], raw.attributes.get("measurement")
-    if not held:
+    present, named = [n for n in MEASUREMENTS if n in raw.arrays], raw.attributes.get("measurement")
+    if not present:
         raise DataError(f"{source}: expected one of {', '.join(MEASUREMENTS)}; found none of them")
-    return str(named) if named in held else held[0]
+    return str(named) if named in present else present[0]
 
 
 def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
@@ -319,51 +319,24 @@ def _runs(first: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.repeat(first - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
 
 
-def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[str, np.ndarray]:
-    offsets = raw.arrays["path_offsets"]
-    if offsets.shape != (count + 1,) or offsets.dtype.kind not in "iu":
-        raise DataError(f"{source}, path_offsets: expected {count + 1} whole numbers, found {offsets.shape}")
-    offsets = offsets.astype(np.int64)
-    lengths = np.diff(offsets).clip(0)[rows]
-    found = {"path_offsets": np.concatenate([[0], np.cumsum(lengths)])}
-    for name in PATH_AXES:
-        if name in raw.arrays:
-            if len(raw.arrays[name]) != offsets[-1]:
-                raise DataError(f"{source}, {name}: expected {offsets[-1]} paths as path_offsets says")
-            found[name] = raw.arrays[name][_runs(offsets[rows], lengths)]
-    return found
-
-
-def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Noted:
+def _kept(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
     rows = np.flatnonzero(keep)
-    _left(rows, said, source)
+    _left(rows, option, source)
     if len(rows) == len(keep):
         return Noted(raw)
-    note = f"{said}: {len(keep) - len(rows)} of {len(keep)} rows left out"
-    return Noted(take_rows(raw, rows, source), (note,))
+    note = f"{option}: {len(keep) - len(rows)} of {len(keep)} rows left out"
+    return Noted(_rows_of(raw, rows, source), (note,))
 
 
-def _left(rows: np.ndarray, said: str, source: str | Path) -> None:
+def _rows_of(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
+    count = row_count(raw, source)
+    named = {"row_name": numbered_rows(count), **raw.arrays}  # numbers stay the file's
+    return replace(raw, arrays=take_rows(named, rows, count, station_count(raw)))
+
+
+def _left(rows: np.ndarray, option: str, source: str | Path) -> None:
     if len(rows) < FEWEST:
-        raise DataError(f"{said}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
-
-
-def rows_by_station(given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """The setting `dataset.level_steps`, checked.
-
-    Raises:
-        DataError: what it holds is not lists of rows.
-    """
-    found = {}
-    for station, firsts in given.items():
-        rows = (firsts,) if isinstance(firsts, int) else firsts
-        good = isinstance(rows, Sequence) and not isinstance(rows, str) and len(rows) > 0
-        if not good or not all(type(row) is int for row in rows):
-            raise DataError(
-                f"dataset.level_steps.{station}={firsts}: expected first rows after steps, like [1162]"
-            )
-        found[str(station)] = tuple(rows)
-    return found
+        raise DataError(f"{option}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
 
 
 def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | Path) -> Raw:
@@ -384,12 +357,12 @@ def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | P
 
 
 def _split(raw: Raw, station: str, first: int, source: str | Path) -> Raw:
-    rows, said = row_count(raw, source), f"dataset.level_steps.{station}={first}"
-    count = _stations(raw, said, source)
+    rows, option = row_count(raw, source), f"dataset.level_steps.{station}={first}"
+    count = _stations(raw, option, source)
     if not 0 < first < rows:
-        raise DataError(f"{said}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
+        raise DataError(f"{option}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
     names = [str(name) for name in raw.arrays.get("station_name", np.arange(count)).ravel()]
-    number = known_station(station, names, count, said, source)
+    number = known_station(station, names, count, option, source)
     last = parts_of(number, names)[-1]  # later steps divide the part after earlier ones
     doubled = np.array([*range(count), last])
     raw = replace(raw, arrays={**raw.arrays, "station_name": np.array(names)})

@@ -13,12 +13,14 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError, nearest, reason
+from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
+from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 
 log = logging.getLogger(__name__)
 
 NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs")
+CORNERS = ("--", "-+", "+-", "++")
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
@@ -57,16 +59,27 @@ class Split:
 
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""
-        for number, fold in enumerate(self.folds):
+        for i, fold in enumerate(self.folds):
             if len(fold.train) < LEAST_ROWS or not len(fold.test):
                 raise DataError(
-                    f"split={self.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} "
+                    f"split={self.name}: fold {i} has {len(fold.train)} training and {len(fold.test)} "
                     f"test rows; at least {LEAST_ROWS} and 1 are needed"
                 )
 
 
+def _are_rows(given: Any) -> bool:
+    listed = given.tolist() if isinstance(given, np.ndarray) else given
+    if isinstance(listed, str) or not isinstance(listed, Sequence):
+        return isinstance(listed, str) and listed == "outliers"
+    return all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
+
+
+ROWS = Limit("outliers, or a list of rows like [3, 17],", _are_rows)
+KNOWN = Limit(f"one of {', '.join(NAMES)}, file", lambda name: name in NAMES, (*NAMES, "file"))
+
+
 @dataclass(frozen=True)
-class SplitSettings:
+class SplitSettings(Checked):
     """How to split; one instance of the config group `split`.
 
     Attributes:
@@ -90,53 +103,31 @@ class SplitSettings:
             are held out together, drawn by seed (0: each one in its turn).
     """
 
-    name: str = "random"
-    seed: int = 0
-    val_fraction: float = 0.1
-    test_fraction: float = 0.2
+    name: str = setting("random", KNOWN)
+    seed: int = setting(0, whole(0))
+    val_fraction: float = setting(0.1, number(0, 1, open_high=True))
+    test_fraction: float = setting(0.2, SHARE)
     redraw: bool = False
-    folds: int = 5
-    stretches_per_fold: int = 1
-    side_m: float | None = None
-    share: float = 0.2
-    buffer_m: float = 0.03
-    corner: str = "++"
-    train_fraction: float = 0.1
-    train_count: int | None = None
-    thin: float = 1.0
-    spacing_m: float | None = None
+    folds: int = setting(5, whole(2))
+    stretches_per_fold: int = setting(1, whole(1))
+    side_m: float | None = setting(None, or_null(POSITIVE))
+    share: float = setting(0.2, SHARE)
+    buffer_m: float = setting(0.03, number(0))
+    corner: str = setting("++", choice(*CORNERS))
+    train_fraction: float = setting(0.1, SHARE)
+    train_count: int | None = setting(None, or_null(whole(1)))
+    thin: float = setting(1.0, number(0, 1, open_low=True))
+    spacing_m: float | None = setting(None, or_null(POSITIVE))
     leave_out: Sequence[int] | Literal["outliers"] | int = ()
 
     def __post_init__(self) -> None:
-        if self.name not in NAMES:
-            hint = nearest(self.name, (*NAMES, "file"), 0.6)
-            raise DataError(f"split: {self.name!r} is none of {', '.join(NAMES)}, file{hint}")
-        if not isinstance(self.seed, int):
-            raise DataError(f"split.seed={self.seed}: a whole number is needed")
-        spacing, count = self.spacing_m, self.train_count
-        for key, good, expected in (
-            ("test_fraction", 0 < self.test_fraction < 1, "a share between 0 and 1"),
-            ("train_fraction", 0 < self.train_fraction < 1, "a share between 0 and 1"),
-            ("val_fraction", 0 <= self.val_fraction < 1, "a share from 0 to below 1"),
-            ("thin", 0 < self.thin <= 1, "a share above 0, at most 1"),
-            ("train_count", count is None or count >= 1, "at least 1 row"),
-            ("spacing_m", spacing is None or 0 < spacing < np.inf, "metres, above 0"),
-            ("side_m", self.side_m is None or 0 < self.side_m < np.inf, "metres, above 0"),
-            ("share", 0 < self.share < 1, "a share between 0 and 1"),
-            ("buffer_m", 0 <= self.buffer_m < np.inf, "metres, at least 0"),
-        ):
-            if not good:
-                raise DataError(f"split.{key}={getattr(self, key)}: expected {expected}")
+        super().__post_init__()
         if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
-            _check_rows(self.leave_out)
-        if self.folds < 2 or self.stretches_per_fold < 1:
-            raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
-        if len(self.corner) != 2 or set(self.corner) - set("+-"):
-            raise DataError(f"split.corner={self.corner!r}: expected one of --, -+, +-, ++")
+            ROWS.check("leave_out", self.leave_out)
 
 
 @dataclass(frozen=True)
-class FileSettings:
+class FileSettings(Checked):
     """The folds of an index file: the config group `split` with the name `file`.
 
     Attributes:
@@ -146,12 +137,12 @@ class FileSettings:
 
     name: str = "file"
     path: str = ""
-    leave_out: Sequence[int] | Literal["outliers"] = ()
+    leave_out: Sequence[int] | Literal["outliers"] = setting((), ROWS)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not isinstance(self.path, str | Path) or str(self.path) in ("", "???"):
             raise DataError("split.path is not set; say split.path=split.json for split=file")
-        _check_rows(self.leave_out)
 
 
 def make_split(
@@ -177,21 +168,22 @@ def make_split(
     """
     rows, left = len(positions), settings.leave_out
     absent = np.zeros(0, np.int64) if isinstance(left, int) else left_out(left, outliers, rows)
-    kept = np.setdiff1d(np.arange(rows), absent)
-    first = which = np.arange(len(kept))  # of the rows that stand for their places, and the place of each row
+    rows_left = np.setdiff1d(np.arange(rows), absent)
+    # Of the rows that stand for their places, and the place of each row.
+    first = which = np.arange(len(rows_left))
     if settings.name in ("stations", "runs"):
-        found = _whole(None if station is None else station[kept], settings)
+        found = _whole(None if station is None else station[rows_left], settings)
     else:
         named = release_split if settings.name == "random" and not settings.redraw else None
         if named is not None:
-            train, test = (np.searchsorted(kept, np.intersect1d(part, kept)) for part in named)
+            train, test = (np.searchsorted(rows_left, np.intersect1d(part, rows_left)) for part in named)
             named = train, test
         elif place is not None:
-            _, first, which = np.unique(place[kept], return_index=True, return_inverse=True)
-        where = positions[kept][first]
+            _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
+        where = positions[rows_left][first]
         pairs = enumerate(_pairs(where, settings, named))
         found = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
-    folds = tuple(fold.each(lambda part: kept[np.isin(which.reshape(-1), part)]) for fold in found)
+    folds = tuple(fold.each(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in found)
     return Split(settings.name, folds, indices_hash(folds))
 
 
@@ -266,12 +258,12 @@ def far_from(
 def far_apart(positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int]) -> np.ndarray:
     """A largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m]."""
     tree, free = cKDTree(positions[rows]), np.ones(len(rows), dtype=bool)
-    kept = []
+    subset = []
     for i in np.random.default_rng(seed).permutation(len(rows)):
         if free[i]:
-            kept.append(i)
+            subset.append(i)
             free[tree.query_ball_point(positions[rows[i]], distance)] = False
-    return rows[np.sort(kept)]
+    return rows[np.sort(subset)]
 
 
 def indices_hash(folds: tuple[Fold, ...]) -> str:
@@ -323,17 +315,6 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
         log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
     return Split(name, folds, stored_hash)
-
-
-def _check_rows(given: Any) -> None:
-    """Refuse what `leave_out` cannot be (DataError)."""
-    listed = given.tolist() if isinstance(given, np.ndarray) else given
-    if isinstance(listed, str) or not isinstance(listed, Sequence):
-        good = isinstance(listed, str) and listed == "outliers"
-    else:
-        good = all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
-    if not good:
-        raise DataError(f"split.leave_out={given}: expected outliers, or numbers of rows like [3, 17]")
 
 
 def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -393,10 +374,10 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
         remain = "two at least must remain" if least == 2 else "one must remain"
         raise DataError(f"split={name}: {count} {name}; {remain} to learn from and to choose on")
     draw = np.random.default_rng(settings.seed).permutation(count)
-    held = [draw[:together]] if together else [np.array([t]) for t in range(count)]
+    test_units = [draw[:together]] if together else [np.array([t]) for t in range(count)]
     folds = []
-    for number, test in enumerate(held):
-        rest = np.random.default_rng([settings.seed, number, 2]).permutation(
+    for fold, test in enumerate(test_units):
+        rest = np.random.default_rng([settings.seed, fold, 2]).permutation(
             np.setdiff1d(np.arange(count), test)
         )
         chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]

@@ -51,19 +51,19 @@ def read_walls(path: str | Path | None) -> SceneWalls:
     if path is None:
         raise DataError(f"init.file is missing; expected a file of {EXPECTED}")
     path, problems = Path(path), Problems(path)
-    found = SceneWalls((), np.zeros((0, 2, 3)))
+    walls = SceneWalls((), np.zeros((0, 2, 3)))
     if path.suffix.lower() == ".obj":
-        found = _mesh(path, problems)
+        walls = _mesh(path, problems)
     elif path.suffix.lower() in (".yaml", ".yml"):
-        found = _table(path, problems)
+        walls = _table(path, problems)
     else:
         problems.add(
             path, "walls are read from *.yaml or *.obj; export meshes of other kinds as Wavefront OBJ"
         )
-    if not problems and not len(found):
+    if not problems and not len(walls):
         problems.add(path, f"no walls in it; expected {EXPECTED}")
     problems.raise_if_any()
-    return found
+    return walls
 
 
 def _table(path: Path, problems: Problems) -> SceneWalls:
@@ -107,13 +107,13 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
         else:
             faces = box_faces(np.zeros(3), size)
     if room.get("boxes_m"):
-        found = finite(room["boxes_m"])
-        if found.shape[1:] != (2, 3) or not (found[:, 0] < found[:, 1]).all():
+        corners = finite(room["boxes_m"])
+        if corners.shape[1:] != (2, 3) or not (corners[:, 0] < corners[:, 1]).all():
             problems.add(
                 path, "room.boxes_m: expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
             )
         else:
-            boxes = found
+            boxes = corners
     return faces, boxes
 
 

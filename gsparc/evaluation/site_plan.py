@@ -60,7 +60,7 @@ def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
     for rows in outliers(data).values():
         suspicious[which[rows]] = True
     if levels is not None:
-        lost = [rows for _, rows, _ in wild_of(levels.station, levels.level_db)]
+        lost = [rows for _, rows, _ in wild_of(levels)]
         wild = levels.position[np.concatenate([np.zeros(0, np.int64), *lost])]
         suspicious[cKDTree(place + site.origin).query(wild)[1]] = True
     level, label = _levels(data, which, count)
@@ -257,7 +257,7 @@ def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[Lev
             ha="left" if first < len(rows) / 2 else "right", transform=axis.get_xaxis_transform(),
             path_effects=OUTLINE,
         )  # fmt: skip
-    wild = [bad for t, bad, _ in wild_of(levels.station, levels.level_db) if t == station]
+    wild = [bad for t, bad, _ in wild_of(levels) if t == station]
     for row in np.concatenate([np.zeros(0, np.int64), *wild]):
         axis.plot(np.searchsorted(rows, row), levels.level_db[row], "o", mec="red", mfc="none")
     axis.set(title=f"{levels.names[station]}: steps that the places do not explain", ylabel=f"level [{unit}]")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.blocks import taken
+from gsparc.data.blocks import take
 from gsparc.data.schema import Kind, Measurements
 from gsparc.processes.powers import Rows
 
@@ -23,7 +23,7 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
     Returns:
         (n, ...) like `data.target`; an entry measured in no row is 0.
     """
-    target = taken(data.target, rows)
+    target = take(data.target, rows)
     if data.mask is None or data.mask[rows].all():
         return target
     measured = data.mask[rows]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.instantiate import known_keys
+from gsparc.data.instantiate import from_settings
 
 # Bits of one interaction; the first four are Sionna's, an edge is a wedge with one face.
 SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION, EDGE = 1, 2, 4, 8, 16
@@ -94,4 +94,4 @@ def from_config(config: Mapping[str, Any]) -> PropagationEffects:
     Raises:
         ValueError: a switch that does not exist, or a contradiction.
     """
-    return PropagationEffects(**known_keys(config, PropagationEffects, "effects", "effect"))
+    return from_settings(PropagationEffects, config, "effects", "effect")

@@ -1,8 +1,38 @@
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from releases import write_release
+
+from gsparc.data.errors import DataError
+
+
+@pytest.fixture
+def refused():
+    """`refused(says, read, ...)`: the error of `read(...)`, of which each problem is one short line."""
+
+    def error_of(says: str, read: Callable, *arguments, **more) -> DataError:
+        with pytest.raises(DataError) as caught:
+            read(*arguments, **more)
+        problems = caught.value.problems
+        assert all("\n" not in line and "Traceback" not in line and len(line) < 600 for line in problems)
+        assert any(says in line or re.search(says, line) for line in problems), problems
+        return caught.value
+
+    return error_of
+
+
+@pytest.fixture
+def write(tmp_path):
+    """`write(content, name)`: a file of text, or of bytes as they are."""
+
+    def written(content: str | bytes, name: str = "drive.csv") -> Path:
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        return tmp_path / name
+
+    return written
 
 
 @pytest.fixture

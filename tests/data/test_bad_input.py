@@ -1,7 +1,7 @@
 """Everything a disk can hand us: refused in one clear line that names file, row and expectation."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-import json
+import io
 import warnings
 import zipfile
 from pathlib import Path
@@ -18,28 +18,9 @@ from gsparc.data.load import load
 from gsparc.data.own import from_arrays, load_own, write_own
 
 
-def _one_clear_line(error, pattern):
-    import re
-
-    for problem in error.value.problems:
-        assert "\n" not in problem and "Traceback" not in problem and len(problem) < 600
-    assert any(re.search(pattern, problem) for problem in error.value.problems), error.value.problems
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("case", SPOILT)
-def test_rfid_folder(rfid_folder, case):
-    spoil, pattern = SPOILT[case]
-    spoil(rfid_folder)
-    with pytest.raises(DataError) as error:
-        load_rfid(rfid_folder)
-    _one_clear_line(error, pattern)
-    assert str(rfid_folder) in str(error.value)
-
-
-def test_rfid_unknown_gateway(rfid_folder):
-    with pytest.raises(DataError, match="no gateway named 'gateway9'; there are gateway1, gateway2"):
-        load_rfid(rfid_folder, gateway="gateway9")
+def test_rfid_unknown_gateway(rfid_folder, refused):
+    says = "no gateway named 'gateway9'; there are gateway1, gateway2"
+    refused(says, load_rfid, rfid_folder, gateway="gateway9")
 
 
 def test_all_problems_of_a_folder_are_listed_at_once(rfid_folder):
@@ -51,27 +32,24 @@ def test_all_problems_of_a_folder_are_listed_at_once(rfid_folder):
 
 
 def _set(name, value):
-    def spoil(arrays):
-        arrays[name] = value
-
-    return spoil
+    return lambda arrays: arrays | {name: value}
 
 
 def _entry(name, index, value):
     def spoil(arrays):
-        arrays[name] = arrays[name].copy()
-        arrays[name][index] = value
+        changed = arrays[name].copy()
+        changed[index] = value
+        return arrays | {name: changed}
 
     return spoil
 
 
-def _without(name):
-    return lambda arrays: arrays.pop(name)
+def _without(name, new=None):
+    """Without an array, or with it under a new name."""
 
-
-def _rename(old, new):
     def spoil(arrays):
-        arrays[new] = arrays.pop(old)
+        rest = {key: value for key, value in arrays.items() if key != name}
+        return rest if new is None else rest | {new: arrays[name]}
 
     return spoil
 
@@ -79,7 +57,8 @@ def _rename(old, new):
 def _together(*spoils):
     def spoil(arrays):
         for one in spoils:
-            one(arrays)
+            arrays = one(arrays)
+        return arrays
 
     return spoil
 
@@ -90,13 +69,11 @@ CSI = {
     "no receiver": (_without("rx_position"), r"rx_position: missing"),
     "no transmitter": (_without("tx_position"), r"tx_position: missing"),
     "no frequency": (_without("frequency_hz"), "frequency_hz: missing; csi needs the 3 frequencies"),
-    "misspelt": (_rename("tx_position", "tx_positon"), "unknown name; did you mean tx_position"),
-    "NeWRF's name": (_rename("tx_position", "tx_pos"), "unknown name; did you mean tx_position"),
+    "misspelt": (_without("tx_position", "tx_positon"), "unknown name; did you mean tx_position"),
+    "NeWRF's name": (_without("tx_position", "tx_pos"), "unknown name; did you mean tx_position"),
     "real csi": (_set("csi", np.ones((12, 2, 3))), "csi: expected complex numbers, found dtype float64"),
-    "csi of text": (_set("csi", np.array(["1+1j"] * 12)), "expected complex numbers"),
     "csi 4-dimensional": (_set("csi", np.ones((12, 1, 1, 1), complex)), r"csi: expected shape \(S,\)"),
     "csi nan": (_entry("csi", (5, 1, 1), np.nan), "csi, row 5: not finite"),
-    "csi infinite": (_entry("csi", (5, 1, 1), np.inf), "csi, row 5: not finite"),
     "csi silent": (_set("csi", np.zeros((12, 2, 3), complex)), "every measured value is zero"),
     "one sample": (_together(_set("csi", np.ones((1, 2, 3), complex)),
                              _set("rx_position", np.ones((1, 3)))), "two rows or more"),
@@ -106,19 +83,14 @@ CSI = {
     "two coordinates": (_set("rx_position", np.ones((12, 2))), "rx_position: two coordinates.* rx_height"),
     "position nan": (_entry("rx_position", (5, 1), np.nan), "rx_position, row 5 = .*three finite coordinates"),
     "position 1e38": (_entry("rx_position", (5, 1), 1e38), "rx_position, row 5 = .*none beyond"),
-    "position complex": (_set("tx_position", np.ones(3, complex)), "tx_position: expected real numbers"),
     "nothing moves": (_set("rx_position", np.ones(3)), "neither end moves"),
     "GHz": (_set("frequency_hz", np.array([2.40, 2.41, 2.42])), r"expected Hz \(not MHz or GHz\)"),
-    "negative frequency": (_set("frequency_hz", -np.array([2.4e9, 2.41e9, 2.42e9])), "expected Hz"),
-    "frequency nan": (_set("frequency_hz", np.array([2.4e9, np.nan, 2.42e9])), "expected Hz"),
     "frequency twice": (_set("frequency_hz", np.array([2.4e9, 2.4e9, 2.42e9])), "same frequency twice"),
     "too few frequencies": (_set("frequency_hz", np.array([2.4e9, 2.41e9])), "frequency_hz: expected shape"),
     "one frequency for three": (_set("frequency_hz", np.array(2.4e9)), "one frequency, but csi has 3 columns"),
-    "carrier zero": (_set("carrier_hz", np.array(0.0)), "carrier_hz: .*expected Hz"),
     "antennas differ": (_set("array_position", np.ones((3, 3))), "array_position: expected shape"),
     "antenna nan": (_entry("array_position", (0, 0), np.nan), "array_position: not finite"),
     "zero quaternion": (_set("rx_orientation", np.zeros(4)), r"rx_orientation, row 0 = .*\(w, x, y, z\) of length 1"),
-    "quaternion nan": (_set("rx_orientation", np.array([1.0, np.nan, 0, 0])), "length 1"),
     "two orientations": (_set("rx_rotation", np.eye(3)), "both given; expected one"),
     "a mirror": (_together(_without("rx_orientation"), _set("rx_rotation", np.diag([1.0, 1, -1]))),
                  "determinant [+]1"),
@@ -145,12 +117,9 @@ CSI = {
 
 
 @pytest.mark.parametrize("case", CSI)
-def test_own_csi(csi_arrays, case):
-    spoil, pattern = CSI[case]
-    spoil(csi_arrays)
-    with pytest.raises(DataError) as error:
-        from_arrays(csi_arrays)
-    _one_clear_line(error, pattern)
+def test_own_csi(csi_arrays, refused, case):
+    spoil, says = CSI[case]
+    refused(says, from_arrays, spoil(csi_arrays))
 
 
 SPECTRUM = {
@@ -172,111 +141,103 @@ SPECTRUM = {
 
 
 @pytest.mark.parametrize("case", SPECTRUM)
-def test_own_spectrum(spectrum_arrays, case):
-    spoil, pattern = SPECTRUM[case]
-    spoil(spectrum_arrays)
-    with pytest.raises(DataError) as error:
-        from_arrays(spectrum_arrays)
-    _one_clear_line(error, pattern)
+def test_own_spectrum(spectrum_arrays, refused, case):
+    spoil, says = SPECTRUM[case]
+    refused(says, from_arrays, spoil(spectrum_arrays))
 
 
-def test_attributes(spectrum_arrays):
-    for attributes, pattern in (({"normalisation": "maximum"}, "expected one of max, minmax"),
-                                ({"convergence_error": -1.0}, "at least 0"),
-                                ({"convergence_error": "low"}, "finite number"),
-                                ({"measurement": "spectra"}, "'spectra' names no measurement of this file, "
-                                                             "which holds spectrum")):  # fmt: skip
-        with pytest.raises(DataError, match=pattern):
-            from_arrays(spectrum_arrays, attributes)
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"normalisation": "maximum"}, "expected one of max, minmax"),
+        ({"convergence_error": -1.0}, "at least 0"),
+        ({"convergence_error": "low"}, "finite number"),
+        ({"measurement": "spectra"}, "'spectra' names no measurement of this file, which holds spectrum"),
+    ],
+)
+def test_attributes(spectrum_arrays, refused, attributes, says):
+    refused(says, from_arrays, spectrum_arrays, attributes)
 
 
-@pytest.mark.parametrize("unit", [1e-42, 1e-38, 1e38])
-def test_channels_in_units_at_the_edge_of_float32(csi_arrays, unit):
-    """Dividing in complex64 by a scale of 1e-42 gave NaN or a digit or two."""
-    plain = from_arrays(csi_arrays)
-    tiny = from_arrays(
-        {**csi_arrays, "csi": (csi_arrays["csi"].astype(np.complex128) * unit).astype(np.complex64)}
-    )
-    assert np.isfinite(tiny.target).all()
-    found = tiny.target.astype(np.complex128) * tiny.site.target_scale / unit
-    wanted = plain.target.astype(np.complex128) * plain.site.target_scale
-    assert np.abs(found - wanted).max() < (1e-6 if unit >= 1e-38 else 2e-3) * np.abs(wanted).max()
-
-
-def test_decibels_beyond_reason():
+@pytest.mark.parametrize(
+    ("powers", "says"),
+    [
+        ({"rssi_db": [-50, -60, 4000, -70.0]}, "row 2: out of range; expected dB"),
+        ({"rssi": [-50, -60, -70, -70.0]}, "linear power"),
+        ({"rssi_db": [-50, -60, -40, -70.0], "noise_variance": 1.0}, "cannot go with rssi_db"),
+    ],
+)
+def test_powers_beyond_reason(refused, powers, says):
     rows = {"rx_position": np.arange(12.0).reshape(4, 3), "tx_position": np.zeros(3)}
-    with pytest.raises(DataError, match="row 2: out of range; expected dB"):
-        from_arrays({**rows, "rssi_db": np.array([-50, -60, 4000, -70.0])})
-    with pytest.raises(DataError, match="linear power"):
-        from_arrays({**rows, "rssi": np.array([-50, -60, -70, -70.0])})
-    with pytest.raises(DataError, match="cannot go with rssi_db"):
-        from_arrays({**rows, "rssi_db": np.array([-50, -60, -40, -70.0]), "noise_variance": np.array(1.0)})
+    refused(says, from_arrays, rows | {name: np.array(value) for name, value in powers.items()})
 
 
-def _npz_file(path, arrays):
-    np.savez(path, **arrays)
-    return path
+def _archive(arrays) -> bytes:
+    stored = io.BytesIO()
+    np.savez(stored, **arrays)
+    return stored.getvalue()
 
 
-def test_files_that_are_no_files(tmp_path, csi_arrays):
-    good = _npz_file(tmp_path / "good.npz", csi_arrays)
-    content = good.read_bytes()
-    cases = {
-        "absent.npz": (None, "no such file"),
-        "noise.npz": (b"not a zip", "damaged or not an npz"),
-        "half.npz": (content[: len(content) // 2], "damaged or not an npz"),
-        "empty.npz": (b"", "damaged or not an npz"),
-        "mine.csv": (b"x", "expected a name ending in .npz, .h5 or .hdf5, found .csv"),
-        "noise.h5": (b"not hdf5", "damaged or not an HDF5"),
-        "empty.hdf5": (b"", "damaged or not an HDF5"),
-    }
-    for name, (data, pattern) in cases.items():
-        if data is not None:
-            (tmp_path / name).write_bytes(data)
-        with pytest.raises(DataError, match=pattern) as error:
-            load_own(tmp_path / name)
-        _one_clear_line(error, pattern)
+def _flipped(whole: bytes) -> bytes:
+    content = bytearray(whole)
+    content[content.index(b"csi.npy") + 120] ^= 0xFF
+    return bytes(content)
 
 
-def test_a_flipped_byte_in_an_npz(tmp_path, csi_arrays):
-    path = tmp_path / "flip.npz"
-    np.savez_compressed(path, **csi_arrays)
-    content = bytearray(path.read_bytes())
-    position = content.index(b"csi.npy") + 120
-    content[position] ^= 0xFF
-    path.write_bytes(bytes(content))
-    with pytest.raises(DataError, match=r"csi: damaged"):
-        load_own(path)
+def _encrypted(whole: bytes) -> bytes:
+    content = bytearray(whole)
+    content[content.rindex(b"PK\x01\x02") + 8] |= 1  # the flag in the last entry of the directory
+    return bytes(content)
 
 
-def test_python_objects_are_refused(tmp_path):
-    path = tmp_path / "objects.npz"
-    np.savez(path, csi=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(DataError, match="holds Python objects"):
-        load_own(path)
+def _array_twice(whole: bytes) -> bytes:
+    stored = io.BytesIO(whole)
+    with zipfile.ZipFile(stored, "a") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python warns of the name
+        archive.writestr("csi.npy", archive.read("csi.npy"))
+    return stored.getvalue()
 
 
-def test_a_bare_array_is_refused(tmp_path):
-    path = tmp_path / "bare.npz"
-    with path.open("wb") as file:
-        np.save(file, np.ones(3))
-    with pytest.raises(DataError, match=r"not an npz archive"):
-        load_own(path)
+def _bare_array(whole: bytes) -> bytes:
+    stored = io.BytesIO()
+    np.save(stored, np.ones(3))
+    return stored.getvalue()
 
 
-def test_wrong_units_are_refused(tmp_path, csi_arrays):
-    path = tmp_path / "units.h5"
-    with h5py.File(path, "w") as file:
+NO_FILES = {  # name of the file, what becomes of a sound archive, and what is said
+    "absent.npz": (None, "no such file"),
+    "noise.npz": (lambda whole: b"not a zip", "damaged or not an npz"),
+    "half.npz": (lambda whole: whole[: len(whole) // 2], "damaged or not an npz"),
+    "empty.npz": (lambda whole: b"", "damaged or not an npz"),
+    "mine.csv": (lambda whole: b"x", "expected a name ending in .npz, .h5 or .hdf5, found .csv"),
+    "noise.h5": (lambda whole: b"not hdf5", "damaged or not an HDF5"),
+    "empty.hdf5": (lambda whole: b"", "damaged or not an HDF5"),
+    "flipped.npz": (_flipped, "csi: damaged"),
+    "locked.npz": (_encrypted, "damaged or not an npz file.*encrypted"),
+    "twice.npz": (_array_twice, "csi: damaged .*twice"),
+    "bare.npz": (_bare_array, "not an npz archive"),
+    "shifted.npz": (lambda whole: b"#!" + whole, "damaged or not an npz archive"),
+    "objects.npz": (
+        lambda whole: _archive({"csi": np.array([{"a": 1}], dtype=object)}),
+        "holds Python objects",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NO_FILES)
+def test_files_that_are_no_files(tmp_path, csi_arrays, refused, name):
+    change, says = NO_FILES[name]
+    if change is not None:
+        (tmp_path / name).write_bytes(change(_archive(csi_arrays)))
+    refused(says, load_own, tmp_path / name)
+
+
+def test_wrong_units_are_refused(tmp_path, csi_arrays, refused):
+    with h5py.File(tmp_path / "units.h5", "w") as file:
         for name, array in csi_arrays.items():
             file[name] = array
         file["rx_position"].attrs["units"] = "mm"
-    with pytest.raises(DataError, match="rx_position: units are 'mm'; expected 'm'"):
-        load_own(path)
-    about = json.dumps({"units": {"frequency_hz": "GHz"}})
-    with pytest.raises(DataError, match="frequency_hz: units are 'GHz'; expected 'Hz'"):
-        load_own(_npz_file(tmp_path / "units.npz", {**csi_arrays, "attributes": np.array(about)}))
-    with pytest.raises(DataError, match="expected a JSON table"):
-        load_own(_npz_file(tmp_path / "units.npz", {**csi_arrays, "attributes": np.array("{")}))
+    refused("rx_position: units are 'mm'; expected 'm'", load_own, tmp_path / "units.h5")
 
 
 def test_fuzzed_files_are_read_or_refused(tmp_path, csi_arrays):
@@ -302,26 +263,7 @@ def test_fuzzed_files_are_read_or_refused(tmp_path, csi_arrays):
     assert 100 < refused < 300
 
 
-def test_encrypted_entry_is_refused(tmp_path, csi_arrays):
-    path = _npz_file(tmp_path / "locked.npz", csi_arrays)
-    content = bytearray(path.read_bytes())
-    content[content.rindex(b"PK\x01\x02") + 8] |= 1  # the flag in the last entry of the directory
-    path.write_bytes(bytes(content))
-    with pytest.raises(DataError, match=r"damaged or not an npz file.*encrypted"):
-        load_own(path)
-
-
-def test_an_array_twice_in_an_archive_is_refused(tmp_path, csi_arrays):
-    """The second was taken without a word."""
-    np.savez(tmp_path / "a.npz", **csi_arrays)
-    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Python warns of the name
-        archive.writestr("csi.npy", archive.read("csi.npy"))
-    with pytest.raises(DataError, match=r"csi: damaged .*twice"):
-        load_own(tmp_path / "a.npz")
-
-
-def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, monkeypatch):
+def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, refused, monkeypatch):
     """The reason is the system's, not a traceback, and not "damaged"."""
     np.savez(tmp_path / "a.npz", **csi_arrays)
 
@@ -329,15 +271,7 @@ def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, monkeypatc
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(DataError, match=r"a\.npz: cannot be read .*Permission denied"):
-        load_own(tmp_path / "a.npz")
-
-
-def test_bytes_before_an_archive_are_not_called_objects(tmp_path, csi_arrays):
-    np.savez(tmp_path / "a.npz", **csi_arrays)
-    (tmp_path / "a.npz").write_bytes(b"#!" + (tmp_path / "a.npz").read_bytes())
-    with pytest.raises(DataError, match="damaged or not an npz archive"):
-        load_own(tmp_path / "a.npz")
+    refused(r"a\.npz: cannot be read .*Permission denied", load_own, tmp_path / "a.npz")
 
 
 def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):
@@ -350,14 +284,14 @@ def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):
 
 
 @pytest.mark.parametrize("name", ["tx_pos", "rx_pos", "csi", "frequency_hz"])
-def test_newrf_without(tmp_path, csi_arrays, name):
+def test_newrf_without(tmp_path, csi_arrays, refused, name):
     arrays = {"tx_pos": np.zeros(3), "rx_pos": csi_arrays["rx_position"], "csi": csi_arrays["csi"][:, 0, 0],
               "frequency_hz": np.array(2.4e9)}  # fmt: skip
-    assert len(load_newrf(_npz_file(tmp_path / "room.npz", arrays))) == 12
+    (tmp_path / "room.npz").write_bytes(_archive(arrays))
+    assert len(load_newrf(tmp_path / "room.npz")) == 12
     del arrays[name]
-    with pytest.raises(DataError, match=rf"room\.npz, {name}: missing") as error:
-        load_newrf(_npz_file(tmp_path / "room.npz", arrays))
-    _one_clear_line(error, name)
+    (tmp_path / "room.npz").write_bytes(_archive(arrays))
+    refused(rf"room\.npz, {name}: missing", load_newrf, tmp_path / "room.npz")
 
 
 def test_many_bad_rows_stay_readable():
@@ -379,29 +313,33 @@ def test_a_path_of_another_dataset_is_not_ignored(name, key):
         ('{"name": ' + "[" * 50_000, "brackets within brackets, too many"),
         ('{"a": ' + "1" * 5000 + "}", r"Exceeds the limit .* value has 5000 digits\)$"),
         ("[1]", "expected a JSON table as text .found a list"),
+        ("{", "expected a JSON table"),
+        ('{"units": {"frequency_hz": "GHz"}}', "frequency_hz: units are 'GHz'; expected 'Hz'"),
         ('{"units": [1]}', "units is not a table"),
         ('{"name": [1]}', "name: a list; expected text"),
         ('{"stand_in": 5}', "stand_in: a int; expected text"),
         ('{"convergence_error": true}', "convergence_error: True; expected a finite number"),
     ],
 )
-def test_attributes_that_are_none(tmp_path, csi_arrays, text, says):
+def test_attributes_that_are_none(tmp_path, csi_arrays, refused, text, says):
     """Brackets ended `gsparc check` in a traceback; lists and truth values passed."""
     np.savez(tmp_path / "own.npz", attributes=np.array(text), **csi_arrays)
-    with pytest.raises(DataError) as error:
-        load_own(tmp_path / "own.npz")
-    _one_clear_line(error, says)
-    assert "own.npz, " in str(error.value) and "set_int_max_str_digits" not in str(error.value)
+    said = str(refused(says, load_own, tmp_path / "own.npz"))
+    assert "own.npz, " in said and "set_int_max_str_digits" not in said
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    "dtype,unit", [(np.complex128, 1e-310), (np.complex128, 1e300), (np.complex64, 1e38)]
+    ("dtype", "unit"),
+    [(np.complex128, unit) for unit in (1e-310, 1e-200, 1e200, 1e300)]
+    + [(np.complex64, unit) for unit in (1e-42, 1e-38, 1e38)],
 )
 def test_channels_in_units_at_the_edge_of_numbers(csi_arrays, dtype, unit):
-    """Units of 1e-310 were refused as beyond float32, row by row."""
+    """Units of 1e-310 were refused row by row; dividing in complex64 by 1e-42 gave NaN or a digit or two."""
+    plain = from_arrays(csi_arrays)
     tiny = from_arrays({**csi_arrays, "csi": (csi_arrays["csi"] * unit).astype(dtype)})
-    np.testing.assert_allclose(tiny.target, from_arrays(csi_arrays).target, rtol=1e-5)
+    tolerance = 2e-3 if unit == 1e-42 else 1e-5
+    assert np.abs(tiny.target - plain.target).max() < tolerance * np.abs(plain.target).max()
 
 
 @pytest.mark.filterwarnings("error")

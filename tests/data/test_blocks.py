@@ -15,7 +15,6 @@ from releases import write_release
 from gsparc.data import blocks
 from gsparc.data.assemble import content_hash
 from gsparc.data.datasets.rfid import load_rfid
-from gsparc.data.errors import DataError
 from gsparc.data.own import load_own, write_own
 from gsparc.models.target_rows import training_targets
 
@@ -36,35 +35,48 @@ def small(monkeypatch):
     monkeypatch.setattr(blocks, "BLOCK", 512)
 
 
-@pytest.mark.parametrize("chunked", [True, False])
-def test_channels_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch, chunked):
+def spectra(kind) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    values = rng.uniform(0, 3, (20, 12, 16)) if kind is not np.uint8 else rng.integers(0, 256, (20, 12, 16))
+    places = {"rx_position": rng.uniform(0, 5, (20, 3)), "tx_position": np.array([9.0, 0, 2])}
+    return {**places, "spectrum": values.astype(kind)}
+
+
+def unchunked(path, values):
+    with h5py.File(path, "w") as file:
+        for name, one in values.items():
+            file[name] = one
+
+
+@pytest.mark.parametrize("write", [write_own, unchunked])
+@pytest.mark.parametrize("kind", [np.complex64, np.uint8, np.float32, np.float64])
+def test_measurements_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch, kind, write):
+    """Spectra of floating point were three copies in memory, of a byte a mask as large as they are."""
     path = tmp_path / "own.h5"
-    if chunked:
-        write_own(path, arrays())
-    else:
-        with h5py.File(path, "w") as file:
-            for name, values in arrays().items():
-                file[name] = values
+    write(path, arrays() if kind is np.complex64 else spectra(kind))
     there = load_own(path)
-    assert isinstance(there.target, np.memmap) and there.target.dtype == np.complex64
     with monkeypatch.context() as patch:
         patch.setattr(blocks, "BIG", 2**28)
         here = load_own(path)
-    assert not isinstance(here.target, np.memmap)
-    assert np.array_equal(there.target, here.target) and there.site.sha256 == here.site.sha256
-    assert there.site.target_scale == here.site.target_scale
-    rows = np.array([7, 3, 3, 39])
+    assert isinstance(there.target, np.memmap) and not isinstance(here.target, np.memmap)
+    assert there.target.dtype == here.target.dtype and np.array_equal(there.target, here.target)
+    assert there.site.sha256 == here.site.sha256 and there.site.target_scale == here.site.target_scale
+    rows = np.array([7, 3, 3, 19])
     assert np.array_equal(there.batch(rows).target, here.batch(rows).target)
 
 
-def test_a_bad_entry_is_named_there_too(tmp_path, small):
-    values = arrays()
-    values["csi"][31, 2, 5] = np.nan
-    with h5py.File(tmp_path / "own.h5", "w") as file:
-        for name, one in values.items():
-            file[name] = one
-    with pytest.raises(DataError, match=r"csi.*row 31.*not finite"):
-        load_own(tmp_path / "own.h5")
+@pytest.mark.parametrize(
+    ("make", "name", "index", "value", "says"),
+    [
+        (arrays, "csi", (31, 2, 5), np.nan, "csi.*row 31.*not finite"),
+        (lambda: spectra(np.float32), "spectrum", (13, 2, 5), -1, "spectrum.*row 13.*at least 0"),
+    ],
+)
+def test_a_bad_entry_is_named_there_too(tmp_path, small, refused, make, name, index, value, says):
+    values = make()
+    values[name][index] = value
+    unchunked(tmp_path / "own.h5", values)
+    refused(says, load_own, tmp_path / "own.h5")
 
 
 def test_the_hash_is_that_of_all_bytes_as_it_was(small):
@@ -80,29 +92,6 @@ def test_blocks_are_all_rows_in_their_order(small):
     values = np.arange(700.0).reshape(70, 10)
     assert np.array_equal(np.concatenate([values[part] for part in blocks.blocks(values)]), values)
     assert len(list(blocks.blocks(np.zeros((0, 3))))) == 1
-
-
-@pytest.mark.parametrize("kind", [np.uint8, np.float32, np.float64])
-def test_spectra_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch, kind):
-    """Those of floating point were three copies in memory, of a byte a mask as large as they are."""
-    rng, path = np.random.default_rng(0), tmp_path / "own.h5"
-    spectrum = rng.uniform(0, 3, (20, 12, 16)) if kind is not np.uint8 else rng.integers(0, 256, (20, 12, 16))
-    given = {"rx_position": rng.uniform(0, 5, (20, 3)), "tx_position": np.array([9.0, 0, 2])}
-    write_own(path, {**given, "spectrum": spectrum.astype(kind)})
-    there = load_own(path)
-    with monkeypatch.context() as patch:
-        patch.setattr(blocks, "BIG", 2**28)
-        here = load_own(path)
-    assert isinstance(there.target, np.memmap) and not isinstance(here.target, np.memmap)
-    assert there.target.dtype == here.target.dtype and np.array_equal(there.target, here.target)
-    assert there.site.sha256 == here.site.sha256 and there.site.target_scale == here.site.target_scale
-    if kind is not np.uint8:
-        spectrum[13, 2, 5] = -1
-        with h5py.File(path, "w") as file:
-            for name, one in {**given, "spectrum": spectrum.astype(kind)}.items():
-                file[name] = one
-        with pytest.raises(DataError, match=r"spectrum.*row 13.*at least 0"):
-            load_own(path)
 
 
 def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(tmp_path, small, monkeypatch):

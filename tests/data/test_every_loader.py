@@ -15,9 +15,7 @@ from releases import write_release
 from gsparc.data.checks.describe import describe
 from gsparc.data.datasets.argos import load_argos
 from gsparc.data.datasets.own import read_any
-from gsparc.data.datasets.sionna import load_sionna
 from gsparc.data.errors import DataError
-from gsparc.data.raw import Raw, write_raw
 
 
 def own(make):
@@ -34,15 +32,6 @@ def own(make):
     return write
 
 
-def newrf(folder: Path, change) -> Path:
-    """A room in NeWRF's layout."""
-    with np.load(channels(folder / "sound.npz", shape="S")) as stored:
-        arrays = dict(stored)
-    places = {"tx_pos": change(arrays["tx_position"]), "rx_pos": change(arrays["rx_position"])}
-    np.savez(folder / "room.npz", csi=arrays["csi"], frequency_hz=arrays["frequency_hz"], **places)
-    return folder / "room.npz"
-
-
 def rfid(folder: Path, change) -> Path:
     """A folder in the RFID release's layout."""
     root = write_release(folder / "release")
@@ -53,18 +42,6 @@ def rfid(folder: Path, change) -> Path:
     return root
 
 
-def sionna(folder: Path, change) -> Path:
-    """A file as the simulator writes it, with spectra and channels of the same receivers."""
-    with np.load(channels(folder / "sound.npz", rows=40)) as stored:
-        arrays = dict(stored)
-    with np.load(spectra(folder / "images.npz", moving="rx")) as stored:
-        arrays["spectrum"] = stored["spectrum"]
-    for end in ("tx_position", "rx_position"):
-        arrays[end] = change(arrays[end])
-    write_raw(folder / "simulated.npz", Raw(arrays, {"simulator": "gsparc-shoebox", "measurement": "csi"}))
-    return folder / "simulated.npz"
-
-
 def argos(folder: Path, change) -> Path:
     """A folder in Argos' layout, with the users' positions."""
     root = shutil.copytree(cities.folder(), folder / "city")
@@ -72,17 +49,11 @@ def argos(folder: Path, change) -> Path:
     return root
 
 
-READERS = {
-    "sionna": load_sionna,
-    "argos": lambda path: load_argos(path, positions="true"),
-}
-DOORS = {
-    "sionna": sionna,
+DOORS = {  # readers of the schema's arrays, a room's, a simulator's or a table's, share one way
     "argos": argos,
     "own spectra": own(spectra),
     "own channels": own(channels),
     "own powers": own(powers),
-    "newrf": newrf,
     "rfid": rfid,
 }
 EVERY = pytest.mark.parametrize("door", DOORS)
@@ -90,7 +61,7 @@ EVERY = pytest.mark.parametrize("door", DOORS)
 
 def read(door: str, path: Path):
     """Its measurements."""
-    return READERS[door](path) if door in READERS else read_any(path).data
+    return load_argos(path, positions="true") if door == "argos" else read_any(path).data
 
 
 def said(door: str, path: Path) -> dict[str, str]:
@@ -147,9 +118,7 @@ def test_swapped_columns_are_another_room_of_the_same_size(tmp_path, door):
     """Nothing can tell x from y; what is said shows both, so that a person can."""
     for name in ("plain", "turned"):
         (tmp_path / name).mkdir()
-    plain = said(door, DOORS[door](tmp_path / "plain", lambda places: places))["moves"]
-    turned = said(door, DOORS[door](tmp_path / "turned", lambda places: np.array(places)[..., [1, 0, 2]]))[
-        "moves"
-    ]
+    plain = said(door, DOORS[door](tmp_path / "plain", np.array))["moves"]
+    turned = said(door, DOORS[door](tmp_path / "turned", lambda p: np.array(p)[..., [1, 0, 2]]))["moves"]
     size = [text.partition("box of ")[2].partition(" m")[0].split(" x ") for text in (plain, turned)]
     assert size[0] == [size[1][1], size[1][0], size[1][2]]

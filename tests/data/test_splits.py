@@ -148,7 +148,7 @@ def test_bad_index_files_are_refused(tmp_path):
 @pytest.mark.parametrize(
     "settings, pattern",
     [
-        ({"name": "grouped", "folds": 1}, "folds of at least 2"),
+        ({"name": "grouped", "folds": 1}, "folds=1: a whole number of at least 2"),
         ({"name": "groupd"}, "did you mean 'grouped'"),
         ({"val_fraction": 1.0}, "val_fraction=1.0"),
         ({"test_fraction": 0.0}, "test_fraction=0.0"),
@@ -287,26 +287,26 @@ def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path
     assert len(str(error.value)) < 300 and "sys." not in str(error.value)
 
 
-def test_a_place_visited_again_was_learned_from_and_tested_on():
+PLACES = np.repeat(np.random.default_rng(0).uniform(0, 9, (30, 3)), 10, axis=0)
+POST = np.array([0.0, 0, 5])
+
+
+@pytest.mark.parametrize(
+    "other_end",
+    [
+        {},
+        {"tx_position": POST},
+        {"station_position": np.add.outer([0, 9], POST)},
+        {"tx_position": np.roll(PLACES, -10, 0)},
+    ],
+    ids=["unknown", "one", "two", "moves"],
+)
+def test_a_place_visited_again_was_learned_from_and_tested_on(other_end):
     """Ten samples at each of 30 places: every test row had others of its place to learn from."""
-    places = np.repeat(np.random.default_rng(0).uniform(0, 9, (30, 3)), 10, axis=0)
-    levels_db, post = -60 - places[:, 0], np.array([[0.0, 0, 5]])
-    for arrays in (
-        {"rx_position": places, "rssi_db": levels_db},
-        {"rx_position": places, "rssi_db": levels_db, "tx_position": post[0]},
-        {
-            "rx_position": places,
-            "rssi_db": levels_db[:, None] - [0, 3],
-            "station_position": [*post, post[0] + 9],
-        },
-        {
-            "rx_position": places,
-            "tx_position": np.concatenate([places[10:], places[:10]]),
-            "rssi_db": levels_db,
-        },
-    ):
-        data = from_arrays(arrays)
-        for name in ("random", "sparse"):
-            fold = split_for({"name": name}, data).folds[0]
-            known = {tuple(row) for row in data.moving[np.concatenate([fold.train, fold.val])]}
-            assert len(fold.test) and not known & {tuple(row) for row in data.moving[fold.test]}
+    levels = -60 - PLACES[:, 0]
+    levels = levels[:, None] - [0, 3] if "station_position" in other_end else levels
+    data = from_arrays({"rx_position": PLACES, "rssi_db": levels, **other_end})
+    for name in ("random", "sparse"):
+        fold = split_for({"name": name}, data).folds[0]
+        known = {tuple(row) for row in data.moving[np.concatenate([fold.train, fold.val])]}
+        assert len(fold.test) and not known & {tuple(row) for row in data.moving[fold.test]}

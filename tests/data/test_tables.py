@@ -1,7 +1,7 @@
 """Tables of measurements: what is understood, what is said, and 41 spoilt ones with one line each."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-import importlib.util
+import sys
 import time
 
 import numpy as np
@@ -9,25 +9,12 @@ import pytest
 from releases import real
 
 from gsparc.data.datasets.own import Own
-from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
 from gsparc.data.tables.heads import understand
 from gsparc.data.tables.read import understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
 STATIONS = "name,x,y,z\na,1,2,3\nb,2,3,4\n"
-
-
-@pytest.fixture
-def write(tmp_path):
-    """`write(text, name)`: a file of it; bytes as they are."""
-
-    def written(content, name="drive.csv"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return written
 
 
 @pytest.mark.parametrize(
@@ -69,30 +56,20 @@ def test_usual_heads(head, role, unit):
     assert found.role == role and (unit is None or found.unit.name == unit)
 
 
-def test_labels_of_stations():
-    assert [understand(h).label for h in ("rssi_gw-01 [dBm]", "rssi_db_gw7", "RSSI A", "rssi12")] == [
-        "gw-01", "gw7", "A", "12",
-    ]  # fmt: skip
-
-
-def test_a_plain_table(write):
-    raw = understand_table(write(PLAIN)).raw
-    np.testing.assert_array_equal(raw.arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(raw.arrays["rssi_db"], [-80, -81.5])
-    assert list(raw.arrays["row_name"]) == ["line 2", "line 3"]
+@pytest.mark.parametrize(
+    "head, label", [("rssi_gw-01 [dBm]", "gw-01"), ("rssi_db_gw7", "gw7"), ("RSSI A", "A"), ("rssi12", "12")]
+)
+def test_labels_of_stations(head, label):
+    assert understand(head).label == label
 
 
 @pytest.mark.parametrize(
     "content, name",
     [
-        (PLAIN.encode("utf-8-sig"), "bom.csv"),
-        (PLAIN.encode("utf-16"), "utf16.csv"),
-        (PLAIN.replace("\n", "\r\n"), "windows.csv"),
+        (PLAIN, "plain.csv"),
         (PLAIN.replace("\n", "\r"), "old.csv"),
         (PLAIN.replace(",", "\t"), "tabs.tsv"),
         (PLAIN.replace(",", ";"), "semicolons.csv"),
-        (PLAIN.replace(",", ";").replace(".", ","), "decimal.csv"),
-        (PLAIN.replace(",", " | "), "bars.csv"),
         (PLAIN.replace(",", "  "), "spaces.txt"),
         ("# " + PLAIN, "savetxt.csv"),
         ("# by hand\n\n" + PLAIN + "\n,,,\n% end\n", "comments.csv"),
@@ -104,9 +81,10 @@ def test_a_plain_table(write):
     ],
 )  # fmt: skip
 def test_the_same_table_in_other_forms(write, content, name):
-    raw = understand_table(write(content, name)).raw
-    np.testing.assert_array_equal(raw.arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(raw.arrays["rssi_db"], [-80, -81.5])
+    arrays = understand_table(write(content, name)).raw.arrays
+    np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(arrays["rssi_db"], [-80, -81.5])
+    assert name != "plain.csv" or arrays["row_name"].tolist() == ["line 2", "line 3"]
 
 
 def test_no_value_in_a_level_is_missing(write):
@@ -133,16 +111,15 @@ def test_units_are_converted_and_said(write):
 
 def test_every_guess_is_said_and_what_is_not_used(write):
     notes = understand_table(write("lat,lng,RSRP [dBm],SINR,battery\n40,8,-80,3,1\n40.1,8,-81,3,1\n")).notes
-    assert "column 'RSRP [dBm]' taken as rssi_db [dBm]" in notes
-    assert (
-        "column 'lat' taken as latitude [deg]" in notes and "column 'lng' taken as longitude [deg]" in notes
-    )
-    assert "not used: columns 'SINR', 'battery'" in notes
-    assert "no height of the receiver: taken as 0 m" in notes
-    assert understand_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).raw.arrays["rssi_db"].tolist() == [
-        4,
-        8,
-    ]
+    assert set(notes) >= {
+        "column 'RSRP [dBm]' taken as rssi_db [dBm]",
+        "column 'lat' taken as latitude [deg]",
+        "column 'lng' taken as longitude [deg]",
+        "not used: columns 'SINR', 'battery'",
+        "no height of the receiver: taken as 0 m",
+    }
+    arrays = understand_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).raw.arrays
+    assert arrays["rssi_db"].tolist() == [4, 8]
 
 
 def test_many_transmitters_did_not_become_one_without_a_word(write):
@@ -153,12 +130,11 @@ def test_many_transmitters_did_not_become_one_without_a_word(write):
     assert not any("stations?" in note for note in other)
 
 
-def test_what_is_said_wins_over_guesses(write):
+def test_what_is_said_wins_over_guesses(write, refused):
     text = "lat,lon,px,py,RSRP,RSSI\n40,8,1,2,-80,-60\n40,9,3,4,-81,-61\n"
     said = {"rssi_db": "rsrp", "tx_x": "px", "tx_y": "py", "tx_z": 1.5, "rx_x": 0, "rx_y": 0, "rx_z": 2}
     # lat and lon are of an end without a name, which is a third one: it must be said to be none
-    with pytest.raises(DataError, match="expected two ends"):
-        understand_table(write(text), said)
+    refused("expected two ends", understand_table, write(text), said)
     arrays = understand_table(write(text.replace("lat,lon", "a,b")), said).raw.arrays
     np.testing.assert_array_equal(arrays["rssi_db"], [-80, -81])
     np.testing.assert_array_equal(arrays["tx_position"], [[1, 2, 1.5], [3, 4, 1.5]])
@@ -232,7 +208,7 @@ def test_channels(write):
 ENDS = {"rx_x": 0, "rx_y": 0, "rx_z": 0, "frequency_hz": "1e9:5e9"}
 
 
-def test_negative_numbers_of_tones_lost_their_sign(write):
+def test_negative_numbers_of_tones_lost_their_sign(write, refused):
     """csi_re_-2 and csi_re_2 were one tone: 2 of 4 loaded, or in the order 1, 2, -1, -2."""
     heads = [f"csi_{part}_{tone}" for tone in (1, -2, 2, -1) for part in ("re", "im")]
     text = ",".join(["x,y,z", *heads]) + "\n1,2,3,1,0,-2,0,2,0,-1,0\n4,5,6,1,9,-2,8,2,7,-1,6\n"
@@ -242,12 +218,13 @@ def test_negative_numbers_of_tones_lost_their_sign(write):
         assert table.raw.arrays["csi"][1].imag.tolist() == [8, 6, 9, 7]
         assert table.raw.arrays["frequency_hz"].tolist() == [1e9, 2e9, 4e9, 5e9]
         assert any("spaced as the numbers of the tones" in note for note in table.notes)
-    same = text.replace("csi_re_-1", "csi_re_02")
-    with pytest.raises(DataError, match="'csi_re_02': the same tone as 'csi_re_2'"):
-        understand_table(write(same), ENDS)
-    for head in ("csi_re-1", "csi_re_m1", "csi_re_0_1"):
-        with pytest.raises(DataError, match=f"'{head}': .* is no number of a tone"):
-            understand_table(write(text.replace("csi_re_-1", head)), ENDS)
+    for head, says in (
+        ("csi_re_02", "'csi_re_02': the same tone as 'csi_re_2'"),
+        ("csi_re-1", "'csi_re-1': .* is no number of a tone"),
+        ("csi_re_m1", "'csi_re_m1': .* is no number of a tone"),
+        ("csi_re_0_1", "'csi_re_0_1': .* is no number of a tone"),
+    ):
+        refused(says, understand_table, write(text.replace("csi_re_-1", head)), ENDS)
 
 
 def test_runs_and_names_of_rows(write):
@@ -345,16 +322,13 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("name", SPOILT)
-def test_a_spoilt_table_is_refused_in_a_line(write, name, monkeypatch, tmp_path):
-    content, columns, words = SPOILT[name]
+def test_a_spoilt_table_is_refused_in_a_line(write, refused, name, monkeypatch, tmp_path):
+    content, columns, says = SPOILT[name]
     write(content)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DataError) as caught:
-        understand_table("drive.csv", columns)
-    problems = caught.value.problems
-    assert words in problems[0], problems
-    assert all("\n" not in p and ("drive.csv" in p or "dataset." in p) for p in problems)
-    assert len(problems) <= 3, problems
+    problems = refused("", understand_table, "drive.csv", columns).problems
+    assert says in problems[0] and len(problems) <= 3, problems
+    assert all("drive.csv" in p or "dataset." in p for p in problems)
 
 
 def test_channels_of_several_tones_and_stations(write):
@@ -364,12 +338,10 @@ def test_channels_of_several_tones_and_stations(write):
     assert arrays["csi"].tolist() == [[3 + 4j, 1 + 2j], [7 + 8j, 5 + 6j]]
 
 
-def test_all_bad_cells_are_listed_at_once(write):
+def test_all_bad_cells_are_listed_at_once(write, refused):
     rows = "".join(f"{i},{'?!' if i % 2 else i},-8x\n" for i in range(20))
-    with pytest.raises(DataError) as caught:
-        understand_table(write("x,y,rssi\n" + rows))
-    said = "\n".join(caught.value.problems)
-    assert "line 2: '-8x'" in said and "line 3: '?!'" in said
+    said = "\n".join(refused("line 2: '-8x'", understand_table, write("x,y,rssi\n" + rows)).problems)
+    assert "line 3: '?!'" in said
     assert "the same in 15 more rows" in said and "the same in 5 more rows" in said
 
 
@@ -384,25 +356,20 @@ def test_all_bad_cells_are_listed_at_once(write):
         ("name,x,y\na,1,\n", "column 'y', line 2: no value; station_y is needed"),
     ],
 )
-def test_a_spoilt_list_of_stations(write, listed, words):
-    with pytest.raises(DataError) as caught:
-        understand_table(write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n"), {}, write(listed, "stations.csv"))
-    assert any(words in problem for problem in caught.value.problems), caught.value.problems
+def test_a_spoilt_list_of_stations(write, refused, listed, words):
+    rows = write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n")
+    refused(words, understand_table, rows, {}, write(listed, "stations.csv"))
 
 
-def test_names_of_files(write, tmp_path):
-    with pytest.raises(DataError, match="no such file"):
-        understand_table(tmp_path / "nothing.csv")
-    with pytest.raises(DataError, match=r"expected a name ending in .csv"):
-        understand_table(write(PLAIN, "drive.xlsx"))
+def test_names_of_files(write, refused, tmp_path):
+    refused("no such file", understand_table, tmp_path / "nothing.csv")
+    refused("expected a name ending in .csv", understand_table, write(PLAIN, "drive.xlsx"))
 
 
-def test_marks_between_thousands_were_decimal_commas(write):
+def test_marks_between_thousands_were_decimal_commas(write, refused):
     """\"448,262\" in quotes between commas was 448.262 m."""
-    with pytest.raises(
-        DataError, match=r"line 2: '448,262': is no finite number; .* no marks between thousands"
-    ):
-        understand_table(write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n'))
+    marked = write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n')
+    refused("line 2: '448,262': is no finite number; .* no marks between thousands", understand_table, marked)
     some = understand_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n')).raw
     np.testing.assert_array_equal(some.arrays["rx_position"], [[448.262, 412.1], [448.263, 412.25]])
 
@@ -416,41 +383,20 @@ def test_access_points_that_receive_were_transmitters(write):
     assert "rx_position" in understand_table(write(path.read_text().replace("rx_", "tx_"))).raw.arrays
 
 
-def test_parquet(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'gsparc[tables]'")
-    from pyarrow import parquet
-
-    columns = {"lat": [40.0, 40.1], "lon": [8.0, 8.1], "RSRP [dBm]": [-80, None], "pci": [7, 8]}
-    columns |= {"cell_lat": [41.0, 42.0], "cell_lon": [8.0, 8.0]}
-    parquet.write_table(pyarrow.table(columns), tmp_path / "drive.parquet")
-    arrays = understand_table(tmp_path / "drive.parquet").raw.arrays
-    assert arrays["station_name"].tolist() == ["7", "8"] and arrays["row_name"][1] == "row 1"
-    assert arrays["rssi_db"][0] == -80 and np.isnan(arrays["rssi_db"][1])
-    (tmp_path / "bad.parquet").write_bytes(b"PAR1" + bytes(20))
-    with pytest.raises(DataError, match="damaged or not a Parquet file"):
-        understand_table(tmp_path / "bad.parquet")
-
-
-def test_an_index_of_parquet_was_dropped(tmp_path):
-    """pandas sets a column aside as the index: stations were lost, and all rows one station's."""
+def test_parquet(tmp_path, write, refused):
+    """pandas sets columns aside as an index: stations were lost, and all rows one station's."""
     pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'gsparc[tables]'")
     import pandas as pd
 
-    columns = {
-        "x": [0.0, 1],
-        "y": [0.0, 2],
-        "station": ["a", "b"],
-        "station_x": [5.0, 6],
-        "station_y": [0.0, 0],
-    }
-    frame = pd.DataFrame({**columns, "rssi": [-80.0, -70]})
-    for index in (["station"], ["station", "x"]):
-        frame.set_index(index).to_parquet(tmp_path / "drive.parquet")
+    columns = {"lat": [40.0, 40.1], "lon": [8.0, 8.1], "RSRP [dBm]": [-80, None], "pci": [7, 8]}
+    frame = pd.DataFrame({**columns, "cell_lat": [41.0, 42.0], "cell_lon": [8.0, 8.0]})
+    for index in (None, ["pci"], ["pci", "lat"]):
+        (frame if index is None else frame.set_index(index)).to_parquet(tmp_path / "drive.parquet")
         arrays = understand_table(tmp_path / "drive.parquet").raw.arrays
-        assert arrays["station_name"].tolist() == ["a", "b"] and arrays["rx_position"].tolist() == [
-            [0, 0],
-            [1, 2],
-        ]
+        assert arrays["station_name"].tolist() == ["7", "8"] and arrays["row_name"][1] == "row 1"
+        assert arrays["rssi_db"][0] == -80 and np.isnan(arrays["rssi_db"][1])
+        assert arrays["latitude"].tolist() == [40.0, 40.1]
+    refused("damaged or not a Parquet file", understand_table, write(b"PAR1" + bytes(20), "bad.parquet"))
 
 
 @pytest.mark.parametrize(("head", "unit"), [("RSRP [dBm]", "dBm"), ("RSRP [dBW]", "dBm"), ("rssi", "dB")])
@@ -460,11 +406,10 @@ def test_pictures_name_the_unit_that_levels_were_turned_into(write, head, unit):
     assert data.site.level_unit == unit
 
 
-def test_parquet_without_pyarrow(write, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(DataError, match=r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"):
-        understand_table(write(b"PAR1", "drive.parquet"))
-    assert importlib.util.find_spec("pandas") is not None
+def test_parquet_without_pyarrow(write, refused, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    says = r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"
+    refused(says, understand_table, write(b"PAR1", "drive.parquet"))
 
 
 def test_a_real_drive_as_a_table(tmp_path):

@@ -145,28 +145,6 @@ def draw(rng: np.random.Generator) -> Drive:
     )  # fmt: skip
 
 
-# A change makes of a table another one and says what must come of it; None where it cannot be made.
-CHANGES: list[Callable[[Drive, np.random.Generator], tuple[Drive, str] | None]] = []
-
-
-@CHANGES.append
-def columns_in_another_order(drive, rng):
-    heads = [list(drive.columns)[i] for i in rng.permutation(len(drive.columns))]
-    return replace(drive, columns={head: drive.columns[head] for head in heads}), SAME
-
-
-@CHANGES.append
-def rows_in_another_order(drive, rng):
-    order = rng.permutation(COUNT)
-    return replace(drive, columns={h: [v[i] for i in order] for h, v in drive.columns.items()}), SAME
-
-
-@CHANGES.append
-def stations_in_another_order(drive, rng):
-    if drive.listed is not None:
-        return replace(drive, listed={h: v[::-1] for h, v in drive.listed.items()}), SAME
-
-
 def in_another_unit(drive, rng):
     unit = str(rng.choice(list(LENGTHS)))
     heads = [h for h in drive.columns if h.split("_")[-1] in ("x", "y", "z")]
@@ -175,219 +153,178 @@ def in_another_unit(drive, rng):
     return changed, {head: style.format(head, unit) for head in heads}
 
 
-@CHANGES.append
-def another_unit(drive, rng):
-    changed, names = in_another_unit(drive, rng)
-    if names:
-        return changed.renamed(names), SAME
+class Changes:
+    """Each makes of a table another one and says what must come of it; None where it cannot be made."""
+
+    def columns_in_another_order(drive, rng):
+        heads = [list(drive.columns)[i] for i in rng.permutation(len(drive.columns))]
+        return replace(drive, columns={head: drive.columns[head] for head in heads}), SAME
+
+    def rows_in_another_order(drive, rng):
+        order = rng.permutation(COUNT)
+        return replace(drive, columns={h: [v[i] for i in order] for h, v in drive.columns.items()}), SAME
+
+    def stations_in_another_order(drive, rng):
+        if drive.listed is not None:
+            return replace(drive, listed={h: v[::-1] for h, v in drive.listed.items()}), SAME
+
+    def another_unit(drive, rng):
+        changed, names = in_another_unit(drive, rng)
+        if names:
+            return changed.renamed(names), SAME
+
+    def a_unit_lost(drive, rng):
+        changed, names = in_another_unit(drive, rng)
+        if names:
+            del names[str(rng.choice(list(names)))]
+            return changed.renamed(names), REFUSED
+
+    def radians(drive, rng):
+        heads = [h for h in drive.columns if h.endswith(("lat", "lon"))]
+        if heads:
+            changed = replace(drive.with_values(heads, np.radians), digits=10)
+            return changed.renamed({h: f"{h} [rad]" for h in heads}), SAME
+
+    def another_unit_of_levels(drive, rng):
+        levels, watts = ([h for h in drive.columns if unit in h] for unit in ("dBm", "mW"))
+        if levels or watts:
+            changed = drive.with_values(levels, lambda v: v - 30).with_values(watts, lambda v: v / 1e3)
+            names = {h: h.replace("mW", "W").replace("dBm", "dBW") for h in levels + watts}
+            return replace(changed, digits=9).renamed(names), SAME
+
+    def a_field_strength(drive, rng):
+        names = {h: h.replace("dBm", "dBuV/m").replace("mW", "V/m") for h in drive.columns}
+        if list(names) != list(names.values()):
+            return drive.renamed(names), REFUSED
+
+    def axes_swapped(drive, rng):
+        if drive.on_a_map():
+            return drive.renamed(SWAPPED), REFUSED
+
+    def axes_swapped_in_the_list(drive, rng):
+        if drive.listed is not None and drive.on_a_map():
+            listed = {SWAPPED.get(head, head): values for head, values in drive.listed.items()}
+            return replace(drive, listed=listed), REFUSED
+
+    def a_sign_lost(drive, rng):
+        head = str(rng.choice(["lat", "lon", "y"]))
+        if head in drive.columns and drive.on_a_map():
+            return drive.with_values([head], lambda v: -v), REFUSED
+
+    def another_separator(drive, rng):
+        names = [
+            *drive.columns.get(drive.of_stations(), ()),
+            *(drive.listed or {}).get("name", ()),
+            *drive.columns,
+        ]
+        spaces = [" "] * (not any(" " in name for name in names))
+        return replace(drive, separator=str(rng.choice([";", "\t", "|", *spaces]))), SAME
+
+    def another_separator_in_a_line(drive, rng):
+        row, other = -1 - int(rng.integers(COUNT)), ";" if drive.separator == "|" else "|"
+        if drive.separator != " ":
+            return drive.with_line(row, drive.lines()[row].replace(drive.separator, other)), REFUSED
+
+    def another_decimal_mark(drive, rng):
+        return replace(drive, separator=";", decimal="," if drive.decimal == "." else "."), SAME
+
+    def another_decimal_mark_in_a_line(drive, rng):
+        row, marks = -1 - int(rng.integers(COUNT)), (".", ",") if drive.decimal == "." else (",", ".")
+        return drive.with_line(row, drive.lines()[row].replace(*marks, 1)), REFUSED
+
+    def marks_between_thousands(drive, rng):
+        marks = str.maketrans(",.", ".," if drive.decimal == "," else ",.")
+        for head in ("y", "tx_y", "station_y"):
+            if abs(drive.columns.get(head, [0])[0]) > 1e4:
+                return drive.with_values([head], lambda v: f"{v:,.3f}".translate(marks)), REFUSED
+
+    def a_row_commented_out(drive, rng):
+        row, mark = -1 - int(rng.integers(COUNT)), str(rng.choice(["#", "%", "//", "# "]))
+        return drive.with_line(row, mark + drive.lines()[row]), REFUSED
+
+    def a_comment_among_rows(drive, rng):
+        row = -1 - int(rng.integers(COUNT))
+        text = drive.separator.join(["# turned", "back", "here", "and", "there"][: int(rng.integers(1, 6))])
+        return drive.with_line(row, text, drive.lines()[row]), EITHER
+
+    def the_mark_before_heads(drive, rng):
+        return replace(drive, comment="" if drive.comment else "# "), SAME
+
+    def a_sign_in_a_head(drive, rng):
+        heads = [h for h in drive.columns if h[:4] in ("csi_", "h re", "h im") and h[-1] in "123456789"]
+        if heads:
+            head = str(rng.choice(heads))
+            at = max(head.rfind("_"), head.rfind(" ")) + 1
+            turned = head[:at] + str(-int(head[at:]))
+            return drive.renamed(
+                {head: turned if turned not in drive.columns else head[:at] + "0" + turned[at:]}
+            ), REFUSED
+
+    def plus_signs(drive, rng):
+        return drive.with_values(drive.columns, lambda v: drive.number(v, "+")), SAME
+
+    def another_minus(drive, rng):
+        return drive.with_values(drive.columns, lambda v: drive.number(v).replace("-", "\u2212")), EITHER
+
+    def exponents(drive, rng):
+        return drive.with_values(drive.columns, lambda v: f"{v:.12e}".replace(".", drive.decimal)), SAME
+
+    def a_station_misspelt(drive, rng):
+        if drive.listed is not None:
+            names = [name + "b" * (i == 0) for i, name in enumerate(drive.listed["name"])]
+            return replace(drive, listed={**drive.listed, "name": names}), REFUSED
+
+    def stations_by_their_numbers(drive, rng):
+        head = drive.of_stations()
+        if head is not None and drive.listed is not None and not {"0", "1"} & set(drive.listed["name"]):
+            numbers = [str(drive.listed["name"].index(name)) for name in drive.columns[head]]
+            return replace(drive, columns={**drive.columns, head: numbers}), REFUSED
+
+    def a_line_cut_short(drive, rng):
+        row = -1 - int(rng.integers(COUNT))
+        return drive.with_line(row, drive.lines()[row].rpartition(drive.separator)[0]), REFUSED
+
+    def two_lines_in_one(drive, rng):
+        row, lines = -1 - int(rng.integers(COUNT - 1)), drive.lines()
+        return replace(drive.with_line(row, lines[row] + lines[row])), REFUSED
+
+    def a_place_missing(drive, rng):
+        head, row = next(h for h in drive.columns if h in SWAPPED), int(rng.integers(COUNT))
+        gone = [None if i == row else value for i, value in enumerate(drive.columns[head])]
+        return replace(drive, columns={**drive.columns, head: gone}), REFUSED
+
+    def other_heads(drive, rng):
+        names = {"lat": "Latitude (deg)", "lon": "GPS_Longitude", "x": "X [m]", "y": "Y_m", "z": "Height (m)"}
+        return drive.renamed({**names, "rssi": "RxPower_mean", "re": "real", "im": "H Imag"}), SAME
+
+    def a_column_more(drive, rng):
+        more = {
+            "battery_level": 3.5,
+            "rssi_delta": 1.0,
+            "SINR": 12.0,
+            "tx_power_dbm": 30.0,
+            "time": "12:30:05",
+            "": 4.0,
+        }
+        head = str(rng.choice(list(more)))
+        return replace(drive, columns={**drive.columns, head: [more[head]] * COUNT}), EITHER
+
+    def a_second_level(drive, rng):
+        if not drive.said:
+            return replace(drive, columns={"RSSI strongest": [-50.0] * COUNT, **drive.columns}), REFUSED
+
+    def empty_lines(drive, rng):
+        lines = drive.lines()
+        return replace(drive, changed=(*lines[:-3], "", drive.separator * 3, *lines[-3:], "", "")), SAME
+
+    def a_trailing_separator(drive, rng):
+        first = len(drive.above) + 1
+        lines = [line + drive.separator * (i >= first) for i, line in enumerate(drive.lines())]
+        if drive.separator != " ":
+            return replace(drive, changed=tuple(lines)), EITHER
 
 
-@CHANGES.append
-def a_unit_lost(drive, rng):
-    changed, names = in_another_unit(drive, rng)
-    if names:
-        del names[str(rng.choice(list(names)))]
-        return changed.renamed(names), REFUSED
-
-
-@CHANGES.append
-def radians(drive, rng):
-    heads = [h for h in drive.columns if h.endswith(("lat", "lon"))]
-    if heads:
-        changed = replace(drive.with_values(heads, np.radians), digits=10)
-        return changed.renamed({h: f"{h} [rad]" for h in heads}), SAME
-
-
-@CHANGES.append
-def another_unit_of_levels(drive, rng):
-    levels, watts = ([h for h in drive.columns if unit in h] for unit in ("dBm", "mW"))
-    if levels or watts:
-        changed = drive.with_values(levels, lambda v: v - 30).with_values(watts, lambda v: v / 1e3)
-        names = {h: h.replace("mW", "W").replace("dBm", "dBW") for h in levels + watts}
-        return replace(changed, digits=9).renamed(names), SAME
-
-
-@CHANGES.append
-def a_field_strength(drive, rng):
-    names = {h: h.replace("dBm", "dBuV/m").replace("mW", "V/m") for h in drive.columns}
-    if list(names) != list(names.values()):
-        return drive.renamed(names), REFUSED
-
-
-@CHANGES.append
-def axes_swapped(drive, rng):
-    if drive.on_a_map():
-        return drive.renamed(SWAPPED), REFUSED
-
-
-@CHANGES.append
-def axes_swapped_in_the_list(drive, rng):
-    if drive.listed is not None and drive.on_a_map():
-        listed = {SWAPPED.get(head, head): values for head, values in drive.listed.items()}
-        return replace(drive, listed=listed), REFUSED
-
-
-@CHANGES.append
-def a_sign_lost(drive, rng):
-    head = str(rng.choice(["lat", "lon", "y"]))
-    if head in drive.columns and drive.on_a_map():
-        return drive.with_values([head], lambda v: -v), REFUSED
-
-
-@CHANGES.append
-def another_separator(drive, rng):
-    names = [
-        *drive.columns.get(drive.of_stations(), ()),
-        *(drive.listed or {}).get("name", ()),
-        *drive.columns,
-    ]
-    spaces = [" "] * (not any(" " in name for name in names))
-    return replace(drive, separator=str(rng.choice([";", "\t", "|", *spaces]))), SAME
-
-
-@CHANGES.append
-def another_separator_in_a_line(drive, rng):
-    row, other = -1 - int(rng.integers(COUNT)), ";" if drive.separator == "|" else "|"
-    if drive.separator != " ":
-        return drive.with_line(row, drive.lines()[row].replace(drive.separator, other)), REFUSED
-
-
-@CHANGES.append
-def another_decimal_mark(drive, rng):
-    return replace(drive, separator=";", decimal="," if drive.decimal == "." else "."), SAME
-
-
-@CHANGES.append
-def another_decimal_mark_in_a_line(drive, rng):
-    row, marks = -1 - int(rng.integers(COUNT)), (".", ",") if drive.decimal == "." else (",", ".")
-    return drive.with_line(row, drive.lines()[row].replace(*marks, 1)), REFUSED
-
-
-@CHANGES.append
-def marks_between_thousands(drive, rng):
-    marks = str.maketrans(",.", ".," if drive.decimal == "," else ",.")
-    for head in ("y", "tx_y", "station_y"):
-        if abs(drive.columns.get(head, [0])[0]) > 1e4:
-            return drive.with_values([head], lambda v: f"{v:,.3f}".translate(marks)), REFUSED
-
-
-@CHANGES.append
-def a_row_commented_out(drive, rng):
-    row, mark = -1 - int(rng.integers(COUNT)), str(rng.choice(["#", "%", "//", "# "]))
-    return drive.with_line(row, mark + drive.lines()[row]), REFUSED
-
-
-@CHANGES.append
-def a_comment_among_rows(drive, rng):
-    row = -1 - int(rng.integers(COUNT))
-    text = drive.separator.join(["# turned", "back", "here", "and", "there"][: int(rng.integers(1, 6))])
-    return drive.with_line(row, text, drive.lines()[row]), EITHER
-
-
-@CHANGES.append
-def the_mark_before_heads(drive, rng):
-    return replace(drive, comment="" if drive.comment else "# "), SAME
-
-
-@CHANGES.append
-def a_sign_in_a_head(drive, rng):
-    heads = [h for h in drive.columns if h[:4] in ("csi_", "h re", "h im") and h[-1] in "123456789"]
-    if heads:
-        head = str(rng.choice(heads))
-        at = max(head.rfind("_"), head.rfind(" ")) + 1
-        turned = head[:at] + str(-int(head[at:]))
-        return drive.renamed(
-            {head: turned if turned not in drive.columns else head[:at] + "0" + turned[at:]}
-        ), REFUSED
-
-
-@CHANGES.append
-def plus_signs(drive, rng):
-    return drive.with_values(drive.columns, lambda v: drive.number(v, "+")), SAME
-
-
-@CHANGES.append
-def another_minus(drive, rng):
-    return drive.with_values(drive.columns, lambda v: drive.number(v).replace("-", "\u2212")), EITHER
-
-
-@CHANGES.append
-def exponents(drive, rng):
-    return drive.with_values(drive.columns, lambda v: f"{v:.12e}".replace(".", drive.decimal)), SAME
-
-
-@CHANGES.append
-def a_station_misspelt(drive, rng):
-    if drive.listed is not None:
-        names = [name + "b" * (i == 0) for i, name in enumerate(drive.listed["name"])]
-        return replace(drive, listed={**drive.listed, "name": names}), REFUSED
-
-
-@CHANGES.append
-def stations_by_their_numbers(drive, rng):
-    head = drive.of_stations()
-    if head is not None and drive.listed is not None and not {"0", "1"} & set(drive.listed["name"]):
-        numbers = [str(drive.listed["name"].index(name)) for name in drive.columns[head]]
-        return replace(drive, columns={**drive.columns, head: numbers}), REFUSED
-
-
-@CHANGES.append
-def a_line_cut_short(drive, rng):
-    row = -1 - int(rng.integers(COUNT))
-    return drive.with_line(row, drive.lines()[row].rpartition(drive.separator)[0]), REFUSED
-
-
-@CHANGES.append
-def two_lines_in_one(drive, rng):
-    row, lines = -1 - int(rng.integers(COUNT - 1)), drive.lines()
-    return replace(drive.with_line(row, lines[row] + lines[row])), REFUSED
-
-
-@CHANGES.append
-def a_place_missing(drive, rng):
-    head, row = next(h for h in drive.columns if h in SWAPPED), int(rng.integers(COUNT))
-    gone = [None if i == row else value for i, value in enumerate(drive.columns[head])]
-    return replace(drive, columns={**drive.columns, head: gone}), REFUSED
-
-
-@CHANGES.append
-def other_heads(drive, rng):
-    names = {"lat": "Latitude (deg)", "lon": "GPS_Longitude", "x": "X [m]", "y": "Y_m", "z": "Height (m)"}
-    return drive.renamed({**names, "rssi": "RxPower_mean", "re": "real", "im": "H Imag"}), SAME
-
-
-@CHANGES.append
-def a_column_more(drive, rng):
-    more = {
-        "battery_level": 3.5,
-        "rssi_delta": 1.0,
-        "SINR": 12.0,
-        "tx_power_dbm": 30.0,
-        "time": "12:30:05",
-        "": 4.0,
-    }
-    head = str(rng.choice(list(more)))
-    return replace(drive, columns={**drive.columns, head: [more[head]] * COUNT}), EITHER
-
-
-@CHANGES.append
-def a_second_level(drive, rng):
-    if not drive.said:
-        return replace(drive, columns={"RSSI strongest": [-50.0] * COUNT, **drive.columns}), REFUSED
-
-
-@CHANGES.append
-def empty_lines(drive, rng):
-    lines = drive.lines()
-    return replace(drive, changed=(*lines[:-3], "", drive.separator * 3, *lines[-3:], "", "")), SAME
-
-
-@CHANGES.append
-def a_trailing_separator(drive, rng):
-    first = len(drive.above) + 1
-    lines = [line + drive.separator * (i >= first) for i, line in enumerate(drive.lines())]
-    if drive.separator != " ":
-        return replace(drive, changed=tuple(lines)), EITHER
+CHANGES = [change for name, change in vars(Changes).items() if not name.startswith("_")]
 
 
 def load(drive: Drive, folder) -> Measurements:

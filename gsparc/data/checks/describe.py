@@ -11,6 +11,7 @@ from gsparc.data.schema import ENDS, Measurements, Site
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.ops import SphereGrid
 
+TINY_DEGREES = 1.0  # a campaign's extent in degrees
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 
@@ -28,7 +29,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("moves", _moving(data)),
         ("neighbours", neighbours(places_of(data), site.wavelength)),
         *(("units?", hint) for hint in suspicious_values(data)),
-        *(("outliers?", said) for said in outliers.warnings(data)),
+        *(("outliers?", warning) for warning in outliers.warnings(data)),
         ("carrier", carrier),
     ]
     if tones is not None and len(tones) > 1:
@@ -115,42 +116,56 @@ def _moving(data: Measurements) -> str:
 
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
-    site, ends = data.site, np.concatenate([data.tx, data.rx_position])
-    found = []
-    if site.georeference is None:  # degrees became metres: no unit to mistake
-        found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
+    site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
+    hints = []
+    if not np.ptp(data.moving, axis=0).any():
+        hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
+    elif site.georeference is None:  # degrees became metres: no unit to mistake
+        hints = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3] + site.origin)
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
             waves = f"{reach / site.wavelength:.3g} wavelengths"
-            found.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
+            hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
     if site.grid is not None:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         if abs(turn / (2 * np.pi) - 1) < 0.02:
-            found.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
+            hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
     if site.kind == "rssi" and (data.target == 0).any():
         count = int((data.target == 0).sum())
-        found.append(
+        hints.append(
             f"{count} powers are exactly 0, learned as -300 dB: not heard? make them NaN, or give "
             "rssi_db and sensitivity_db"
         )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
         if 0 < spread < 0.1:
-            found.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
-    return found
+            hints.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
+    return hints
 
 
 def _units(positions: np.ndarray) -> list[str]:
-    """Warnings that positions (n, 3) may not be metres."""
-    extent = np.ptp(positions, axis=0)
-    height, width = float(extent[2]), float(extent.max())
+    """Warnings that positions (n, 3), in the world, may not be metres."""
+    extent, middle = np.ptp(positions, axis=0), np.abs(np.median(positions[:, :2], axis=0))
+    height, width, across = float(extent[2]), float(extent.max()), float(extent[:2].max())
+    reach = np.abs(positions[:, :2]).max(axis=0)
+    on_earth = reach.max() <= 180 and reach.min() <= 90
+    if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
+        near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
+        return [
+            f"positions near {near} within {across:.2g}: degrees? then give them as latitude and longitude"
+        ]
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
         hint = f"if these are {unit}, the box is {size} m: convert to metres"
         far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
         return [f"{far}; {hint}"]
+    if across > 1000 and (positions % 1 == 0).all():
+        size = " x ".join(f"{e / 1000:.4g}" for e in extent)
+        return [
+            f"positions are whole numbers up to {across:.0f} apart: millimetres? the box is {size} m then"
+        ]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []

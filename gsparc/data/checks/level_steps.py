@@ -81,12 +81,12 @@ def level_steps(
     regressors = np.stack(mean, axis=1)
     precision = _precision(places, level, regressors)
     after, change, sigmas = _search(precision, level, regressors)
-    found = [
+    steps = [
         LevelStep(int(blocks[k - 1][-1]), int(blocks[k][0]), float(d), float(s))
         for k, d, s in zip(after, change, sigmas, strict=True)
         if abs(d) >= LEAST_DB and s >= LEAST_SIGMAS
     ]
-    return tuple(sorted(found, key=lambda step: step.first))
+    return tuple(sorted(steps, key=lambda step: step.first))
 
 
 def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:

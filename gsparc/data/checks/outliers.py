@@ -26,9 +26,9 @@ def too_strong(peaks: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
     known = np.isfinite(level)
-    found = np.zeros(len(level), bool)
-    found[known] = _few_beyond(level[known], lambda inner, outer: outer - inner > GAP_DB)
-    return found
+    strong = np.zeros(len(level), bool)
+    strong[known] = _few_beyond(level[known], lambda inner, outer: outer - inner > GAP_DB)
+    return strong
 
 
 def too_far(positions: np.ndarray) -> np.ndarray:
@@ -48,31 +48,31 @@ def _few_beyond(values: np.ndarray, gap: Callable[[float, float], bool]) -> np.n
 
 def peaks(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Largest magnitude (S,) of the measured entries of rows `values` (S, ...)."""
-    found = []
+    highest = []
     for part in blocks(values):
         magnitude = np.abs(values[part] if mask is None else np.where(mask[part], values[part], 0))
-        found.append(magnitude.reshape(len(magnitude), -1).max(axis=1, initial=0))
-    return np.concatenate(found)
+        highest.append(magnitude.reshape(len(magnitude), -1).max(axis=1, initial=0))
+    return np.concatenate(highest)
 
 
 def outliers(data: Measurements) -> dict[str, np.ndarray]:
     """Rows (n,) by what is wrong with them."""
     amplitude = peaks(data.target, data.mask)
     amplitude = np.sqrt(amplitude) if data.site.kind == "rssi" else amplitude
-    found = {
+    rows_by_fault = {
         "measure far more power than all others": np.flatnonzero(too_strong(amplitude)),
         "lie far outside the region of all others": np.flatnonzero(too_far(data.moving)),
     }
-    return {what: rows for what, rows in found.items() if len(rows)}
+    return {what: rows for what, rows in rows_by_fault.items() if len(rows)}
 
 
 def warnings(data: Measurements) -> list[str]:
     """One sentence for each kind of outlier, with the names of the first rows."""
-    said = []
+    sentences = []
     for what, rows in outliers(data).items():
         names = some([data.row_names[i] for i in rows])
-        said.append(f"{names}: {what}; if they are wrong, leave them out with split.leave_out=outliers")
-    return said
+        sentences.append(f"{names}: {what}; if they are wrong, leave them out with split.leave_out=outliers")
+    return sentences
 
 
 WIDTHS = 30.0  # of the rows' box
@@ -107,13 +107,13 @@ def far_ends(still: np.ndarray, moving: np.ndarray, origin: Georeference | None)
                 turned = origin.from_degrees(longitude, latitude)
         swapped = bool(beyond(turned)[0] < 0.1 * distance[far])
         hint = f"are {axes} swapped?" if swapped else "are both in one system and unit?"
-        said = (
+        fault = (
             f"a static end {distance[far] / 1e3:.4g} km from all rows, which reach over {width:.4g} m; {hint}"
         )
-        return said, swapped or bool(distance[far] > TOO_DISTANT_M)
+        return fault, swapped or bool(distance[far] > TOO_DISTANT_M)
     below, above = float(low[2] - still[:, 2].min()), float(still[:, 2].max() - high[2])
     if max(below, above) > APART_M:
         side = "below" if below > above else "above"
-        said = f"a static end {max(below, above):.4g} m {side} all rows"
-        return f"{said}: heights above the sea beside heights above the ground?", False
+        fault = f"a static end {max(below, above):.4g} m {side} all rows"
+        return f"{fault}: heights above the sea beside heights above the ground?", False
     return "", False

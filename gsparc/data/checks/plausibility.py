@@ -7,13 +7,12 @@ what one station measured at one place, in the order of measuring; levels are in
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, level_steps
-from gsparc.data.checks.outliers import too_far
 from gsparc.data.errors import some
 from gsparc.data.schema import Measurements
 
@@ -26,7 +25,6 @@ LONG_GAP = 20  # rows without a value in one piece
 EDGE = 10  # rows beside it
 FEW = 0.005  # of a station's rows: fewer are no sign of a limit
 WEAK_DB = 6.0  # above the weakest value: heard only just
-TINY_DEGREES = 1.0  # a campaign's extent in degrees
 
 
 def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
@@ -36,46 +34,8 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
         levels: of powers.
         steps: `steps_of` them.
     """
-    position, station, level_db = levels.position, levels.station, levels.level_db
-    names, rows = levels.names, levels.rows
-    found = position_warnings(position, rows) + level_warnings(level_db)
-    found += direction_warnings(position, station, level_db, levels.station_position)
-    found += copies(position, station, level_db, rows)
-    found += wild_rows(station, level_db, names, rows)
-    found += changed_levels(levels, steps)
-    return found + gaps(station, level_db, names, rows)
-
-
-def position_warnings(position: np.ndarray, rows: Sequence[str]) -> list[str]:
-    """Positions (n, 2) or (n, 3) that may be degrees or millimetres, do not differ, or lie far off."""
-    if not np.ptp(position, axis=0).any():
-        return ["all positions are the same, a box of 0 m: is it the moving end's column?"]
-    lost = too_far(position)
-    found = []
-    if lost.any():
-        which = some([rows[i] for i in np.flatnonzero(lost).tolist()])
-        found.append(f"{which}: far outside the region of all others; a lost fix of the receiver?")
-    return found + _units(position[~lost])
-
-
-def _units(position: np.ndarray) -> list[str]:
-    extent = np.ptp(position, axis=0)
-    middle = np.abs(np.median(position[:, :2], axis=0))
-    across = float(extent[:2].max())
-    on_earth = (np.abs(position[:, :2]) <= 180).all() and (np.abs(position[:, :2]).max(axis=0) <= 90).any()
-    if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
-        return [
-            f"positions near ({position[0, 0]:.6g}, {position[0, 1]:.6g}) within {across:.2g}: degrees? "
-            "then give them as latitude and longitude"
-        ]
-    if across > 1000 and (position % 1 == 0).all():
-        size = " x ".join(f"{e / 1000:.4g}" for e in extent)
-        return [
-            f"positions are whole numbers up to {across:.0f} apart: millimetres? the box is {size} m then"
-        ]
-    if position.shape[1] > 2 and extent[2] > 1000:
-        return [f"heights differ by {extent[2]:.4g} m: millimetres, or feet?"]
-    return []
+    found = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
+    return [*found, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
@@ -97,65 +57,68 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         return []
     if not np.ptp(values):
         return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
-    found = marks(values)
-    for mark, _ in _marks(values):
+    marks = _marks(values)
+    warnings = _mark_warnings(marks, values)
+    for mark, _ in marks:
         values = values[values != mark]
     low, high = float(values.min()), float(values.max())
     if low >= 0 and high <= 1:
-        found.append(f"all levels lie between {low:g} and {high:g}: linear power? then give it as rssi, in W")
+        warnings.append(
+            f"all levels lie between {low:g} and {high:g}: linear power? then give it as rssi, in W"
+        )
     elif high > HIGHEST_DBM and low >= 0:
-        found.append(
+        warnings.append(
             f"levels from {low:g} to {high:g} are all positive: losses, percent, or linear? expected dBm"
         )
     elif high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
-        found.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
+        warnings.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
     elif low >= 0 and (values % 1 == 0).all():
-        found.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
-    return found
+        warnings.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
+    return warnings
 
 
-def marks(values: np.ndarray) -> list[str]:
-    """A value (n,) that many rows have and that lies apart from all others, or at the lower end."""
-    said = []
-    for mark, apart in _marks(values):
+def _mark_warnings(marks: list[tuple[float, bool]], values: np.ndarray) -> list[str]:
+    warnings = []
+    for mark, apart in marks:
         count, shown = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
         share = f"{count} of {len(values)} levels are exactly {shown}"
         if apart:
-            said.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
+            warnings.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
         else:
-            said.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={shown}")
-    return said
+            warnings.append(
+                f"{share}, the least: not heard? leave them empty and give sensitivity_db={shown}"
+            )
+    return warnings
 
 
 def _marks(values: np.ndarray) -> list[tuple[float, bool]]:
+    """Values (n,) that many rows have and that lie apart from all others (True), or at the lower end."""
     different, counts = np.unique(values, return_counts=True)
     if len(different) < 4:
         return []
-    found = []
+    marks = []
     for i, inner in ((0, 1), (len(different) - 1, len(different) - 2)):
         distance = abs(different[i] - different[inner])
         apart = distance > 20 and distance > 0.3 * abs(different[-2] - different[1]) and counts[i] >= 3
         pile = i == 0 and counts[0] > max(0.05 * len(values), 5 * float(np.median(counts)), 10)
         if apart or pile:
-            found.append((float(different[i]), bool(apart)))
-    return found
+            marks.append((float(different[i]), bool(apart)))
+    return marks
 
 
-def direction_warnings(
-    position: np.ndarray, station: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None
-) -> list[str]:
+def direction_warnings(levels: LinkLevels) -> list[str]:
     """Levels that rise with the distance from their station: losses, or stations in wrong places."""
-    if station_position is None:
+    if levels.station_position is None:
         return []
-    axes = min(position.shape[1], station_position.shape[1])
-    distance = np.linalg.norm(position[:, :axes] - station_position[station, :axes], axis=1)
+    axes = min(levels.position.shape[1], levels.station_position.shape[1])
+    away = levels.position[:, :axes] - levels.station_position[levels.station, :axes]
+    spread = np.log10(np.maximum(np.linalg.norm(away, axis=1), 1e-3))
     slopes = []
-    for t in np.unique(station):
-        used = (station == t) & np.isfinite(level_db)
-        spread = np.log10(np.maximum(distance[used], 1e-3))
-        if used.sum() >= 20 and np.ptp(spread) > 0.3 and np.ptp(level_db[used]) > 0:
-            slopes.append(np.corrcoef(spread, level_db[used])[0, 1])
+    for _, used in levels.heard():
+        level = levels.level_db[used]
+        if len(used) >= 20 and np.ptp(spread[used]) > 0.3 and np.ptp(level) > 0:
+            slopes.append(np.corrcoef(spread[used], level)[0, 1])
     if slopes and np.median(slopes) > 0.3:
         return [
             f"levels rise with distance (correlation {np.median(slopes):.2f}): losses instead of levels, "
@@ -164,63 +127,60 @@ def direction_warnings(
     return []
 
 
-def copies(position: np.ndarray, station: np.ndarray, level_db: np.ndarray, rows: Sequence[str]) -> list[str]:
+def copies(levels: LinkLevels) -> list[str]:
     """Rows of one place and station: copies where the value is the same, repeated measurements where not."""
     import pandas as pd  # here, as it takes half a second
 
-    where = np.unique(np.column_stack([position, station]), axis=0, return_inverse=True)[1].reshape(-1)
-    table = pd.DataFrame({"link": where, "level": level_db, "row": range(len(level_db))}).dropna()
+    rows = levels.rows
+    places = np.column_stack([levels.position, levels.station])
+    where = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+    table = pd.DataFrame({"link": where, "level": levels.level_db, "row": range(len(rows))})
     table = table[np.isfinite(table["level"])].sort_values("link", kind="stable")
     first = table.groupby(["link", "level"])["row"].transform("first")
-    found = []
+    warnings = []
     same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        found.append(f"copies (same place, station and level): {some(same)}; leave them out")
+        warnings.append(f"copies (same place, station and level): {some(same)}; leave them out")
     spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
     if len(spreads):
-        found.append(
+        warnings.append(
             f"{len(spreads)} places were measured more than once by one station, with different levels "
             f"(standard deviation {spreads.median():.2g} dB, median)"
         )
-    return found
+    return warnings
 
 
-def wild_rows(
-    station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: Sequence[str]
-) -> list[str]:
+def wild_rows(levels: LinkLevels) -> list[str]:
     """Single rows whose level is far from those of the rows before and after them at the same station."""
-    found = []
-    for t, bad, most in wild_of(station, level_db):
-        where = f"station {names[t]}: " if len(names) > 1 else ""
-        found.append(
-            f"{where}{some([rows[i] for i in bad])}: up to {most:.0f} dB from the rows around; wrong?"
-        )
-    return found
+    warnings = []
+    for t, bad, most in wild_of(levels):
+        where = f"station {levels.names[t]}: " if len(levels.names) > 1 else ""
+        rows = some([levels.rows[i] for i in bad])
+        warnings.append(f"{where}{rows}: up to {most:.0f} dB from the rows around; wrong?")
+    return warnings
 
 
-def wild_of(station: np.ndarray, level_db: np.ndarray) -> list[tuple[int, np.ndarray, float]]:
+def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
     """(station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
     found = []
-    for t in np.unique(station):
-        used = np.flatnonzero((station == t) & np.isfinite(level_db))
+    for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
             continue
-        level = level_db[used]
+        level = levels.level_db[used]
         padded = np.pad(level, NEIGHBOURS, mode="reflect")
         around = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
         difference = np.abs(level - np.median(around, axis=1))
         wild = difference > max(OUTLIER_DB, SPREADS * 1.4826 * float(np.median(difference)))
         # A single row: where the neighbour differs as much it is a place, not a fault.
-        alone = wild & ~np.roll(wild, 1) & ~np.roll(wild, -1)
-        bad = np.flatnonzero(alone)
+        bad = np.flatnonzero(wild & ~np.roll(wild, 1) & ~np.roll(wild, -1))
         if 0 < len(bad) <= max(NAMED, len(used) // 100):
-            found.append((int(t), used[bad], float(difference[bad].max())))
+            found.append((t, used[bad], float(difference[bad].max())))
     return found
 
 
 def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Stations whose level changes at a row though the places do not explain it (`level_steps`)."""
-    names, rows, found = levels.names, levels.rows, []
+    names, rows, warnings = levels.names, levels.rows, []
     for t, step in steps:
         who = f"station {names[t]}" if len(names) > 1 else "the level"
         verb = "rises" if step.change_db > 0 else "falls"
@@ -228,17 +188,17 @@ def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -
         what, _, number = after.partition(" ")
         named = what == "row" and number.isdigit() and len(names) > 1
         setting = f"{{{names[t]}:[{number}]}}" if named else "{STATION:[ROW]}"
-        found.append(
+        warnings.append(
             f"{who} {verb} by {abs(step.change_db):.0f} dB between {before} and {after}, which the places do "
             f"not explain: another gain or antenna? dataset.level_steps={setting} makes it another station "
             "from there on"
         )
-    return found
+    return warnings
 
 
 def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     """Stations and their steps, which name rows of `levels`."""
-    found = []
+    steps = []
     stations = np.unique(levels.station)
     blocks = int(np.clip(20 * MOST_BLOCKS / len(stations), 200, MOST_BLOCKS)) if len(stations) else 0
     for t in stations:
@@ -246,24 +206,25 @@ def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
         where = None if levels.station_position is None else levels.station_position[t]
         where = where if where is not None and np.isfinite(where).all() else None
         for step in level_steps(levels.position[used], levels.level_db[used], where, blocks):
-            found.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
-    return found
+            steps.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
+    return steps
 
 
-def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: Sequence[str]) -> list[str]:
+def gaps(levels: LinkLevels) -> list[str]:
     """Missing levels: long runs of rows (a station was off) and scattered ones (perhaps not heard).
 
     A long run is no outage but out of reach where the values beside it are near the station's weakest, and
     where fading makes its edges ragged.
     """
+    names, rows = levels.names, levels.rows
     long: dict[tuple[str, str], list[str]] = defaultdict(list)
     lengths: dict[tuple[str, str], int] = {}
     faint: list[tuple[str, int, float]] = []
     plain: list[tuple[str, int]] = []
     silent: list[str] = []
-    for t in np.unique(station):
-        used = np.flatnonzero(station == t)
-        level = level_db[used]
+    for t in np.unique(levels.station):
+        used = np.flatnonzero(levels.station == t)
+        level = levels.level_db[used]
         missing = ~np.isfinite(level)
         if missing.all():
             silent.append(str(names[t]))
@@ -290,27 +251,27 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
             faint.append((str(names[t]), scattered, float(level[~missing].min())))
         elif scattered:
             plain.append((str(names[t]), scattered))
-    found = [
+    warnings = [
         f"no level in the {lengths[key]} rows from {key[0]} to {key[1]}{_of(who, len(names))}: an outage; "
         "these rows are not used"
         for key, who in sorted(long.items(), key=lambda item: -lengths[item[0]])
     ]
     if silent:
-        found.append(f"no level in any row{_of(silent, len(names))}")
+        warnings.append(f"no level in any row{_of(silent, len(names))}")
     if faint:
         count, least = sum(n for _, n, _ in faint), min(v for _, _, v in faint)
         who = _of([name for name, _, _ in faint], len(names))
-        found.append(
+        warnings.append(
             f"{count} levels missing{who}, beside the weakest ones: not heard? then give sensitivity_db "
             f"(the least level is {least:.4g} dB), and they count as below it"
         )
     if plain:
         count = sum(n for _, n in plain)
-        found.append(
+        warnings.append(
             f"{count} single levels missing{_of([n for n, _ in plain], len(names))}, few or beside strong "
             "ones: lost rather than not heard; they are not used"
         )
-    return found
+    return warnings
 
 
 def _of(who: list[str], total: int) -> str:
@@ -336,6 +297,11 @@ class LinkLevels:
     rows: list[str]
     names: list[str]
     station_position: np.ndarray | None
+
+    def heard(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Each station, and its rows (k,) with a value."""
+        for t in np.unique(self.station):
+            yield int(t), np.flatnonzero((self.station == t) & np.isfinite(self.level_db))
 
 
 def link_levels(data: Measurements) -> LinkLevels | None:

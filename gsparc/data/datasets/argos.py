@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import assemble, check_positions, rounded_rms
-from gsparc.data.datasets.campaign import Release, StandIn, simulated
+from gsparc.data.datasets.campaign import Release, StandIn, read_split, simulated
 from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite
@@ -67,7 +67,9 @@ def load_argos(
     scale = rounded_rms(csi)
     csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
     uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
-    split = _split(root, len(csi))
+    problems = Problems(root)
+    split = read_split(root, len(csi), problems)
+    problems.raise_if_any()
     where = _positions(root, positions, encoder, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
@@ -173,22 +175,6 @@ def _chosen(antenna: int | str, count: int) -> np.ndarray:
     return np.array([antenna])
 
 
-def _split(root: Path, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
-    paths = [root / f"{name}_index.txt" for name in ("train", "test")]
-    if not all(path.exists() for path in paths):
-        return None
-    try:
-        train, test = (np.loadtxt(path, dtype=np.int64, ndmin=1) for path in paths)
-    except ValueError as error:
-        raise DataError(f"{paths[0].parent}: an index file is not a list of row numbers ({error})") from None
-    every = np.concatenate([train, test])
-    once = len(np.intersect1d(every, np.arange(rows))) == len(every)
-    if not (len(train) and len(test) and once):
-        fault = f"the index files are empty, name a row twice, or one outside 0 to {rows - 1}"
-        raise DataError(f"{root}: {fault}")
-    return train, test
-
-
 def _positions(
     root: Path,
     positions: str,
@@ -227,6 +213,7 @@ class Argos(Release):
     """
 
     called, reader = "Argos", staticmethod(load_argos)
+    hint = "It comes with the code of FIRE and NeRF2: put csidata.npy and base-station.yml into a folder"
 
     def __init__(
         self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
@@ -235,14 +222,6 @@ class Argos(Release):
         file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
         super().__init__(root, **rest)
         self.encoder = (room, EncoderSettings(**given), file)
-
-    def missing(self) -> str:
-        """See `Release`."""
-        where = "dataset.root is not set" if self.root is None else f"{self.root} is not there"
-        return (
-            f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
-            "csidata.npy and base-station.yml into a folder and set dataset.root=FOLDER."
-        )
 
     def read(self, folder: Path) -> Measurements:
         """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
 from gsparc.data.raw import Raw, read_raw
+from gsparc.data.schema import TEXT
 
 LAYOUT = {
     "mobile_position": Expected(("S", 3), place=True, field="tx_position"),

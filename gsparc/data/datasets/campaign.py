@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,11 @@ from gsparc.data.assemble import FARTHEST, bad_positions
 from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, Problems
+from gsparc.data.files import read_text
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
-from gsparc.data.schema import Measurements
-from gsparc.data.selection import Selection, rows_by_station, select, split_stations
+from gsparc.data.schema import KIND_WORDS, REAL, Measurements
+from gsparc.data.selection import Selection, select
 
 log = logging.getLogger(__name__)
 
@@ -29,8 +29,7 @@ class Campaign(DataModule):
     Args:
         file: what `raw` reads.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
-        stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
-        level_steps: by station, rows from which it counts as another; see `gsparc.data.selection`.
+        stations, runs, min_rssi_db, max_rows, level_steps: see `gsparc.data.selection.Selection`.
         **settings: what `reader` takes besides.
     """
 
@@ -52,8 +51,7 @@ class Campaign(DataModule):
         super().__init__(name or self.choice, batch_size)
         self.file = str(file) if "://" in str(file) else Path(file)  # which would make one of two slashes
         self.settings = settings
-        self.selection = Selection(stations, runs, min_rssi_db, max_rows)
-        self.level_steps = rows_by_station(level_steps or {})
+        self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
 
     def raw(self) -> Raw:
         """The file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
@@ -62,10 +60,10 @@ class Campaign(DataModule):
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
         raw = self.raw()
-        selected = select(split_stations(raw, self.level_steps, self.file), self.selection, self.file)
+        selected = select(raw, self.selection, self.file)
         reading = interpret(selected.raw, self.file)
-        said = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*said, *selected.notes, *reading.notes):
+        left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
+        for note in (*left_out, *selected.notes, *reading.notes):
             log.warning("%s: %s", self.file, note)
         for hint in suspicious_values(reading.data):
             log.warning("%s: units? %s", self.file, hint)
@@ -94,6 +92,7 @@ class Release(DataModule):
     """
 
     called = ""  # the release, in messages; in small letters the choice of conf/dataset
+    hint = ""  # how to get it
     reader: ClassVar[Callable[..., Measurements]]  # what a folder holds
 
     def __init__(
@@ -107,9 +106,10 @@ class Release(DataModule):
         super().__init__(name or self.called.lower(), batch_size)
         self.root, self.stand_in, self.settings = None if root is None else Path(root), stand_in, settings
 
-    @abstractmethod
     def missing(self) -> str:
         """Why the release is not used, and how to get it."""
+        root = f"dataset.root={self.root} does not exist" if self.root else "dataset.root is not set"
+        return f"{root}: the {self.called} release is NOT on disk. {self.hint}, then set dataset.root=FOLDER."
 
     def read(self, folder: Path) -> Measurements:
         """A folder in the release's layout; `DataError` where something is missing or wrong."""
@@ -148,14 +148,55 @@ def write_split(folder: Path, count: int, seed: int, first: int = 0, form: str =
         np.savetxt(folder / f"{name}_index.txt", np.sort(rows), fmt=form)
 
 
-REAL, COMPLEX, FLAGS, TEXT, LABELS = "iuf", "c", "biuf", "US", "USiu"  # kinds of NumPy's dtypes
-IN_WORDS = {
-    REAL: "real numbers",
-    COMPLEX: "complex numbers",
-    FLAGS: "True and False",
-    TEXT: "text",
-    LABELS: "text or whole numbers",
-}
+def read_split(
+    folder: Path, count: int | None, problems: Problems, first: int = 0
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """(train, test) rows from 0 that `train_index.txt` and `test_index.txt` name; None where there are none.
+
+    Args:
+        folder: of the release.
+        count: number of rows; None: unknown.
+        problems: takes what is wrong.
+        first: number of the first row in the files.
+    """
+    paths = [folder / "train_index.txt", folder / "test_index.txt"]
+    present = [path for path in paths if path.exists()]
+    if not present:
+        return None
+    if len(present) == 1:
+        absent = next(path for path in paths if path not in present)
+        return problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
+    train, test = (_read_index(path, count, problems, first) for path in paths)
+    if train is None or test is None:
+        return None
+    both = np.intersect1d(train, test)
+    problems.add_rows(paths[1], (f"index {i + first:05d}" for i in both), "also in train_index.txt")
+    return train, test
+
+
+def _read_index(path: Path, count: int | None, problems: Problems, first: int) -> np.ndarray | None:
+    """Rows (n,) from 0, sorted."""
+    text = problems.attempt(lambda: read_text(path, "missing"))
+    lines: dict[int, int] = {}  # in which each row was named first
+    for number, line in enumerate((text or "").split("\n"), start=1):
+        for word in line.split():
+            where, digits = f"{path}, line {number}", word.removesuffix(".png")
+            if not (digits.isascii() and digits.isdigit() and len(digits) <= LONGEST):
+                problems.add(where, f"expected the number of a row like {first:05d}, found {word!r}")
+            elif count is not None and not first <= int(digits) < count + first:
+                last = count + first - 1
+                problems.add(where, f"index {digits} is out of range; rows are {first} to {last}")
+            elif int(digits) - first in lines:
+                before = lines[int(digits) - first]
+                problems.add(where, f"index {digits} appears twice, first in line {before}")
+            else:
+                lines[int(digits) - first] = number
+    if text is not None and not lines:
+        return problems.add(path, "no usable index in it; expected one number of a row per line")
+    return np.sort(np.array(list(lines), dtype=np.int64)) if lines else None
+
+
+LONGEST = 18  # digits of an index
 
 
 @dataclass(frozen=True)
@@ -164,7 +205,7 @@ class Expected:
 
     Attributes:
         shape: per axis a size, or a letter that stands for the same size in all arrays.
-        kinds: allowed kinds of NumPy's dtypes, one of those above.
+        kinds: allowed kinds of NumPy's dtypes, a key of `KIND_WORDS`.
         place: whether rows are coordinates [m], all of which must be finite and on Earth.
         optional: whether the array may be absent.
         field: of the schema that it is read as; None: the one of its name.
@@ -189,9 +230,9 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
         where, array = f"{source}, {name}", raw.arrays.get(name)
         if array is None:
             if not expected.optional:
-                problems.add(where, f"missing; expected {IN_WORDS[expected.kinds]} {_text(expected.shape)}")
+                problems.add(where, f"missing; expected {KIND_WORDS[expected.kinds]} {_text(expected.shape)}")
         elif array.dtype.kind not in expected.kinds:
-            problems.add(where, f"expected {IN_WORDS[expected.kinds]}, found dtype {array.dtype}")
+            problems.add(where, f"expected {KIND_WORDS[expected.kinds]}, found dtype {array.dtype}")
         elif not _fits(array.shape, expected.shape, sizes):
             problems.add(where, _misfit(array.shape, expected.shape, sizes))
         else:

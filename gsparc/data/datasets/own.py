@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsparc.data.datasets.ble import raw_of_ble
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.datasets.newrf import is_newrf, read_newrf
+from gsparc.data.datasets.newrf import raw_of_newrf
 from gsparc.data.datasets.powder import raw_of_powder
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
@@ -56,19 +56,20 @@ LOADERS: dict[str, Callable[[Path], Raw]] = {
     "techtile": raw_of_techtile,
     "powder": raw_of_powder,
     "ble": raw_of_ble,
+    "newrf": raw_of_newrf,
 }
 PLANE = 2  # coordinates of places in POWDER's files
 
 
 def campaign_of(raw: Raw) -> str | None:
     """The choice of conf/dataset that reads a file with these arrays; None where it is of none of them."""
-    held = raw.arrays
-    if {"rx_antenna_position", "csi"} <= set(held):
+    arrays = raw.arrays
+    if {"rx_antenna_position", "csi"} <= set(arrays):
         return "techtile"
-    if {"mobile_position", "rssi_db"} <= set(held):
-        flat = held["mobile_position"].ndim == 2 and held["mobile_position"].shape[1] == PLANE
+    if {"mobile_position", "rssi_db"} <= set(arrays):
+        flat = arrays["mobile_position"].ndim == 2 and arrays["mobile_position"].shape[1] == PLANE
         return "powder" if flat else "ble"
-    return None
+    return "newrf" if {"tx_pos", "rx_pos"} <= set(arrays) else None
 
 
 def read_any(
@@ -97,7 +98,7 @@ def read_any(
     campaign = campaign_of(raw)
     if campaign is not None:
         raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
-    reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+    reading = interpret(raw, path)
     return Reading(reading.data, (*notes, *reading.notes))
 
 
@@ -113,8 +114,8 @@ def raw_of(
         DataError: not readable, or columns that nothing can be made of.
     """
     if cell_m is None and not is_table(path):
-        told = any(value is not None for value in (columns or {}).values())
-        for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
+        named = any(value is not None for value in (columns or {}).values())
+        for name in [name for name, given in (("columns", named), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return Noted(read_raw(path))
     from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import

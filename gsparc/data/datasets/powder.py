@@ -12,18 +12,19 @@ station (T,) names, latitude, longitude (S,) [deg], frequency_hz () [Hz].
 from __future__ import annotations
 
 import ast
-import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import TEXT, Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
 from gsparc.data.errors import DataError, Problems, shortened
-from gsparc.data.files import read_csv, read_text
+from gsparc.data.files import read_text
+from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw, read_raw
+from gsparc.data.schema import TEXT
 
 CARRIER_HZ = 462.7e6
 NO_VALUE_DB = -101.0
@@ -33,7 +34,6 @@ STATIONS = "location_coordinates.json"
 LATITUDES = ("tx_x_coord", "tx_lat", "tx_latitude", "latitude", "lat")
 LONGITUDES = ("tx_y_coord", "tx_lon", "tx_lng", "tx_long", "tx_longitude", "longitude", "lon", "lng", "long")
 TIMES = ("timestamp", "time", "date", "datetime")
-EMPTY = ("", "nan", "none", "null", "na", "n/a")
 SLACK_M = 1.0  # an affine map from degrees to metres is good to centimetres over a campus
 LAYOUT = {
     "mobile_position": Expected(("S", 2), place=True, field="tx_position"),
@@ -81,14 +81,14 @@ def raw_of_powder(
 
 
 def _of_npz(raw: Raw, path: Path) -> Raw:
-    held = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
-    parts = [held.pop(name) for name in ("latitude", "longitude") if name in held]
+    arrays = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
+    parts = [arrays.pop(name) for name in ("latitude", "longitude") if name in arrays]
     if len(parts) == 2:
         degrees = np.stack(parts, axis=1).astype(np.float64)
-        stations = _degrees_of(held.pop("station_position"), held.pop("tx_position"), degrees, path)
-        held |= {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
-        held |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
-    return Raw(held, raw.attributes)
+        stations = _degrees_of(arrays.pop("station_position"), arrays.pop("tx_position"), degrees, path)
+        arrays |= {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
+        arrays |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
+    return Raw(arrays, raw.attributes)
 
 
 def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: Path) -> np.ndarray:
@@ -97,7 +97,9 @@ def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, p
     Args:
         places, degrees: (S, 2), the same rows in metres and in degrees.
     """
-    _check_degrees(path, ("latitude", "longitude"), degrees, [f"row {i}" for i in range(len(degrees))])
+    fault = bad_degrees(*degrees.T)
+    if fault:
+        raise DataError("{}, row {}: {}".format(path, *fault))
     middle, mean = places.mean(axis=0), degrees.mean(axis=0)
     turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
     error = 111e3 * np.abs((places - middle) @ turn + mean - degrees).max(axis=1)  # a degree is 111 km
@@ -111,83 +113,42 @@ def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, p
 
 
 def _of_csv(path: Path, table: Path) -> Raw:
-    header, rows = _read_csv(path)
-    places = station_places(table)
-    names = [name.strip() for name in header]
-    plain = [name.lower().replace(" ", "_") for name in names]
+    from gsparc.data.tables.columns import Column  # here, as pandas takes half a second to import
+    from gsparc.data.tables.places import places
+    from gsparc.data.tables.sheet import sheet_of
+
+    (sheet, _), stations = sheet_of(path), station_places(table)
+    plain = {head.lower().replace(" ", "_"): head for head in sheet.heads}
     if sum(name.startswith("tx") and name.endswith(("_x_coord", "_lat", "_latitude")) for name in plain) > 1:
         raise DataError(f"{path}, line 1: two transmitters in a row; expected one, as in single_tx.csv")
-    found = [next((plain.index(n) for n in wanted if n in plain), None) for wanted in (LATITUDES, LONGITUDES)]
-    for column, wanted in zip(found, (LATITUDES, LONGITUDES), strict=True):
-        if column is None:
-            raise DataError(f"{path}, line 1: no column {wanted[0]} (or {', '.join(wanted[1:])})")
-    columns = {name: i for i, name in enumerate(names) if name in places}
-    if len(columns) < sum(name in places for name in names):
-        twice = next(name for name in columns if names.count(name) > 1)
-        raise DataError(f"{path}, line 1: column {twice} twice")
+    chosen: dict[str, tuple[Column, ...]] = {}
+    for role, names in (("tx_latitude", LATITUDES), ("tx_longitude", LONGITUDES)):
+        head = next((plain[name] for name in names if name in plain), None)
+        if head is None:
+            raise DataError(f"{path}, line 1: no column {names[0]} (or {', '.join(names[1:])})")
+        chosen[role] = (Column(role, head=head),)
+    columns = [head for head in sheet.heads if head in stations]
     if not columns:
-        raise DataError(
-            f"{path}, line 1: no column is a station of {table}, e.g. {next(iter(places), 'none')}"
-        )
-    numbers = _numbers(path, names, rows, [*(i for i in found if i is not None), *columns.values()])
-    degrees, rssi = numbers[:, :2], numbers[:, 2:]
-    lines = [f"line {number}" for number, _ in rows]
-    called = [names[i] for i in found if i is not None]
-    _check_degrees(path, called, degrees, lines, f"; are {called[0]} and {called[1]} swapped?")
-    where = np.array(list(places[name] for name in columns))
-    rest = [n for n, p in zip(names, plain, strict=True) if n not in columns and p not in TIMES]
-    rest = [n for n in rest if names.index(n) not in found]
-    attributes = {}
+        example = next(iter(stations), "none")
+        raise DataError(f"{path}, line 1: no column is a station of {table}, e.g. {example}")
+    walk, levels = places(sheet, chosen, "tx_"), [sheet.numbers(name) for name in columns]
+    sheet.problems.raise_if_any()
+    assert walk is not None
+    rssi = np.stack([level for level in levels if level is not None], axis=1)
+    known = {*columns, *(column.head for (column,) in chosen.values())}
+    rest = [head for name, head in plain.items() if head not in known and name not in TIMES]
+    about = {}
     if rest:
-        attributes["left_out"] = shortened(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}")
+        about["left_out"] = shortened(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}")
+    where = np.array([stations[name] for name in columns])
     arrays = {
-        "latitude": degrees[:, 0], "longitude": degrees[:, 1],
+        "latitude": walk.across[:, 0], "longitude": walk.across[:, 1],
         "station_latitude": where[:, 0], "station_longitude": where[:, 1],
-        "station_name": np.array(list(columns)), "carrier_hz": np.array(CARRIER_HZ),
+        "station_name": np.array(columns), "carrier_hz": np.array(CARRIER_HZ),
         "rssi_db": np.where(rssi == NO_VALUE_DB, np.nan, rssi),
-        "row_name": np.array(lines),
+        "row_name": np.array(sheet.rows),
     }  # fmt: skip
-    return Raw(arrays, attributes)
-
-
-def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The header, and the other lines with their numbers; blank ones are none."""
-    found = read_csv(path, "no such file; expected single_tx.csv of the POWDER release")
-    lines = [(i, cells) for i, cells in enumerate(found, 1) if any(c.strip() for c in cells)]
-    if len(lines) < 2:
-        raise DataError(f"{path}: no rows; expected a header and a line per place")
-    return lines[0][1], lines[1:]
-
-
-def _numbers(
-    path: Path, names: Sequence[str], rows: Sequence[tuple[int, list[str]]], columns: Sequence[int]
-) -> np.ndarray:
-    """Cells (S, len(columns)) float64, NaN where a cell is empty."""
-    import pandas as pd  # here, as it takes half a second
-
-    problems = Problems(path)
-    for line, cells in [row for row in rows if len(row[1]) != len(names)][: Problems.LIMIT]:
-        problems.add(f"{path}, line {line}", f"expected {len(names)} cells, found {len(cells)}")
-    problems.raise_if_any()
-    text = np.char.strip(np.array([[cells[column] for column in columns] for _, cells in rows]))
-    values = pd.to_numeric(text.ravel().astype(object), errors="coerce").reshape(text.shape)
-    wrong = np.isnan(values) & ~np.isin(np.char.lower(text), EMPTY)
-    for row, k in np.argwhere(wrong)[: Problems.LIMIT]:
-        where = f"{path}, line {rows[row][0]}, {names[columns[k]]}"
-        problems.add(where, f"expected a number, found {str(text[row, k])!r}")
-    problems.raise_if_any()
-    return np.asarray(values, np.float64)
-
-
-def _check_degrees(
-    path: Path, names: Sequence[str], degrees: np.ndarray, rows: Sequence[str], hint: str = ""
-) -> None:
-    problems = Problems(path)
-    for column, most in ((0, 90), (1, 180)):
-        bad = np.flatnonzero(~(np.abs(degrees[:, column]) <= most)).tolist()
-        found = (f"{rows[i]} = {degrees[i, column]}" for i in bad)
-        problems.add_rows(f"{path}, {names[column]}", found, f"expected degrees, at most {most}{hint}")
-    problems.raise_if_any()
+    return Raw(arrays, about)
 
 
 def station_places(path: Path) -> dict[str, tuple[float, float]]:
@@ -202,7 +163,7 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
     """
     expected = "the stations' coordinates, name the file with dataset.station_table"
     text = read_text(path, f"missing; expected {expected}")
-    content = _rows_by_name(path, text) if path.suffix.lower() == ".csv" else _literal(path, text)
+    content = _listed(path) if path.suffix.lower() == ".csv" else _literal(path, text)
     problems, places = Problems(path), {}
     for name, value in content.items():
         if value is None:
@@ -212,8 +173,9 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
         except (TypeError, ValueError):
             problems.add(f"{path}, {name}", f"expected latitude and longitude [deg], found {value!r}")
             continue
-        if not (abs(latitude) <= 90 and abs(longitude) <= 180):
-            problems.add(f"{path}, {name}", f"({latitude}, {longitude}) is no latitude and longitude [deg]")
+        fault = bad_degrees(latitude, longitude)
+        if fault:
+            problems.add(f"{path}, {name}", fault[1])
         places[str(name).strip()] = (latitude, longitude)
     problems.raise_if_any()
     if not places:
@@ -234,17 +196,16 @@ def _literal(path: Path, text: str) -> Mapping[str, Any]:
     return content
 
 
-def _rows_by_name(path: Path, text: str) -> Mapping[str, Any]:
-    lines = list(csv.DictReader(text.splitlines(), skipinitialspace=True))
-    given = {str(key).strip().lower(): key for key in (lines[0] if lines else {})}
-    keys = [
-        next((given[n] for n in names if n in given), None)
-        for names in (("name", "station"), ("latitude", "lat"), ("longitude", "lon", "lng"))
-    ]
-    if None in keys:
+def _listed(path: Path) -> Mapping[str, Any]:
+    from gsparc.data.tables.places import read_stations
+    from gsparc.data.tables.sheet import sheet_of
+
+    sheet, _ = sheet_of(path)
+    stations, _ = read_stations(sheet)
+    sheet.problems.raise_if_any()
+    if stations is None or not stations.places.degrees:
         raise DataError(f"{path}, line 1: expected the columns name, latitude, longitude")
-    name, *degrees = keys
-    return {str(line[name]): tuple(line[key] for key in degrees) for line in lines}
+    return dict(zip(stations.names, stations.places.across.tolist(), strict=True))
 
 
 class Powder(Campaign):

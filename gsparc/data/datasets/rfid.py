@@ -18,9 +18,9 @@ from PIL import Image
 
 from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.blocks import empty
-from gsparc.data.datasets.campaign import Release
+from gsparc.data.datasets.campaign import Release, read_split
 from gsparc.data.errors import DataError, Problems
-from gsparc.data.files import read_csv, read_text, read_yaml
+from gsparc.data.files import read_csv, read_yaml
 from gsparc.data.limits import finite
 from gsparc.data.own_checks import quaternion_to_matrix
 from gsparc.data.schema import LIGHT, Measurements
@@ -29,7 +29,6 @@ from gsparc.ops import SphereGrid
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
-LONGEST = 18  # digits of an index
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
@@ -68,11 +67,11 @@ def load_rfid(
     problems = Problems(root)
     info = _read_gateway(root / "gateway_info.yml", gateway, problems)
     positions = _read_positions(root / "tx_pos.csv", problems)
-    spectra = _read_spectra(root / "spectrum", None if positions is None else len(positions), problems)
-    release_split = _read_split(root, None if positions is None else len(positions), problems)
+    count = None if positions is None else len(positions)
+    spectra = _read_spectra(root / "spectrum", count, problems)
+    release_split = read_split(root, count, problems, first=1)
     problems.raise_if_any()
-    assert info is not None and positions is not None and spectra is not None
-    count = len(positions)
+    assert info is not None and positions is not None and spectra is not None and count is not None
     simulated = info.dataset == STAND_IN
     given = {} if array is None else array
     places = planar_array(**given) if isinstance(given, Mapping) else np.asarray(given, np.float64)
@@ -189,65 +188,14 @@ def _read_image(path: Path, into: np.ndarray) -> str | None:
     return None
 
 
-def _read_split(root: Path, count: int | None, problems: Problems) -> tuple[np.ndarray, np.ndarray] | None:
-    """Zero-based (train, test) rows, or None when the folder names none."""
-    paths = [root / "train_index.txt", root / "test_index.txt"]
-    present = [path for path in paths if path.exists()]
-    if not present:
-        return None
-    if len(present) == 1:
-        absent = next(path for path in paths if path not in present)
-        return problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
-    train, test = (_read_index(path, count, problems) for path in paths)
-    if train is None or test is None:
-        return None
-    both = np.intersect1d(train, test)
-    problems.add_rows(paths[1], (f"index {i + 1:05d}" for i in both), "also in train_index.txt")
-    return train, test
-
-
-def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray | None:
-    text = problems.attempt(lambda: read_text(path, "missing"))
-    if text is None:
-        return None
-    rows: list[int] = []
-    first_line: dict[int, int] = {}
-    for number, line in enumerate(text.split("\n"), start=1):
-        text = line.strip().removesuffix(".png")
-        if not text:
-            continue
-        where = f"{path}, line {number}"
-        if not (text.isascii() and text.isdigit() and len(text) <= LONGEST):
-            problems.add(where, f"expected the number of a spectrum like 00001, found {line.strip()!r}")
-            continue
-        index = int(text)
-        if count is not None and not 1 <= index <= count:
-            problems.add(where, f"index {text} is out of range; tx_pos.csv has rows 1 to {count}")
-        elif index in first_line:
-            problems.add(where, f"index {text} appears twice, first in line {first_line[index]}")
-        else:
-            first_line[index] = number
-            rows.append(index - 1)
-    if not rows:
-        return problems.add(path, "no usable index in it; expected one number of a spectrum per line")
-    return np.sort(np.array(rows, dtype=np.int64))
-
-
 class RFID(Release):
     """The RFID release (NeRF2, set s23) or any folder in its layout; settings of `load_rfid`, `Release`."""
 
     called, reader = "RFID", staticmethod(load_rfid)
-
-    def missing(self) -> str:
-        """See `Release`."""
-        wanted = (
-            "dataset.root is not set" if self.root is None else f"dataset.root={self.root} does not exist"
-        )
-        return (
-            f"{wanted}: the RFID release is NOT on disk. Get it from the NeRF2 project "
-            "(https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, tx_pos.csv, spectrum/), "
-            "then set dataset.root=DIR."
-        )
+    hint = (
+        "Get it from the NeRF2 project (https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, "
+        "tx_pos.csv, spectrum/)"
+    )
 
     def read(self, folder: Path) -> Measurements:
         """Spectra (S, 90, 360) uint8 of tags that move about a static gateway; stand-ins have no settings."""

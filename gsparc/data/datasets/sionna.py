@@ -65,9 +65,9 @@ def _tested(
     known = truth if train is None else train
     if known is None:
         return None
-    found = np.full(known.shape, plain) if train is None else train.copy()
-    found[test] = plain if truth is None else truth[test]
-    return found
+    flags = np.full(known.shape, plain) if train is None else train.copy()
+    flags[test] = plain if truth is None else truth[test]
+    return flags
 
 
 def _load(path: str | Path, target: str | None) -> Measurements:
@@ -75,9 +75,9 @@ def _load(path: str | Path, target: str | None) -> Measurements:
     if "simulator" not in raw.attributes:
         raise DataError(f"{path}: not written by gsparc simulate; read it with dataset=own")
     target = str(target or raw.attributes.get("measurement"))
-    held = [name for name in TARGETS if STORED[name] in raw.arrays]
-    if target not in held:
-        raise DataError(f"dataset.target={target}: {path} holds {' and '.join(held)}")
+    present = [name for name in TARGETS if STORED[name] in raw.arrays]
+    if target not in present:
+        raise DataError(f"dataset.target={target}: {path} holds {' and '.join(present)}")
     return interpreted(read_as(raw, target), path)
 
 

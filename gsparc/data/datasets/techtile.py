@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import COMPLEX, FLAGS, LABELS, TEXT, Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
 from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf, read_raw
+from gsparc.data.schema import COMPLEX, FLAGS, LABELS, TEXT
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
 CHANNEL = 1  # of the two antennas of a tile, the one that received
@@ -76,12 +77,12 @@ def raw_of_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw
 def _with_experiments(raw: Raw, path: Path) -> Raw:
     """The same with an axis of experiments where a file of one experiment has none."""
     missing = [name for name, wanted in RELEASE.items() if not wanted.optional and name not in raw.arrays]
-    alone = "csi_real" in raw.arrays and raw.arrays["csi_real"].ndim == 2
-    missing = [name for name in missing if not (alone and name == "experiment_id")]
+    single = "csi_real" in raw.arrays and raw.arrays["csi_real"].ndim == 2
+    missing = [name for name in missing if not (single and name == "experiment_id")]
     if missing:
         there = ", ".join(sorted(raw.arrays)) or "no variables"
         raise DataError(f"{path}: {', '.join(missing)} missing in a Techtile NetCDF file; it holds {there}")
-    if not alone:
+    if not single:
         return raw
     arrays = dict(raw.arrays)
     for name, wanted in RELEASE.items():
@@ -92,22 +93,22 @@ def _with_experiments(raw: Raw, path: Path) -> Raw:
 
 
 def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
-    held = check_layout(raw, path, RELEASE)
-    hosts = held["hostname"].astype(str)
-    places = held.get("rx_antenna_position")
+    variables = check_layout(raw, path, RELEASE)
+    hosts = variables["hostname"].astype(str)
+    places = variables.get("rx_antenna_position")
     if places is None:
         places = antenna_positions(path.with_name(ANTENNAS) if antennas is None else Path(antennas), hosts)
     # Stored is reference minus received phase: the conjugate of a channel that follows exp(-j k d).
-    csi = held["csi_real"].astype(np.float64) - 1j * held["csi_imag"].astype(np.float64)
-    heard = np.isfinite(csi) & (held.get("csi_available", np.ones(csi.shape)) == 1)
-    where = np.stack([held[f"rover_{axis}"] for axis in "xyz"], axis=-1).astype(np.float64)
-    placed = np.isfinite(where).all(-1) & (held.get("position_available", np.ones(where.shape[:2])) == 1)
+    csi = variables["csi_real"].astype(np.float64) - 1j * variables["csi_imag"].astype(np.float64)
+    heard = np.isfinite(csi) & (variables.get("csi_available", np.ones(csi.shape)) == 1)
+    where = np.stack([variables[f"rover_{axis}"] for axis in "xyz"], axis=-1).astype(np.float64)
+    placed = np.isfinite(where).all(-1) & (variables.get("position_available", np.ones(where.shape[:2])) == 1)
     measured = heard.any(-1)
     experiment, cycle = np.nonzero(measured & placed)
     if not len(experiment):
         raise DataError(f"{path}: no cycle has both a position and a channel; is it another file?")
-    run = held["experiment_id"].astype(str)[experiment]
-    number = held["cycle_id"].astype(str)[cycle]
+    run = variables["experiment_id"].astype(str)[experiment]
+    number = variables["cycle_id"].astype(str)[cycle]
     attributes = {"name": "techtile", "layout": "techtile"}
     lost = int((measured & ~placed).sum())
     if lost:
@@ -152,8 +153,8 @@ def antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
 def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
     channels: Any = entry.get("channels")
     try:
-        found = channels[CHANNEL]  # of a list, or of a table with numbers
-        place = np.array([float(found[axis]) for axis in "xyz"])
+        antenna = channels[CHANNEL]  # of a list, or of a table with numbers
+        place = np.array([float(antenna[axis]) for axis in "xyz"])
     except (TypeError, KeyError, IndexError, ValueError):
         place = np.full(3, np.nan)
     if not np.isfinite(place).all():

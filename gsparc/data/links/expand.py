@@ -17,7 +17,7 @@ from gsparc.data.links.stations import by_carrier, ends_of, numbered, station_of
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links
-from gsparc.data.selection import rows_of
+from gsparc.data.selection import take_rows
 
 POWERS = ("rssi", "rssi_db")
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
@@ -127,7 +127,7 @@ def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
         if array.shape[:2] == (rows, count):
             wide[name] = array.reshape(rows * count, *array.shape[2:])
     other = {name: array for name, array in raw.arrays.items() if name not in (*MEASUREMENTS, "mask")}
-    return replace(raw, arrays=rows_of(other, np.repeat(np.arange(rows), count), rows, count) | wide)
+    return replace(raw, arrays=take_rows(other, np.repeat(np.arange(rows), count), rows, count) | wide)
 
 
 def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
@@ -152,18 +152,18 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     axes = tuple(range(1, values.ndim))
     gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
     unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
-    told = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
+    marked = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
     censored = np.zeros(len(values), bool)
     if level is not None:
-        censored = unknown & told
+        censored = unknown & marked
         floor = np.broadcast_to(np.atleast_1d(level)[of_level if level.size > 1 else 0], (len(values),))
-        below = ~unknown & told & (values < floor)
+        below = ~unknown & marked & (values < floor)
         if below.any():
             row = int(np.flatnonzero(below)[0])
             named = links.named([str(name) for name in arrays["row_name"]])[row]
             wrong = f"{named}: {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
             return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
-        highest, weakest = floor[censored].max(initial=-np.inf), values[~unknown & told].min(initial=np.inf)
+        highest, weakest = floor[censored].max(initial=-np.inf), values[~unknown & marked].min(initial=np.inf)
         if FAR_BELOW_DB < weakest - highest < np.inf:
             check.notes.append(
                 f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
@@ -173,7 +173,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
     if mask is not None and lost.any():
         return links  # marked as measured, and is not: refused where values are read
-    keep = told & ~lost
+    keep = marked & ~lost
     if silent and values.any():
         keep &= values.any(axis=axes)
     if not (keep & ~censored).any():
@@ -181,7 +181,8 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
         _note_lost(check, measured, links, keep, censored)
-        arrays.update(rows_of(arrays, np.flatnonzero(keep), len(keep)))
+        arrays = take_rows(arrays, np.flatnonzero(keep), len(keep))
+        check.raw = replace(check.raw, arrays=arrays)
         parts = {name: getattr(links, name) for name in ("station", "place", "run")}
         pick = {name: value[keep] for name, value in parts.items() if value is not None}
         links = replace(links, **pick)
@@ -199,8 +200,8 @@ def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, ce
         text = f"{int((~keep).sum())} of {len(keep)} values are missing{silent}"
         if links.stations is not None and links.station is not None:
             lost = np.bincount(links.station[~keep], minlength=len(links.stations))
-            told = ", ".join(f"{links.stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i])
-            text += f" (most: {told})"
+            most = [f"{links.stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i]]
+            text += f" (most: {', '.join(most)})"
         weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
         check.notes.append(text + weak)
     if censored.any():
@@ -238,11 +239,9 @@ def _heights(check: Checker) -> bool:
 
 def _run(check: Checker, rows: int) -> np.ndarray | None:
     """(S,) int64, the number of each row's run; runs may have names."""
-    given = check.raw.arrays.get("run")
-    if given is None or not check.fits("run", given, (rows,)):
+    given = check.array("run", (rows,))
+    if given is None:
         return None
-    if given.dtype.kind not in "iuUS":
-        return check.refuse("run", f"expected names or numbers of runs, found dtype {given.dtype}")
     check.raw.arrays.pop("run")
     return np.unique(given, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
@@ -303,11 +302,9 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
         check.refuse(names[1], f"{len(longitude)} values for {len(latitude)} latitudes")
         return np.zeros(0), np.zeros(0)
     absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
-    for row in np.flatnonzero(~absent).tolist() if bad_degrees(latitude, longitude) else ():
-        fault = bad_degrees(latitude[row], longitude[row])
-        if fault:
-            check.refuse(names[0], f"row {row}: {fault}")
-            break
+    fault = bad_degrees(*np.where(absent, 0, (latitude, longitude)))
+    if fault:
+        check.refuse(names[0], "row {}: {}".format(*fault))
     none = (latitude == 0) & (longitude == 0)
     # (0, 0) is a place, too, for who measures there.
     if none.any() and max(abs(np.median(latitude)), abs(np.median(longitude))) > 1:

@@ -34,7 +34,7 @@ class Georeference:
     def __post_init__(self) -> None:
         fault = bad_degrees(self.latitude, self.longitude)
         if fault is not None:
-            raise DataError(f"origin: {fault}")
+            raise DataError(f"origin: {fault[1]}")
 
     @classmethod
     def about(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
@@ -44,9 +44,9 @@ class Georeference:
             DataError: no places, or a value is not in range.
         """
         latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
-        fault = bad_degrees(latitude, longitude) if latitude.size else "no places"
+        fault = bad_degrees(latitude, longitude) if latitude.size else (0, "no places")
         if fault is not None:
-            raise DataError(f"origin: {fault}")
+            raise DataError(f"origin: {fault[1]}")
         # Relative to one of them: 179.9 and -179.9 are neighbours, their median is not 0.
         turned = np.median((longitude - longitude[0] + 180) % 360 - 180) + longitude[0]
         east = (round(float(turned), DIGITS) + 180) % 360 - 180
@@ -60,7 +60,7 @@ class Georeference:
         """
         fault = bad_degrees(latitude, longitude)
         if fault is not None:
-            raise DataError(fault)
+            raise DataError(fault[1])
         there = np.atleast_1d(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
         places = [np.array(v) for v in np.broadcast_arrays(self.longitude, self.latitude, *there)]
         azimuth, _, distance = _WGS84.inv(places[0], places[1], places[2], places[3])
@@ -85,13 +85,13 @@ class Georeference:
         return np.asarray(latitude), np.asarray(longitude)
 
 
-def bad_degrees(latitude: np.ndarray | float, longitude: np.ndarray | float) -> str | None:
-    """What is wrong with the first bad one of places (n,) [deg], in words; None when all are on Earth."""
+def bad_degrees(latitude: np.ndarray | float, longitude: np.ndarray | float) -> tuple[int, str] | None:
+    """Row of the first bad one of places (n,) [deg], and what is wrong; None when all are on Earth."""
     latitude, longitude = np.atleast_1d(latitude, longitude)
     for name, values, low, high in (("latitude", latitude, -90, 90), ("longitude", longitude, -180, 360)):
         wrong = np.flatnonzero(~((values >= low) & (values <= high)))
         if len(wrong):
             swapped = name == "latitude" and (np.abs(longitude) <= 90).all()
             hint = "; are latitude and longitude swapped?" if swapped else ""
-            return f"{name} {values[wrong[0]]:g} is outside {low} to {high} degrees{hint}"
+            return int(wrong[0]), f"{name} {values[wrong[0]]:g} is outside {low} to {high} degrees{hint}"
     return None

@@ -92,11 +92,9 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
 
 def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
     """(S,) int64, the station of every row."""
-    index = check.raw.arrays["station"]
-    if not check.fits("station", index, (rows,)):
+    index = check.array("station", (rows,))
+    if index is None:
         return None
-    if index.dtype.kind not in "iu":
-        return check.refuse("station", f"expected numbers of stations (integers), found dtype {index.dtype}")
     out = np.flatnonzero((index < 0) | (index >= count))
     if len(out):
         return check.refuse(

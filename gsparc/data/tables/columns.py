@@ -82,36 +82,40 @@ Chosen = dict[str, tuple[Column, ...]]
 
 
 def choose(
-    sheet: Sheet, said: Mapping[str, object], labelled: Iterable[str] = (), only: Container[str] | None = None
+    sheet: Sheet,
+    settings: Mapping[str, object],
+    labelled: Iterable[str] = (),
+    only: Container[str] | None = None,
 ) -> tuple[Chosen, list[str]]:
     """The columns of each quantity, and a note for each that was guessed.
 
     Args:
         sheet: the table.
-        said: heads, patterns with a `*` or numbers by quantity, as in `dataset.columns`.
+        settings: heads, patterns with a `*` or numbers by quantity, as in `dataset.columns`.
         labelled: names of stations; columns called so are taken as their levels.
         only: quantities that are guessed; None: all.
     """
     chosen: Chosen = {}
     labelled = set(labelled)
-    for key, value in said.items():
-        columns = () if value is None else _said(sheet, key, value)
+    for key, value in settings.items():
+        columns = () if value is None else _by_setting(sheet, key, value)
         if columns:
             chosen[columns[0].role] = columns
     if sheet.problems:
         return chosen, []
-    taken = {column.head for columns in chosen.values() for column in columns}
+    used_heads = {column.head for columns in chosen.values() for column in columns}
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        found = understand(head) if head and head not in taken else Head()
-        if head not in taken and head in labelled:
-            found = Head("rssi_db", label=head, word="station")
-        role = found.role
+        meaning = understand(head) if head and head not in used_heads else Head()
+        if head not in used_heads and head in labelled:
+            meaning = Head("rssi_db", label=head, word="station")
+        role = meaning.role
         if not role or (only is not None and role not in only) or _settled(role, chosen):
             continue
-        if found.strange:
-            sheet.refuse(f"[{found.strange}] is no known unit; expected one of {known(KINDS[role])}", head)
-        guesses.setdefault(role, []).append(Column(**vars(found), head=head))
+        if meaning.strange:
+            expected = known(KINDS[role])
+            sheet.refuse(f"[{meaning.strange}] is no known unit; expected one of {expected}", head)
+        guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
     _one_way(sheet, guesses)
     notes = []
     for role, candidates in guesses.items():
@@ -144,19 +148,19 @@ def choose(
 
 def _perhaps_stations(sheet: Sheet, used: Container[str | None]) -> list[str]:
     """Columns that repeat few words and are called an end: without them all transmitters would be one."""
-    found = []
+    notes = []
     ends = [head for head in sheet.heads if head not in used and set(words_of(head)) & set(END_WORDS)]
     for head in ends:
         distinct = len(set(sheet.words(head).tolist()) - {""})
         if 2 <= distinct <= len(sheet) // REPEATED:
-            found.append(
+            notes.append(
                 f"column {head!r} holds {distinct} names again and again: stations? say "
                 f"dataset.columns.station={head!r}, with their places in dataset.stations_file"
             )
-    return found
+    return notes
 
 
-def _said(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
+def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     role, where = OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
     if role not in KINDS:
         close = difflib.get_close_matches(key, [*KINDS, *OTHER_NAMES], 1, 0.4)
@@ -202,10 +206,10 @@ def _unit(head: str, role: str) -> Unit | None:
     return unit
 
 
-def _settled(role: str, said: Chosen) -> bool:
+def _settled(role: str, chosen: Chosen) -> bool:
     """Whether what was said leaves no room for a guess of `role`."""
     other = [way for ways in ONE_OF if role in sum(ways, ()) for way in ways if role not in way]
-    return role in said or any(name in said for way in other for name in way)
+    return role in chosen or any(name in chosen for way in other for name in way)
 
 
 def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
@@ -239,10 +243,10 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
         silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]  # to watts or milliwatts?
         if turned and silent and turned[0].unit is not None:
             other = silent[0].unit
-            said = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} "
-            said += "says no unit" if other is None else f"in {other.name} of nothing"
+            fault = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} "
+            fault += "says no unit" if other is None else f"in {other.name} of nothing"
             plain = unit_of(silent[0].head or "")[0]
-            sheet.refuse(f"{said}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
+            sheet.refuse(f"{fault}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
 
 
 def _choice(column: Column) -> str:

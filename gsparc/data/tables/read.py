@@ -52,8 +52,8 @@ def understand_table(
     listed = None
     if stations_file is not None:
         second, _ = sheet_of(stations_file, sheet.problems)
-        listed, said = read_stations(second)
-        notes += said
+        listed, list_notes = read_stations(second)
+        notes += list_notes
         sheet.problems.raise_if_any()
     chosen, guessed = choose(sheet, columns, () if listed is None else listed.names)
     sheet.problems.raise_if_any()
@@ -105,17 +105,17 @@ class Builder:
             self._channels()
             return role
         columns = self.chosen[role]
-        found = [column.numbers(self.sheet) for column in columns]
-        if any(values is None for values in found):
+        levels = [column.numbers(self.sheet) for column in columns]
+        if any(values is None for values in levels):
             return role
-        values = np.stack([v for v in found if v is not None], axis=1)
+        values = np.stack([v for v in levels if v is not None], axis=1)
         if np.isnan(values).all():
             self.refuse("no value in any row", columns[0].head or "")
         first = columns[0]
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
-            said = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
-            self.refuse(f"no value below 0: dBm or W? say {said}", first.head or "")
+            choices = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
+            self.refuse(f"no value below 0: dBm or W? say {choices}", first.head or "")
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
 
@@ -143,47 +143,47 @@ class Builder:
 
     def _tones(self, part: str) -> dict[int, Column]:
         """Columns by the number of their tone, which may be negative; 0 of a single one without."""
-        found: dict[int, Column] = {}
+        tones: dict[int, Column] = {}
         for column in self.chosen.get(part, ()):
             label = column.label.strip(" _.:()[]")
             where = self.sheet.where(column.head or "")
             if not re.fullmatch(r"[-+]?\d+|", label):
                 fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
                 self.sheet.problems.add(where, f"{fault}, or say dataset.columns.{part}='NAME*'")
-            elif found.setdefault(int(label or 0), column) is not column:
+            elif tones.setdefault(int(label or 0), column) is not column:
                 self.sheet.problems.add(
-                    where, f"the same tone as {found[int(label or 0)].head!r}; rename one"
+                    where, f"the same tone as {tones[int(label or 0)].head!r}; rename one"
                 )
-        return found
+        return tones
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
         given = {end: places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
-        found = {end: where for end, where in given.items() if where is not None}
+        ends = {end: where for end, where in given.items() if where is not None}
         if self.sheet.problems:
             return
-        if not found:
+        if not ends:
             fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
             return self.refuse(f"{fault}, or .latitude, .longitude")
-        if len(found) == 3:
+        if len(ends) == 3:
             return self.refuse(
                 "coordinates of rx, of tx and of an end without a name; expected two ends, rename one"
             )
-        stations = self._stations(measured, found)
+        stations = self._stations(measured, ends)
         if self.sheet.problems:
             return
-        stay = next((end for end, where in given.items() if where is not None and end not in found), "")
-        moving, where = self._moving(found, stay)
+        stay = next((end for end, where in given.items() if where is not None and end not in ends), "")
+        moving, where = self._moving(ends, stay)
         if stations is not None:
             self._add_stations(stations, where.degrees)
         self._add_places(moving, where)
-        for other in found.values():  # the end that is left, where there are no stations
+        for other in ends.values():  # the end that is left, where there are no stations
             self._add_other("tx" if moving == "rx" else "rx", other, where)
 
-    def _moving(self, found: dict[str, Places], stay: str) -> tuple[str, Places]:
+    def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `found`."""
-        named: list[str] = [end for end in ("rx_", "tx_") if end in found]
-        if "" in found:
+        named: list[str] = [end for end in ("rx_", "tx_") if end in ends]
+        if "" in ends:
             named = named or [stay] * bool(stay)
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
@@ -191,13 +191,13 @@ class Builder:
                 moving = "tx"
             if not named:
                 other = "tx" if moving == "rx" else "rx"
-                axis = "latitude" if found[""].degrees else "x"
+                axis = "latitude" if ends[""].degrees else "x"
                 rename = f"if not, name them {other}_{axis}, ..., or say dataset.columns.{other}_{axis}=..."
                 self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; {rename}")
-            return moving, found.pop("")
-        if len(named) == 2 and len(np.unique(found["rx_"].all(), axis=0)) == 1:
+            return moving, ends.pop("")
+        if len(named) == 2 and len(np.unique(ends["rx_"].all(), axis=0)) == 1:
             named = ["tx_"]
-        return named[0][:2], found.pop(named[0])
+        return named[0][:2], ends.pop(named[0])
 
     def _stations(self, measured: str | None, found: dict[str, Places]) -> StationList | None:
         """The stations, where there are; an end that is their place is taken out of `found`."""
@@ -293,12 +293,12 @@ class Builder:
         if names:
             self.notes.append(f"listed, but {where}: {', '.join(names[:8])}{', ...' * (len(names) > 8)}")
 
-    def _second_in_degrees(self, found: dict[str, Places]) -> Places | None:
+    def _second_in_degrees(self, ends: dict[str, Places]) -> Places | None:
         """Of two ends in degrees, the one with fewer places, which are then stations."""
-        if len(found) < 2 or not all(where.degrees for where in found.values()):
+        if len(ends) < 2 or not all(where.degrees for where in ends.values()):
             return None
-        few = min(found, key=lambda end: len(np.unique(found[end].all(), axis=0)))
-        return found.pop(few)
+        few = min(ends, key=lambda end: len(np.unique(ends[end].all(), axis=0)))
+        return ends.pop(few)
 
     def _unnamed(self, where: Places) -> StationList | None:
         """Stations told apart by their places alone."""

@@ -176,30 +176,31 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     lines, comment = _lines(text)
     if not lines:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
-    said = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
-    if said:  # Excel's own hint
+    excel = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
+    if excel:  # Excel's own hint
         del lines[min(lines)]
         comment = ""
-    delimiter = said[1] if said else _delimiter(list(lines.values()), comment)
+    delimiter = excel[1] if excel else _delimiter(list(lines.values()), comment)
     if delimiter is None or not lines:
         fault = f"line 1 ({lines[min(lines)][:40]!r}) is a single column" if lines else "no heads"
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
     lines = _with_heads(lines, comment, delimiter, source)
-    lines, dropped = _without_comments(lines, delimiter, source)
-    notes += dropped
+    lines, comment_notes = _without_comments(lines, delimiter, source)
+    notes += comment_notes
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
     for i, head in enumerate(heads):
         if head and head in heads[:i]:
             where = f"columns {heads.index(head) + 1} and {i + 1}"
-            raise DataError(f"{source}: {where} are both named {head!r}; rename one")
+            hint = "; is there no line of heads?" if _is_number(head) else "; rename one"
+            raise DataError(f"{source}: {where} are both named {head!r}{hint}")
     if not rows:
         raise DataError(f"{source}: line {min(lines)} names columns, but there are no rows below it")
     frame = pd.DataFrame(rows, dtype=object)
-    decimal, said_so = _decimal(text, frame, delimiter)
+    decimal, decimal_notes = _decimal(text, frame, delimiter)
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
-    notes += said_so
+    notes += decimal_notes
     columns = tuple(frame[i] for i in range(len(heads)))
     return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines)[1:], decimal), notes
 
@@ -228,16 +229,16 @@ def _decoded(path: Path) -> tuple[str, str]:
 
 def _lines(text: str) -> tuple[Lines, str]:
     """The lines, and the last comment before the first of them."""
-    found: Lines = {}
+    lines: Lines = {}
     comment = ""
     # Not str.splitlines, which also ends lines at characters that may stand in a cell.
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
         stripped = line.strip()
-        if stripped.startswith(COMMENTS) and not found:
+        if stripped.startswith(COMMENTS) and not lines:
             comment = stripped.lstrip("#%/ ")
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
-            found[number] = line
-    return found, comment
+            lines[number] = line
+    return lines, comment
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -254,8 +255,8 @@ def _delimiter(lines: list[str], comment: str) -> str | None:
     sample = lines[:LOOKED_AT]
     for delimiter in DELIMITERS:
         count = len(_cells(sample[0], delimiter))
-        said = _cells(comment, delimiter) if comment else []
-        heads = len(said) == count and any(understand(cell).role for cell in said)
+        named = _cells(comment, delimiter) if comment else []
+        heads = len(named) == count and any(understand(cell).role for cell in named)
         if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
             continue
         agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)

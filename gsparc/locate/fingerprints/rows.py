@@ -13,9 +13,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import LABELS, Expected, check_layout
+from gsparc.data.datasets.campaign import Expected, check_layout
 from gsparc.data.errors import DataError, nearest, reason, some
 from gsparc.data.raw import Raw, read_raw
+from gsparc.data.schema import LABELS
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables import is_table
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.blocks import taken
+from gsparc.data.blocks import take
 from gsparc.data.links.stations import numbered
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
@@ -121,7 +121,7 @@ class ComplexGP(Method):
 
         A hundred nearest rows of one place, where a robot waited, tell of no other: its mean is taken once.
         """
-        targets = torch.from_numpy(taken(data.target, known).reshape(len(known), -1))
+        targets = torch.from_numpy(take(data.target, known).reshape(len(known), -1))
         place = torch.from_numpy(numbered(data.moving[known]))
         _, first, count = np.unique(place.numpy(), return_index=True, return_counts=True)
         self.first, counts = torch.from_numpy(first), torch.from_numpy(count).double()

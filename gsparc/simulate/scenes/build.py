@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.instantiate import known_keys
+from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.raytracer import RayTracer, Sampling
@@ -117,7 +117,7 @@ def from_config(config: Mapping[str, Any]) -> SceneSettings:
     Raises:
         ValueError: a setting that does not exist or cannot be.
     """
-    return SceneSettings(**known_keys(config, SceneSettings, "scene", "setting"))
+    return from_settings(SceneSettings, config, "scene")
 
 
 def build(scene: SceneSettings, sampling: Sampling) -> Survey:

@@ -84,7 +84,7 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     degrees = np.concatenate([np.array(shape.exterior.coords)[:, :2] for shape, _ in shapes])
     fault = bad_degrees(degrees[:, 1], degrees[:, 0])
     if fault is not None:
-        raise ValueError(f"scene.file={path}: {fault}")
+        raise ValueError(f"scene.file={path}: {fault[1]}")
     origin = Georeference.about(degrees[:, 1], degrees[:, 0])
     guesses: Counter[str] = Counter()
     meshes: dict[str, list[Any]] = {}

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
-from gsparc.data.instantiate import known_keys
+from gsparc.data.instantiate import from_settings
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.query_places import read_query_places, read_times
 from gsparc.simulate.scenes.solid import Solid
@@ -84,7 +84,7 @@ def layout(config: Mapping[str, Any] | None) -> Layout:
     Raises:
         ValueError: a setting that does not exist or cannot be.
     """
-    return Layout(**known_keys(config or {}, Layout, "scene.receivers", "setting"))
+    return from_settings(Layout, config or {}, "scene.receivers")
 
 
 def receivers(

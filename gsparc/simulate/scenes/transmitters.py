@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.instantiate import known_keys
+from gsparc.data.instantiate import from_settings
 from gsparc.data.links.georeference import Georeference
 
 PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")  # Sionna's; the last is 3GPP TR 38.901, table 7.3-1
@@ -89,7 +89,7 @@ def stations(
     made: list[Transmitter] = []
     for number, entry in enumerate(entries):
         where = f"scene.transmitters[{number}]"
-        mast = Mast(**known_keys(entry, Mast, where, "setting"))
+        mast = from_settings(Mast, entry, where)
         if not 1 <= mast.sectors <= 12:
             raise ValueError(f"{where}.sectors={mast.sectors}: expected 1 to 12")
         pattern = mast.pattern or ("tr38901" if mast.sectors > 1 else "iso")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from campaigns import channels, powers, spectra
-from releases import REAL
+from releases import real
 
 from gsparc.commands.check import main as check
 from gsparc.data.checks.outliers import outliers, too_far, too_strong
@@ -15,24 +15,31 @@ MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}
 KINDS = pytest.mark.parametrize("kind", MAKERS)
 
 
-def spoilt(kind, folder, row, **change):
-    """A clean file and one of which an array was changed in one row; both as measurements."""
-    clean = MAKERS[kind](folder / "clean.npz")
-    with np.load(clean) as stored:
-        arrays = {name: stored[name].copy() for name in stored.files}
-    for name, factor in change.items():
-        if name == "rssi" and "rssi_db" in arrays:
-            arrays["rssi_db"][row] += 10 * np.log10(factor)
-        else:
-            arrays[name][row] = arrays[name][row] * factor
+def arrays_of(file):
+    with np.load(file) as stored:
+        return {name: stored[name].copy() for name in stored.files}
+
+
+def loaded(folder, arrays):
     np.savez(folder / "own.npz", **arrays)
-    return [load({"name": "own", "file": str(file)}) for file in (clean, folder / "own.npz")]
+    return load({"name": "own", "file": str(folder / "own.npz")})
+
+
+def spoilt(kind, folder, row, factor=1.0):
+    """A clean file and one whose measurement was changed in one row; both as measurements."""
+    arrays = arrays_of(MAKERS[kind](folder / "clean.npz"))
+    clean = loaded(folder, arrays)
+    if "rssi_db" in arrays:
+        arrays["rssi_db"][row] += 10 * np.log10(factor)
+    else:
+        arrays[kind][row] = arrays[kind][row] * factor
+    return clean, loaded(folder, arrays)
 
 
 @KINDS
 def test_one_row_at_1e8_rescales_nothing(kind, tmp_path, caplog, capsys):
     """PSNR rose to 51 dB while the NMSE was 7e13, without a warning; `gsparc check` said good."""
-    clean, wrong = spoilt(kind, tmp_path, 5, **{kind: 1e8})
+    clean, wrong = spoilt(kind, tmp_path, 5, 1e8)
     others = np.delete(np.arange(len(clean)), 5)
     assert wrong.site.target_scale == clean.site.target_scale
     assert np.array_equal(wrong.target[others], clean.target[others])
@@ -44,27 +51,21 @@ def test_one_row_at_1e8_rescales_nothing(kind, tmp_path, caplog, capsys):
 @pytest.mark.parametrize("kind", ["spectrum", "csi"])
 def test_a_flipped_byte_is_the_same(kind, tmp_path, caplog):
     """The exponent's highest bit of a single number."""
-    clean, wrong = spoilt(kind, tmp_path, 0)
-    path = tmp_path / "own.npz"
-    with np.load(path) as stored:
-        arrays = {name: stored[name].copy() for name in stored.files}
+    clean, _ = spoilt(kind, tmp_path, 0)
+    arrays = arrays_of(tmp_path / "clean.npz")
     arrays[kind] = arrays[kind].astype(np.complex64 if kind == "csi" else np.float32)
     values = arrays[kind].reshape(-1)
     values.view(np.uint8)[values.real.dtype.itemsize - 1] ^= 0x40
-    np.savez(path, **arrays)
-    wrong = load({"name": "own", "file": str(path)})
+    wrong = loaded(tmp_path, arrays)
     assert wrong.site.target_scale == clean.site.target_scale and "row 0: measure far" in caplog.text
 
 
 @KINDS
 def test_a_position_2e6_m_off_moves_nothing(kind, tmp_path, caplog):
     clean, _ = spoilt(kind, tmp_path, 0)
-    name = f"{clean.site.moving_end}_position"
-    with np.load(tmp_path / "clean.npz") as stored:
-        arrays = {key: stored[key].copy() for key in stored.files}
-    arrays[name][7] += [2e6, 0, 0]
-    np.savez(tmp_path / "own.npz", **arrays)
-    wrong = load({"name": "own", "file": str(tmp_path / "own.npz")})
+    arrays = arrays_of(tmp_path / "clean.npz")
+    arrays[f"{clean.site.moving_end}_position"][7] += [2e6, 0, 0]
+    wrong = loaded(tmp_path, arrays)
     assert np.allclose(wrong.site.origin, clean.site.origin, atol=0.5)
     assert np.ptp(wrong.site.box, axis=0).max() < 10
     assert "row 7: lie far outside the region of all others" in caplog.text
@@ -72,7 +73,7 @@ def test_a_position_2e6_m_off_moves_nothing(kind, tmp_path, caplog):
 
 @pytest.mark.parametrize("split", ["random", "grouped", "corner", "sparse"])
 def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
-    clean, wrong = spoilt("csi", tmp_path, 5, csi=1e8)
+    clean, wrong = spoilt("csi", tmp_path, 5, 1e8)
     assert outliers(wrong) and not outliers(clean)
     kept = split_for({"name": split, "leave_out": "outliers"}, wrong)
     for fold in kept.folds:
@@ -120,7 +121,7 @@ def test_real_dynamics_are_no_outliers():
 def test_a_row_beyond_float32_is_refused(tmp_path):
     """Its target would be infinite, in units of the other rows."""
     with pytest.raises(ValueError, match=r"csi, row 5: beyond float32 in units of the other rows"):
-        spoilt("csi", tmp_path, 5, csi=1e200)
+        spoilt("csi", tmp_path, 5, 1e200)
 
 
 @pytest.mark.parametrize(
@@ -144,10 +145,5 @@ def test_a_robot_that_waits_makes_no_outliers():
 
 def test_passing_a_station_is_no_outlier():
     """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
-    file = REAL / "real" / "powder-rss-462mhz.npz"
-    if not file.is_file():
-        pytest.skip(f"{file.name} is not here")
-    with np.load(file) as stored:
-        powers_db = stored["rssi_db"]
-    for column in powers_db.T:
+    for column in arrays_of(real("real/powder-rss-462mhz.npz"))["rssi_db"].T:
         assert not too_strong(10 ** (column[np.isfinite(column)] / 20)).any()

@@ -1,19 +1,18 @@
 """Warnings about readable measurements: each is given where it should be, and nowhere else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from releases import real
 from scipy.spatial.distance import cdist
 
 from gsparc.data.checks import plausibility
+from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.checks.level_steps import level_steps
 from gsparc.data.checks.plausibility import LinkLevels, link_levels
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
-
-
-def names_of(count):
-    return [f"row {i}" for i in range(count)]
 
 
 def walk(seed, count=600, step=8.0):
@@ -35,7 +34,7 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
         np.repeat(position, count, axis=0),
         np.tile(np.arange(count), rows),
         level_db.reshape(-1),
-        [name for name in names_of(rows) for _ in range(count)],
+        [f"row {i // count}" for i in range(rows * count)],
         names,
         station_position,
     )
@@ -57,26 +56,25 @@ def test_a_sound_room_raises_none():
     assert warnings_of(as_links(place, level[:, None], ["a"], np.array([[3, 2, 2.5]]))) == []
 
 
+def measured_at(place):
+    return from_arrays({"rx_position": place, "tx_position": np.median(place, axis=0), "rssi_db": room()[1]})
+
+
 @pytest.mark.parametrize(
     "position, said",
     [
-        (lambda p: p * 0 + 2, "a box of 0 m"),
-        (lambda p: np.round(p * 1000), "whole numbers up to"),
+        (lambda p: np.round(p * [600, 600, 1]), "whole numbers up to"),
         (lambda p: p * [1, 1, 1000], "heights differ by"),
-        (lambda p: np.stack([40.76 + p[:, 0] / 1e3, -111.8 + p[:, 1] / 1e3], 1), "degrees? then give"),
-        (lambda p: np.where(np.arange(100)[:, None] == 7, 1e5, p), "row 7: far outside"),
+        (lambda p: np.array([40.76, -111.8, 0]) + p / 1e3, "degrees? then give"),
+        (lambda p: p, None),
+        (lambda p: p + np.array([4e5, 5e6, 100]), None),  # UTM
+        (lambda p: p / 5 + [3, 1, 0], None),  # a small table far from the origin
+        (np.round, None),
     ],
 )
-def test_positions(position, said):
-    found = plausibility.position_warnings(position(room()[0]), names_of(100))
-    assert len(found) == 1 and said in found[0], found
-
-
-def test_small_tables_far_from_the_origin_are_not_degrees():
-    place = np.random.default_rng(0).uniform([3, 1, 0], [4.2, 2.2, 0.5], (50, 3))
-    assert plausibility.position_warnings(place, names_of(50)) == []
-    assert plausibility.position_warnings(place + np.array([4e5, 5e6, 100]), names_of(50)) == []  # UTM
-    assert plausibility.position_warnings(np.round(place), names_of(50)) == []
+def test_units_of_positions(position, said):
+    found = suspicious_values(measured_at(position(room()[0])))
+    assert len(found) == (said is not None) and all(said in line for line in found), found
 
 
 @pytest.mark.parametrize(
@@ -122,9 +120,12 @@ def test_whole_decibels_are_sound():
 
 def test_losses_rise_with_distance():
     place, level = room()
-    station, where = np.zeros(100, int), np.array([[3, 2, 2.5]])
-    assert plausibility.direction_warnings(place, station, level, where) == []
-    assert "rise with distance" in plausibility.direction_warnings(place, station, -level, where)[0]
+    where = np.array([[3, 2, 2.5]])
+    assert plausibility.direction_warnings(as_links(place, level[:, None], ["a"], where)) == []
+    assert (
+        "rise with distance"
+        in plausibility.direction_warnings(as_links(place, -level[:, None], ["a"], where))[0]
+    )
 
 
 def test_copies_and_repeated_measurements():
@@ -133,19 +134,18 @@ def test_copies_and_repeated_measurements():
     place[9], level[9] = place[8], level[8] + 2  # measured again
     place[11] = place[10]  # of another station
     level[11] = level[10]
-    station = np.zeros(20, int)
-    station[11] = 1
-    found = plausibility.copies(place, station, level, names_of(20))
+    links = replace(as_links(place, level[:, None], ["a"]), station=np.arange(20) // 11 % 2)
+    found = plausibility.copies(links)
     assert len(found) == 2 and "row 5 of row 3; leave" in found[0]
     assert "1 places were measured more than once" in found[1] and "1.4 dB" in found[1]
 
 
 def test_a_wild_row_is_named():
-    level = walk(0)[1]
+    place, level, _ = walk(0)
+    assert plausibility.wild_rows(as_links(place, level[:, None], ["a"])) == []
     level[123] += 60
-    found = plausibility.wild_rows(np.zeros(600, int), level, ["a"], names_of(600))
+    found = plausibility.wild_rows(as_links(place, level[:, None], ["a"]))
     assert len(found) == 1 and found[0].startswith("row 123: up to") and "row 124" not in found[0]
-    assert plausibility.wild_rows(np.zeros(600, int), walk(0)[1], ["a"], names_of(600)) == []
 
 
 def test_a_step_is_found_at_its_row():
@@ -190,16 +190,11 @@ def test_outages_and_what_was_not_heard():
     level[100:160, 0] = np.nan  # off
     level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
     level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
-    links = as_links(place, level, ["a", "b", "c"])
-    found = plausibility.gaps(links.station, links.level_db, links.names, links.rows)
-    assert (
-        found[0]
-        == "no level in the 60 rows from row 100 to row 159 of station a: an outage; these rows are not used"
-    )
+    found = plausibility.gaps(as_links(place, level, ["a", "b", "c"]))
+    assert found[0].startswith("no level in the 60 rows from row 100 to row 159 of station a: an outage;")
     assert "of station b, beside the weakest ones: not heard? then give sensitivity_db (" in found[1]
     assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
-    silent = plausibility.gaps(np.zeros(4, int), np.full(4, np.nan), ["a"], names_of(4))
-    assert silent == ["no level in any row"]
+    assert plausibility.gaps(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == ["no level in any row"]
 
 
 def real_links(name):
@@ -223,7 +218,7 @@ def test_a_real_station_that_lost_its_gain(campus):
 
 
 def test_real_outages_are_not_taken_for_silence(campus):
-    found = plausibility.gaps(campus.station, campus.level_db, campus.names, campus.rows)
+    found = plausibility.gaps(campus)
     assert sum("an outage" in line for line in found) == 8
     assert any("the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found)
     assert any(
@@ -236,10 +231,8 @@ def test_other_real_campaigns_raise_few(campus):
     for name in ("ble-hall-1", "ble-hall-2"):
         found = warnings_of(real_links(name))
         assert len(found) <= 1, found
-    assert plausibility.position_warnings(campus.position, campus.rows) == []
     assert plausibility.level_warnings(campus.level_db) == []
-    place, station, level, fixed = campus.position, campus.station, campus.level_db, campus.station_position
-    assert plausibility.direction_warnings(place, station, level, fixed) == []
+    assert plausibility.direction_warnings(campus) == []
 
 
 def test_copies_in_a_file_of_links_were_one_row():

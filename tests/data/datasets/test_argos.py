@@ -75,7 +75,7 @@ def test_peers_normalisation_is_one_number_for_all() -> None:
         (lambda p: np.save(p / "csidata.npy", np.zeros((4, 8, 52), complex)), "uplink is silent"),
         (lambda p: (p / "base-station.yml").write_text("base_station: [1, 2]"), "expected 8 x 3"),
         (lambda p: (p / "base-station.yml").write_text("- 1"), "expected `base_station:`"),
-        (lambda p: [(p / f"{n}_index.txt").write_text("0 1") for n in ("train", "test")], "twice"),
+        (lambda p: [(p / f"{n}_index.txt").write_text("0 1") for n in ("train", "test")], "also in train"),
     ],
 )  # fmt: skip
 def test_bad_folders_are_refused_in_words(tmp_path, change, words) -> None:

@@ -1,28 +1,426 @@
-"""`gsparc check` reads the files of campaigns as their loaders do; `dataset=own` says whose they are."""
+"""Layouts of measured campaigns: what is read and measured, and what is refused with array and row."""
+# ruff: noqa: E501 (a case is a row of a table)
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pytest
+from measured import (
+    ANTENNAS,
+    CYCLES,
+    DEGREES,
+    HOSTS,
+    KINDS,
+    MAKERS,
+    STATIONS,
+    TABLE,
+    ble_arrays,
+    channels_of,
+    powder_arrays,
+    release_variables,
+    write_npz,
+    write_release,
+    write_walk,
+)
 from releases import real
 
-from gsparc.data.datasets.own import read_any
+from gsparc.data.datasets.own import LOADERS, read_any
+from gsparc.data.datasets.powder import raw_of_powder
+from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.errors import DataError
-from gsparc.data.load import load
+from gsparc.data.load import datamodule, load
+from gsparc.data.raw import read_netcdf
 
-FILES = {
-    "techtile-csi-920mhz.npz": "techtile", "powder-rss-462mhz.npz": "powder", "ble-hall-1.npz": "ble",
-    "ble-hall-2.npz": "ble", "techtile-power-reci-rf-1.npz": None,
+EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
+
+
+@EVERY_KIND
+def test_techtile_release(tmp_path, kind):
+    raw = raw_of_techtile(write_release(tmp_path, kind))
+    held, rows = raw.arrays, 2 * CYCLES - 2  # one without position, one without channels
+    assert held["tx_position"].shape == (rows, 3) and held["tx_position"].dtype == np.float64
+    assert held["station_name"].tolist() == HOSTS.tolist()
+    assert np.array_equal(held["station_position"], ANTENNAS)  # matched by tile, not by order
+    assert held["frequency_hz"] == 920e6 and np.isfinite(held["csi"]).all()
+    assert held["row_name"][0] == "EXP005 cycle 1" and held["row_name"][-1] == "EXP006 cycle 7"
+    assert held["run"].tolist() == ["EXP005"] * CYCLES + ["EXP006"] * (CYCLES - 2)
+    assert held["mask"].sum() == 3 * rows - 1 and not held["mask"][3, 2]
+    assert raw.attributes["left_out"] == "1 of 15 cycles left out: no position"
+    # The release stores reference minus received phase, which rises with distance.
+    expected = channels_of(held["tx_position"])
+    assert np.allclose(held["csi"][held["mask"]], expected[held["mask"]], atol=1e-6)
+
+
+@EVERY_KIND
+def test_techtile_release_of_one_experiment(tmp_path, kind):
+    variables = {
+        name: (dimensions[1:], values[0]) if dimensions[0] == "experiment_id" else (dimensions, values)
+        for name, (dimensions, values) in release_variables().items()
+    }
+    del variables["experiment_id"]
+    held = raw_of_techtile(write_release(tmp_path, kind, variables)).arrays
+    assert held["csi"].shape == (CYCLES, 3) and set(held["run"]) == {"csi"}
+
+
+def test_techtile_release_without_flags(tmp_path):
+    variables = {n: v for n, v in release_variables().items() if not n.endswith("_available")}
+    masks = [raw_of_techtile(write_release(tmp_path, "netcdf3", v)).arrays["mask"] for v in (None, variables)]
+    assert np.array_equal(*masks)
+
+
+def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
+    path = write_release(tmp_path)
+    table = (tmp_path / "techtile_antenna_locations.yml").rename(tmp_path / "ceiling.yml")
+    assert np.array_equal(raw_of_techtile(path, table).arrays["station_position"], ANTENNAS)
+    refused("name the file with dataset.antennas", raw_of_techtile, path)
+    variables = {**release_variables(), "rx_antenna_position": (("hostname", "xyz"), ANTENNAS)}
+    path = write_release(tmp_path, variables=variables, antennas=False)
+    assert np.array_equal(raw_of_techtile(path).arrays["station_position"], ANTENNAS)
+
+
+TECHTILE = {
+    "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc: csi_imag, rover_z missing in a Techtile"),
+    "one experiment of two": (
+        {"csi_real": (("h", "c"), np.zeros((3, 8)))},
+        "csi.nc, csi_imag: expected shape (E, C, H)",
+    ),
+    "transposed": (
+        {"csi_imag": (("h", "c", "e"), np.zeros((3, 8, 2)))},
+        "csi.nc, csi_imag: expected shape (E, C, H) with E = 2 as in csi_real, C = 8 as in csi_real, "
+        "H = 3 as in csi_real, found (3, 8, 2); transposed?",
+    ),
+    "few hosts": ({"hostname": (("g",), np.array(["A05", "A06"]))}, "csi.nc, hostname: expected shape (H,)"),
+    "another host": (
+        {"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
+        "techtile_antenna_locations.yml: no antenna of the tiles G99",
+    ),
+    "no position": (
+        {"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
+        "csi.nc: no cycle has both a position and a channel",
+    ),
+    "NaN positions": (
+        {"rover_y": (("experiment_id", "cycle_id"), np.full((2, CYCLES), np.nan))},
+        "csi.nc: no cycle has both a position and a channel",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TECHTILE)
+def test_spoilt_techtile_releases(tmp_path, refused, case):
+    change, says = TECHTILE[case]
+    variables = {
+        name: value for name, value in {**release_variables(), **change}.items() if value is not None
+    }
+    refused(says, raw_of_techtile, write_release(tmp_path, variables=variables))
+
+
+ONE_CHANNEL, NAN_CHANNEL = "channels: [{x: 1, y: 2, z: 3}]", "channels: {1: {x: .nan, y: 2, z: 3}}"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("antennes: 3", "expected `antennes:` with a list"),
+        ("antennes:\n- tile: A05\n", "no antenna of the tiles A06, B05"),
+        *(
+            (
+                "antennes:\n" + "".join(f"- {{tile: {h}, {c}}}\n" for h in HOSTS),
+                "A05: expected x, y, z [m] of channel 1",
+            )
+            for c in (ONE_CHANNEL, NAN_CHANNEL)
+        ),
+        ("[1, 2", "not readable as YAML"),
+    ],
+)
+def test_spoilt_tables_of_antennas(tmp_path, refused, text, says):
+    path = write_release(tmp_path)
+    (tmp_path / "techtile_antenna_locations.yml").write_text(text)
+    refused(says, raw_of_techtile, path)
+
+
+@EVERY_KIND
+def test_damaged_netcdf(tmp_path, refused, kind):
+    path = write_release(tmp_path, kind)
+    whole = path.read_bytes()
+    for content in (b"", b"hello", whole[: len(whole) // 2], whole[:40], b"CDF\x05" + whole[4:]):
+        path.write_bytes(content)
+        refused("csi.nc: ", read_netcdf, path)
+    refused("no such file", read_netcdf, tmp_path / "other.nc")
+
+
+def test_values_that_were_never_written_are_none(tmp_path):
+    variables = release_variables()
+    variables["rover_x"][1][0, 2] = 9.969209968386869e36
+    raw = raw_of_techtile(write_release(tmp_path, variables=variables))
+    assert raw.attributes["left_out"].startswith("2 of 15 cycles")
+    assert np.isfinite(raw.arrays["tx_position"]).all()
+
+
+def test_powder_npz_is_geographic(tmp_path):
+    held, arrays = raw_of_powder(write_npz(tmp_path, "powder")).arrays, powder_arrays()
+    assert np.array_equal(held["latitude"], arrays["latitude"]) and "tx_position" not in held
+    where = np.stack([held["station_latitude"], held["station_longitude"]], axis=1)
+    assert np.abs(where - DEGREES).max() < 1e-9  # a tenth of a millimetre
+    assert held["station_name"].tolist() == STATIONS.tolist() and held["carrier_hz"] == 462.7e6
+    assert held["tx_height"] == 1.5 and held["station_height"] == 10
+    assert np.array_equal(held["rssi_db"], arrays["rssi_db"], equal_nan=True)
+
+
+def test_powder_npz_without_degrees_stays_in_metres(tmp_path):
+    def metric(arrays):
+        return {n: a for n, a in arrays.items() if n not in ("latitude", "longitude", "frequency_hz")}
+
+    held = raw_of_powder(write_npz(tmp_path, "powder", metric), None, 1.2, 20).arrays
+    assert held["tx_position"].shape == (20, 2) and held["station_position"].shape == (3, 2)
+    assert held["tx_height"] == 1.2 and held["station_height"] == 20 and "latitude" not in held
+    assert held["carrier_hz"] == 462.7e6
+
+
+def equal(one: np.ndarray, other: np.ndarray) -> bool:
+    if one.dtype.kind == "f":
+        return np.allclose(one, other, rtol=0, atol=1e-9, equal_nan=True)
+    return np.array_equal(one, other)
+
+
+def test_powder_csv_holds_the_same(tmp_path):
+    table, npz = raw_of_powder(write_walk(tmp_path)), raw_of_powder(write_npz(tmp_path, "powder"))
+    assert all(equal(table.arrays[name], npz.arrays[name]) for name in npz.arrays)
+    assert np.isnan(table.arrays["rssi_db"]).sum() == 2  # -101 in the release
+    assert table.arrays["row_name"][0] == "line 2"
+    assert "3 columns left out, no fixed place: bus-6186_rss" in table.attributes["left_out"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("tx_x_coord,tx_y_coord", "latitude,longitude"),
+        ("tx_x_coord,tx_y_coord", "TX Lat , TX Lon"),
+        ("timestamp", "Time"),
+        ("-101", ""),
+        ("-101", "NaN"),
+        ("\n", "\r\n"),
+        ("\n2022-11-23 13:24:05", "\n\n2022-11-23 13:24:05"),
+    ],
+)
+def test_powder_csv_in_other_spellings(tmp_path, old, new):
+    plain = raw_of_powder(write_walk(tmp_path)).arrays
+    other = raw_of_powder(write_walk(tmp_path, lambda text: text.replace(old, new))).arrays
+    assert all(equal(plain[name], other[name]) for name in set(plain) - {"row_name"})
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        '{"ebc-nuc1-b210": [40.7677, -111.83816], "bus-6186": null}',
+        "{'ebc-nuc1-b210': (40.7677, -111.83816),}",
+    ],
+)
+def test_powder_tables_of_stations(tmp_path, table):
+    raw = raw_of_powder(write_walk(tmp_path, table=table))
+    assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays["rssi_db"].shape == (20, 1)
+    assert "madsen-nuc2-b210" in raw.attributes["left_out"]
+    rows = "Name, Latitude, Longitude\nebc-nuc1-b210, 40.7677, -111.83816\n"
+    (tmp_path / "where.csv").write_text(rows)
+    again = raw_of_powder(tmp_path / "single_tx.csv", tmp_path / "where.csv")
+    assert np.array_equal(again.arrays["station_latitude"], raw.arrays["station_latitude"])
+
+
+HEADER = f"timestamp,bus-6186_rss,bus-6186_x,bus-6186_y,{','.join(STATIONS)},tx_x_coord,tx_y_coord\n"
+SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
+WALKS = {  # what is replaced in the walk (None: all of it), the table of stations, and what is said
+    "no header": ((HEADER, ""), TABLE, "are both named '-1'; is there no line of heads?"),
+    "empty": (None, TABLE, "single_tx.csv: empty; expected a line of heads"),
+    "binary": (("", ""), "\x00\x01", "location_coordinates.json: not readable"),
+    "no latitude": (("tx_x_coord", "east"), TABLE, "line 1: no column tx_x_coord (or "),
+    "no longitude": (("tx_y_coord", "east"), TABLE, "line 1: no column tx_y_coord"),
+    "swapped degrees": (SWAPPED, TABLE, "latitude is outside -90 to 90 degrees; are latitude and longitude swapped?"),
+    "a word": ((":01,-101,-1,-1,-", ":01,-101,-1,-1,loud-"), TABLE, "column 'ebc-nuc1-b210', line 3: 'loud-"),
+    "cells missing": ((":00,-101,-1,-1", ":00"), TABLE, "line 2 (6 cells): expected 9 cells"),
+    "no degrees": ((f",{powder_arrays()['longitude'][-1]!s}\n", ",nan\n"), TABLE, "column 'tx_y_coord', line 21: no value"),
+    "two transmitters": (("tx_x_coord,tx_y", "tx1_x_coord,tx2_x"), TABLE, "line 1: two transmitters in a row"),
+    "column twice": ((STATIONS[1], STATIONS[0]), TABLE, "are both named 'ebc-nuc1-b210'"),
+    "no station": (("", ""), '{"other": [40.0, -111.0]}', "no column is a station of"),
+    "stations that drive": (("", ""), '{"ebc-nuc1-b210": None}', "no station with coordinates"),
+    "station in words": (("", ""), '{"ebc-nuc1-b210": ["north", 1]}', "ebc-nuc1-b210: expected latitude and"),
+    "station beyond the pole": (("", ""), '{"ebc-nuc1-b210": [-111.8, 40.7]}', "ebc-nuc1-b210: latitude -111.8 is outside"),
+    "table is code": (("", ""), "__import__('os').getcwd()", "location_coordinates.json: not readable"),
+    "table is a list": (("", ""), "[1, 2]", "expected a table from names"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("file", "campaign"), FILES.items())
-def test_check_reads_a_campaign_as_its_loader_does(file, campaign):
+@pytest.mark.parametrize("case", WALKS)
+def test_spoilt_powder_tables(tmp_path, refused, case):
+    change, table, says = WALKS[case]
+    refused(says, raw_of_powder, write_walk(tmp_path, lambda t: t.replace(*change) if change else "", table))
+
+
+def test_absent_powder_files(tmp_path, refused):
+    path = write_walk(tmp_path)
+    (tmp_path / "location_coordinates.json").unlink()
+    refused("name the file with dataset.station_table", raw_of_powder, path)
+    refused("no such file", raw_of_powder, tmp_path / "other.csv")
+
+
+@pytest.mark.parametrize("height", [float("nan"), "high", True, None])
+def test_heights_are_metres(tmp_path, refused, height):
+    path = write_npz(tmp_path, "powder")
+    refused("dataset.tx_height=", raw_of_powder, path, None, height)
+    refused("dataset.station_height=", raw_of_powder, path, None, 1.5, height)
+
+
+def with_(name, change):
+    """A change of one array; None leaves it out."""
+
+    def changed(arrays):
+        found = {**arrays, name: change(arrays[name])}
+        return {key: value for key, value in found.items() if value is not None}
+
+    return changed
+
+
+def without(name):
+    return with_(name, lambda array: None)
+
+
+def nan_at(name, row, column):
+    def change(array):
+        changed = array.copy()
+        changed[row, column] = np.nan
+        return changed
+
+    return with_(name, change)
+
+
+SPOILT = {
+    "places missing": ("ble", without("mobile_position"), "mobile_position: missing; expected real numbers (S, 3)"),
+    "powers missing": ("ble", without("rssi_db"), "rssi_db: missing; expected real numbers (S, T)"),
+    "channels missing": ("techtile", without("csi"), "csi: missing; expected complex numbers (S, T)"),
+    "frequency missing": ("techtile", without("frequency_hz"), "frequency_hz: missing; expected real numbers ()"),
+    "places transposed": (
+        "ble", with_("mobile_position", np.transpose), "mobile_position: expected shape (S, 3), found (3, 15); transposed?",
+    ),
+    "powers transposed": (
+        "ble", with_("rssi_db", np.transpose),
+        "rssi_db: expected shape (S, T) with S = 15 as in mobile_position, T = 4 as in station_position, found (4, 15); transposed?",
+    ),
+    "places in 3-D": ("powder", with_("mobile_position", lambda a: np.c_[a, a[:, :1]]), "(S, 2), found (20, 3)"),
+    "places in 2-D": ("ble", with_("mobile_position", lambda a: a[:, :2]), "(S, 3), found (15, 2)"),
+    "table too short": (
+        "powder", with_("station_position", lambda a: a[:-1]),
+        "rssi_db: expected shape (S, T) with S = 20 as in mobile_position, T = 2 as in station_position, found (20, 3)",
+    ),
+    "names too few": ("ble", with_("station", lambda a: a[:-1]), "station: expected shape (T,) with T = 4"),
+    "names are numbers": ("ble", with_("station", lambda a: np.arange(4)), "station: expected text, found dtype"),
+    "runs too few": ("techtile", with_("run", lambda a: a[:-1]), "run: expected shape (S,) with S = 12"),
+    "channels real": ("techtile", with_("csi", np.abs), "csi: expected complex numbers, found dtype float32"),
+    "place NaN": ("powder", nan_at("mobile_position", 7, 1), "mobile_position, row 7 = ("),
+    "antenna NaN": ("techtile", nan_at("rx_antenna_position", 2, 2), "rx_antenna_position, row 2 = ("),
+    "place beyond Earth": ("techtile", with_("tx_position", lambda a: a * 1e9), "expected finite coordinates"),
+    "latitude NaN": ("powder", with_("latitude", lambda a: a * np.nan), "row 0: latitude nan is outside"),
+    "latitude beyond the pole": ("powder", with_("latitude", lambda a: a + 60), "latitude 100.765 is outside -90 to 90"),
+    "metres unlike degrees": (
+        "powder", with_("latitude", lambda a: a + 0.01 * (np.arange(20) == 7)), "mobile_position, row 7: .*m from where latitude",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_spoilt_files(tmp_path, refused, case):
+    name, change, says = SPOILT[case]
+    error = refused(says, LOADERS[name], write_npz(tmp_path, name, change))
+    assert str(error).startswith(f"{tmp_path / name}.npz")
+
+
+EVERY = pytest.mark.parametrize("name", MAKERS)
+
+
+@EVERY
+def test_absent_damaged_and_foreign_files(tmp_path, refused, name):
+    refused("no such file", LOADERS[name], tmp_path / "absent.npz")
+    path = write_npz(tmp_path, name)
+    path.write_bytes(path.read_bytes()[:100])
+    refused("damaged or not an npz", LOADERS[name], path)
+    foreign = write_npz(tmp_path, "ble" if name == "techtile" else "techtile")
+    refused("missing; expected real numbers", LOADERS[name], foreign)
+
+
+@EVERY
+def test_settings_of_the_configuration(tmp_path, name):
+    path = write_npz(tmp_path, name)
+    module = datamodule({"name": name, "file": str(path), "stations": [0, 2], "max_rows": 9})
+    assert module.selection.stations == (0, 2) and module.selection.max_rows == 9
+    assert module.name == name and module.selection.runs is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"max_row": 9}, "dataset.max_row: no such setting of dataset=ble; did you mean 'max_rows'?"),
+        ({"max_rows": 1}, "dataset.max_rows=1: a whole number of at least 2"),
+        ({"stations": []}, "dataset.stations=[]: a list of names like [A,B]"),
+        ({"min_rssi_db": "x"}, "dataset.min_rssi_db='x': a number"),
+        ({"file": None}, "dataset.file is not set; say dataset.file=FILE for dataset=ble"),
+        ({"root": "x"}, "dataset.root is not a setting of dataset=ble; say dataset.file=..."),
+    ],
+)
+def test_settings_that_cannot_be(tmp_path, refused, settings, says):
+    refused(says, datamodule, {"name": "ble", "file": str(write_npz(tmp_path, "ble")), **settings})
+
+
+def test_techtile_is_links_to_antennas(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        data = load({"name": "techtile", "file": str(write_release(tmp_path))})
+    stations, arrays = data.site.stations, raw_of_techtile(tmp_path / "csi.nc").arrays
+    assert data.site.kind == "csi" and data.site.static_end == "rx" and data.site.carrier_hz == 920e6
+    assert np.allclose(stations.position + data.site.origin, ANTENNAS) and stations.name == tuple(HOSTS)
+    assert len(data) == arrays["mask"].sum() and data.target.shape == (len(data), 1, 1)
+    links = arrays["csi"][data.place, data.station]
+    assert np.allclose(data.target[:, 0, 0] * data.site.target_scale, links, rtol=1e-5)
+    assert np.allclose(data.moving + data.site.origin, arrays["tx_position"][data.place])
+    runs = arrays["run"][data.place]
+    assert len(set(zip(runs, data.run, strict=True))) == 2
+    assert "1 of 15 cycles left out: no position" in caplog.text
+
+
+@pytest.mark.parametrize("form", ["npz", "csv"])
+def test_powder_is_links_on_the_earth(tmp_path, form):
+    path = write_npz(tmp_path, "powder") if form == "npz" else write_walk(tmp_path)
+    data, arrays = load({"name": "powder", "file": str(path)}), powder_arrays()
+    assert data.site.kind == "rssi" and data.site.static_end == "rx" and len(data) == 58
+    heard = 10 * np.log10(data.target[:, 0].astype(float) * data.site.target_scale)
+    assert np.allclose(heard, arrays["rssi_db"][data.place, data.station], atol=1e-3)
+    walk = np.stack([arrays["latitude"], arrays["longitude"]], axis=-1)[data.place]
+    for place, degrees, height in ((data.moving, walk, 1.5), (data.site.stations.position, DEGREES, 10)):
+        world = place + data.site.origin
+        found = np.stack(data.site.georeference.to_degrees(world[:, :2]), axis=-1)
+        assert np.abs(found - degrees).max() < 1e-7 and np.allclose(world[:, 2], height)
+
+
+def test_ble_is_links_to_sensors(tmp_path):
+    data, arrays = load({"name": "ble", "file": str(write_npz(tmp_path, "ble"))}), ble_arrays()
+    assert data.site.static_end == "rx" and len(data) == 60 and data.site.carrier_hz == 2.44e9
+    assert data.site.stations.name == tuple(arrays["station"])
+    assert np.allclose(data.site.stations.position + data.site.origin, arrays["station_position"])
+
+
+MEASURED = [
+    ("techtile-csi-920mhz.npz", "techtile", 1015 * 42 - 4),
+    ("powder-rss-462mhz.npz", "powder", None),
+    ("ble-hall-1.npz", "ble", 81 * 12),
+    ("ble-hall-2.npz", "ble", 45 * 12),
+    ("techtile-power-reci-rf-1.npz", None, 20382),
+]
+
+
+@pytest.mark.parametrize(("file", "campaign", "rows"), MEASURED)
+def test_check_reads_a_measured_campaign_as_its_loader_does(file, campaign, rows):
     path = real(f"real/{file}")
     reading = read_any(path)
     assert any(f"dataset={campaign}" in note for note in reading.notes) == (campaign is not None)
     loaded = load({"name": campaign or "own", "file": str(path)})
-    assert reading.data.site.sha256 == loaded.site.sha256
+    assert reading.data.site.sha256 == loaded.site.sha256 and len(loaded) == (rows or len(loaded))
 
 
 def test_own_names_the_campaign_of_a_file(tmp_path):
@@ -30,3 +428,27 @@ def test_own_names_the_campaign_of_a_file(tmp_path):
     np.savez(file, mobile_position=np.eye(3), station_position=np.eye(3), rssi_db=np.zeros((3, 3)))
     with pytest.raises(DataError, match="this is a file of dataset=ble; say dataset=ble"):
         load({"name": "own", "file": str(file)})
+
+
+def test_measured_phases_fall_with_distance():
+    """One unknown phase per antenna and run: along the line of sight phases fall with distance."""
+    held = raw_of_techtile(real("real/techtile-csi-920mhz.npz")).arrays
+    distance = np.linalg.norm(held["tx_position"][:, None] - held["station_position"], axis=-1)
+    turn = 2 * np.pi * held["frequency_hz"] / 299_792_458 * distance
+    phase = np.where(held["mask"], np.exp(1j * np.angle(held["csi"])), 0)[held["run"] == "EXP005"]
+    falling, rising = (
+        np.abs((phase * np.exp(sign * 1j * turn[held["run"] == "EXP005"])).mean(axis=0)).mean()
+        for sign in (1, -1)
+    )
+    assert falling > 0.3 > 0.1 > rising
+
+
+def test_measured_stations_lie_where_the_release_says():
+    path = real("real/powder-rss-462mhz.npz")
+    held = raw_of_powder(path).arrays
+    assert held["rssi_db"].shape == (5006, 12) and np.nanmin(held["rssi_db"]) > -101
+    station = held["station_name"].tolist().index("ebc-nuc1-b210")
+    where = [held[f"station_{axis}"][station] for axis in ("latitude", "longitude")]
+    assert np.allclose(where, [40.7677, -111.83816], atol=1e-7)  # the release's own table, to its five digits
+    data = load({"name": "powder", "file": str(path), "stations": ["ebc-nuc1-b210"]})
+    assert len(data) == np.isfinite(held["rssi_db"][:, station]).sum()

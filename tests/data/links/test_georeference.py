@@ -4,7 +4,6 @@ import pickle
 
 import numpy as np
 import pytest
-from releases import real
 
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
@@ -33,21 +32,6 @@ def test_known_lengths():
 def test_x_is_east_and_y_is_north():
     east, north = Georeference(50, 8).from_degrees([50, 50.01], [8.01, 8])
     assert east[0] > 700 and abs(east[1]) < 1 and north[1] > 1100 and abs(north[0]) < 1e-6
-
-
-def test_distances_are_those_of_the_ground():
-    """Between two places off the origin, too: against the radius of curvature at that latitude."""
-    latitude, step = np.radians(40.8), np.radians(0.001)
-    a, e2 = 6378137.0, 0.0066943799901413165
-    north = a * (1 - e2) / (1 - e2 * np.sin(latitude) ** 2) ** 1.5 * step
-    east = a * np.cos(latitude) / np.sqrt(1 - e2 * np.sin(latitude) ** 2) * step
-    degrees = np.degrees(latitude)
-    local = Georeference(40.76, -111.84).from_degrees(
-        [degrees - 0.0005, degrees + 0.0005, degrees], [-111.8, -111.8, -111.799]
-    )
-    assert np.linalg.norm(local[1] - local[0]) == pytest.approx(north, rel=1e-6)
-    middle = (local[0] + local[1]) / 2
-    assert np.linalg.norm(local[2] - middle) == pytest.approx(east, rel=1e-5)
 
 
 def test_the_antimeridian_and_the_poles_are_places():
@@ -93,12 +77,3 @@ def test_local_coordinates_that_are_none_are_refused():
             Georeference(0, 0).to_degrees(np.asarray(xy))
     with pytest.raises(DataError, match="no places"):
         Georeference.about(np.zeros(0), np.zeros(0))
-
-
-def test_a_real_campaign_has_its_size():
-    """Its own metres are of a sphere: 0.1 % less to the east and 0.4 % to the north."""
-    with np.load(real("real/powder-rss-462mhz.npz")) as stored:
-        latitude, longitude, given = stored["latitude"], stored["longitude"], stored["mobile_position"]
-    xy = Georeference.about(latitude, longitude).from_degrees(latitude, longitude)
-    scale = np.ptp(given, axis=0) / np.ptp(xy, axis=0)
-    assert (np.abs(scale - 1) < 0.005).all()

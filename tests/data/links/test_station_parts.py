@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.data.errors import DataError
-from gsparc.data.own import from_arrays, interpret
+from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
-from gsparc.data.selection import keep_stations, rows_by_station, split_stations
+from gsparc.data.selection import keep_stations, split_stations
 
 
 def wide(**more: np.ndarray) -> Raw:
@@ -71,33 +70,23 @@ def test_places_of_a_row_are_held_out_together_as_before():
     assert np.array_equal(np.unique(before.place), np.unique(after.place)) and len(before) == len(after)
 
 
+def unplaced() -> Raw:
+    return Raw({"rx_position": np.eye(4)[:, :3], "tx_position": np.ones(3), "rssi_db": np.zeros(4)})
+
+
 @pytest.mark.parametrize(
-    ("steps", "said"),
+    ("make", "steps", "says"),
     [
-        ({"c": (5,)}, "no station c in file"),
-        ({"b": (12,)}, "expected a row between 1 and 11"),
-        ({"b": (0,)}, "expected a row between 1 and 11"),
+        (wide, {"c": (5,)}, "no station c in file"),
+        (wide, {"b": (12,)}, "expected a row between 1 and 11"),
+        (wide, {"b": (0,)}, "expected a row between 1 and 11"),
+        (unplaced, {"b": (2,)}, "has no stations"),
     ],
 )
-def test_a_step_that_cannot_be_is_one_line(steps, said):
-    with pytest.raises(DataError, match=said):
-        split_stations(wide(), steps, "file")
+def test_a_step_that_cannot_be_is_one_line(refused, make, steps, says):
+    refused(says, split_stations, make(), steps, "file")
 
 
 def test_a_station_with_a_name_was_unknown_by_its_number():
     by_name, by_number = (split_stations(wide(), {who: (5,)}, "file").arrays for who in ("b", "1"))
     assert by_name["station_name"].tolist() == by_number["station_name"].tolist()
-
-
-def test_steps_without_stations_are_refused():
-    one = Raw({"rx_position": np.zeros((4, 3)), "tx_position": np.ones(3), "rssi_db": np.zeros(4)}, {}, {})
-    with pytest.raises(DataError, match="has no stations"):
-        split_stations(one, {"b": (2,)}, "file")
-    assert len(from_arrays({**one.arrays, "rx_position": np.eye(4)[:, :3]})) == 4
-
-
-@pytest.mark.parametrize("given", ["x", [], [1.5], [True], None])
-def test_the_setting_holds_lists_of_rows(given):
-    with pytest.raises(DataError, match=r"level_steps\.b=.*expected first rows"):
-        rows_by_station({"b": given})
-    assert rows_by_station({"b": 5, 3: [6, 7]}) == {"b": (5,), "3": (6, 7)}

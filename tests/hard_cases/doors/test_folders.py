@@ -1,6 +1,6 @@
 """Folders in the RFID release's layout, spoilt: `gsparc check` and `train.py dataset=rfid`.
 
-Remedy: gsparc/data/datasets/rfid.py. The cases of tests/data/test_bad_input.py come again, at the commands' own doors.
+Remedy: gsparc/data/datasets/rfid.py. Cases of tests/helpers/releases.py and more, at the commands' own doors.
 """
 # ruff: noqa: E501 (a case is a row of a table)
 
