@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from gains import phased
 from rooms import directed
 from small_worlds import CARRIER, ceiling, channel, fold
 
@@ -15,10 +16,10 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.kernels import cells, sphere
 from gsparc.models.directional import method as directional_gp
 from gsparc.models.image_sources.clutter.residual import Residual
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_gp import VisibilityGP
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.ops import Pose
@@ -120,8 +121,7 @@ def image_sources_circular() -> Arrays:
 
 def image_sources_phased() -> Arrays:
     """Gains of constant phase: weights, likelihood, left-out rows, predictions and their variance."""
-    phased = PhasedScene(_scene(), torch.tensor([0.3, -1.0, 2.0]), 0.2)
-    posterior = PhasedPosterior(_rows(), phased)
+    posterior = Posterior(_rows(), phased(_scene(), torch.tensor([0.3, -1.0, 2.0])))
     query = torch.from_numpy(np.random.default_rng(1).uniform(0, 3, (6, 3)))
     means, variance, prior = Query([posterior]).means(query, torch.tensor([CARRIER, CARRIER + 1e7]).double())
     return {
@@ -134,17 +134,16 @@ def image_sources_phased() -> Arrays:
 
 def residual_of_a_scene() -> Arrays:
     """What clutter is sought against: likelihood, what each source is worth, scores of changes."""
-    phased = PhasedScene(_scene(), torch.tensor([0.3, -1.0, 2.0]), 0.2)
-    rows = _rows()
-    residual = Residual(rows, phased)
+    rows, scene = _rows(), phased(_scene(), torch.tensor([0.3, -1.0, 2.0]))
+    residual = Residual(rows, scene)
     share = torch.linspace(0.4, 1, 90).view(3, 30)
-    level = phased.scene.log_amplitude
+    level = scene.log_amplitude
     scorer = residual.scorer(share, level)
-    gain, multiple = scorer.score_waves(phased.waves(rows))
+    gain, multiple = scorer.score_waves(scene.waves(rows))
     return {
         "nll": residual.nll(share, level).float().numpy().reshape(1),
         "worth": residual.nats_per_source(share, level).numpy(), "weights": scorer.alpha.numpy(),
-        "score": scorer.score(phased.waves(rows)).numpy(), "gain": gain.numpy(), "by": multiple.numpy(),
+        "score": scorer.score(scene.waves(rows)).numpy(), "gain": gain.numpy(), "by": multiple.numpy(),
     }  # fmt: skip
 
 

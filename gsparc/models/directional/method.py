@@ -26,8 +26,9 @@ from gsparc.data.splits import Fold
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions, coherence
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse
-from gsparc.models.image_sources.gp_likelihood import steering, with_noise
+from gsparc.models.image_sources.gp_likelihood import with_noise
 from gsparc.models.image_sources.rows import Rows, gather
+from gsparc.models.image_sources.scene import steering
 from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.models.in_double import in_double
 from gsparc.models.method import LeftOut, Prediction

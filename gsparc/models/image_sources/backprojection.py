@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import steering
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import steering
 from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.worker import raise_if_cancelled

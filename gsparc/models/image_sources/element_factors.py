@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.run_factors import run_factors
+from gsparc.models.image_sources.scene import Scene
 
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 
@@ -44,6 +45,7 @@ def element_factors(rows: Rows, scene: Scene, noise_floor: float) -> Tensor | No
         noise_floor: known variance of the noise, in units of the rows' power.
     """
     assert rows.array is not None and rows.element is not None
+    scene = replace(scene, phase=None)
     conditioned = Posterior(rows, scene, noise_floor).conditioned
     known, run = np.unique(rows.element.numpy(), return_inverse=True)
     inverse = conditioned.factor.inverse.to(torch.complex128).numpy()

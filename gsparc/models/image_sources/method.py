@@ -27,9 +27,8 @@ from gsparc.models.image_sources.ensemble import (
     search_many,
 )
 from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse, refuse_turning
-from gsparc.models.image_sources.gp_likelihood import Scene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import KINDS, Offsets, estimate
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import (
     Rows,
@@ -40,6 +39,7 @@ from gsparc.models.image_sources.rows import (
     measured_places,
     ranges_at,
 )
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.method import LeftOut, Method, Prediction
@@ -110,7 +110,7 @@ class ImageSourceGP(FramedMethod):
         self.offsets, self.clutter = offsets, clutter
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
-        self.members: list[PhasedPosterior] = []
+        self.members: list[Posterior] = []
 
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -155,7 +155,7 @@ class ImageSourceGP(FramedMethod):
         row_sets = self._row_sets(data, known, self.searches)
         found = self._search(row_sets, self.settings, budget, self.clutter, cache)
         if held.array is not None and self.offsets == "none":
-            again = self._calibrated(data, row_sets[found[0].number], found[0].phased.scene)
+            again = self._calibrated(data, row_sets[found[0].number], found[0].scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known, self.searches)
                 held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
@@ -166,7 +166,7 @@ class ImageSourceGP(FramedMethod):
             budget.limited = True
             notes.append(f"{self.name}: {affordable} of {len(held)} rows in the final process: time is short")
             held = held.take(torch.linspace(0, len(held) - 1, affordable).long())
-        self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
+        self.members = [Posterior(held, member.scene, self.noise_floor) for member in found]
         self.query = Query(self.members)
         self.held = self._held(data, known, found, len(held))
         notes += self._described(found, budget)
@@ -250,7 +250,7 @@ class ImageSourceGP(FramedMethod):
                 continue
             apart = self.frame.inside(gather(data, self._seen(known, turn), most, self.seed))
             twin = copy.copy(self)
-            twin.members = [PhasedPosterior(apart, member.phased, self.noise_floor) for member in members]
+            twin.members = [Posterior(apart, member.scene, self.noise_floor) for member in members]
             twin.weights, twin.query = ensemble_weights(members), Query(twin.members)
             batch = data.batch(group)
             rows.append(group)
@@ -270,12 +270,12 @@ class ImageSourceGP(FramedMethod):
             few = replace(self.settings, max_sources=sources, final_steps=20)
             now = TimeBudget(ALIGNMENT_SHARE * budget.seconds, budget.clock)
             rows = self._row_sets(aligned, known, 1)
-            phased = self._search(rows, few, now, False, SearchCache())[0].phased
+            scene = self._search(rows, few, now, False, SearchCache())[0].scene
             budget.limited |= now.limited
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)
-                gains = PhasedPosterior(rows[0], phased, self.noise_floor).mean_gains
-                aligned = self._remove_offsets(data, known, phased.scene, gains)
+                gains = Posterior(rows[0], scene, self.noise_floor).mean_gains
+                aligned = self._remove_offsets(data, known, scene, gains)
         return aligned
 
     def _remove_offsets(
@@ -386,7 +386,7 @@ class ImageSourceGP(FramedMethod):
             "weights": self.weights,
             "noise_floor": self.noise_floor,
             "factors": self.factors,
-            "scenes": [member.phased.state() for member in self.members],
+            "scenes": [member.scene.state() for member in self.members],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -394,8 +394,8 @@ class ImageSourceGP(FramedMethod):
         rows = self._restore_frame(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
         self.factors = state["factors"]
-        scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
-        self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]
+        scenes = [Scene.from_state(stored) for stored in state["scenes"]]
+        self.members = [Posterior(rows, scene, self.noise_floor) for scene in scenes]
         self.query = Query(self.members)
 
     def size(self) -> int:
@@ -403,10 +403,8 @@ class ImageSourceGP(FramedMethod):
         return max((len(member.scene.sequences) for member in self.members), default=0)
 
 
-def _loudest(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:
+def _loudest(member: Posterior, share: float, contribution: Tensor) -> Posterior:
     """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
     count = max(1, math.ceil(share * len(contribution)))
     kept = sorted({0, *contribution.topk(count).indices.tolist()})
-    phased = member.phased
-    scene = PhasedScene(phased.scene.only(kept), phased.phase[kept], phased.quadrature)
-    return PhasedPosterior(member.rows, scene, member.noise_floor)
+    return Posterior(member.rows, member.scene.only(kept), member.noise_floor)

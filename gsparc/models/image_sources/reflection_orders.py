@@ -12,9 +12,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import Late, no_deadline, refine
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 
 LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred

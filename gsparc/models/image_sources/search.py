@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, direct_amplitude
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import Late, learn_visibility, no_deadline, refine
 from gsparc.models.image_sources.reflection_orders import (
     drop_planes,
@@ -21,6 +21,7 @@ from gsparc.models.image_sources.reflection_orders import (
     reassign,
 )
 from gsparc.models.image_sources.rows import Rows, box_of
+from gsparc.models.image_sources.scene import Scene, direct_amplitude
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 from gsparc.physics.waves import LIGHT
@@ -147,7 +148,7 @@ class Search:
         if not sequences:
             return 0
         position = images(scene.transmitter, scene.planes, sequences)
-        candidates = replace(scene, sequences=tuple(sequences)).images(self.rows)
+        candidates = scene.over(sequences).images(self.rows)
         scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).conditioned)
         clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(
@@ -200,7 +201,7 @@ class Search:
         """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
         if parent is None:
             return points
-        scene = replace(self.scene, sequences=(parent,))
+        scene = self.scene.over((parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
     def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gains import gains
+from gains import gains, phased
 
 from gsparc.models.image_sources import refine
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, correlations, steering
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene, correlations, steering
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.processes.kernel import matern32_of_squares
 
@@ -40,8 +40,8 @@ def _scene() -> Scene:
     )
 
 
-def _phased(quadrature: float = 0.2) -> PhasedScene:
-    return PhasedScene(_scene(), torch.tensor([0.3, -1.0, 2.0]), quadrature)
+def _phased(quadrature: float = 0.2) -> Scene:
+    return phased(_scene(), torch.tensor([0.3, -1.0, 2.0]), quadrature)
 
 
 def test_covariance_by_the_formula():
@@ -74,20 +74,20 @@ def test_quadrature_one_is_the_circular_process():
     differences = []
     for noise in (-1.0, 0.5):
         circular = replace(scene, log_noise=noise)
-        phased = replace(_phased(quadrature=1.0), scene=circular)
-        differences.append(Posterior(rows, circular).nll - PhasedPosterior(rows, phased).conditioned.nll)
+        turned = replace(_phased(quadrature=1.0), log_noise=noise)
+        differences.append(Posterior(rows, circular).nll - Posterior(rows, turned).nll)
     assert differences[0] == pytest.approx(differences[1], abs=1e-2)
 
 
 @pytest.mark.parametrize("quadrature", [0.1, 1.0])
 def test_left_out_by_refitting_without_the_receiver(quadrature):
-    rows, phased = _rows(), _phased(quadrature)
-    left_out = PhasedPosterior(rows, phased).left_out()
+    rows, scene = _rows(), _phased(quadrature)
+    left_out = Posterior(rows, scene).left_out()
     for receiver in (0, 5):  # the first has two rows
         mine = rows.receiver == receiver
-        rest = PhasedPosterior(rows.take(torch.nonzero(~mine)[:, 0]), phased)
+        rest = Posterior(rows.take(torch.nonzero(~mine)[:, 0]), scene)
         held = rows.take(torch.nonzero(mine)[:, 0])
-        waves = steering(held, phased.scene.sources)
+        waves = steering(held, scene.sources)
         predicted = (waves[:, :, None] * gains(rest, held.position)).sum(1)
         torch.testing.assert_close(left_out[mine], predicted, rtol=1e-3, atol=1e-3)
 
@@ -116,30 +116,28 @@ def test_slopes_of_the_circular_likelihood():
 
 
 def test_slopes_of_the_phased_likelihood():
-    rows, phased = _rows(), _phased()
-    scene = phased.scene
+    rows, scene = _rows(), _phased()
     seen = correlations(rows, scene.sources, scene.visibility)
     values = [
-        scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), phased.phase,
+        scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), scene.phase,
     ]  # fmt: skip
-    start = refine._likelihood(rows, phased, values, seen, 1e-5)[0]
-    assert start == pytest.approx(PhasedPosterior(rows, phased).conditioned.nll, rel=1e-5)
+    start = refine._likelihood(rows, scene, values, seen, 1e-5)[0]
+    assert start == pytest.approx(Posterior(rows, scene).nll, rel=1e-5)
     _gradients_agree(
         values,
-        lambda v: refine._likelihood(rows, phased, v, seen, 1e-5),
+        lambda v: refine._likelihood(rows, scene, v, seen, 1e-5),
         lambda i: 3e-4 if i < 2 else 2e-2,
     )
 
 
 def test_refining_never_worsens_the_likelihood():
-    rows, scene, phased = _rows(), _scene(), _phased()
-    assert Posterior(rows, refine.refine(rows, scene, 8)).nll < Posterior(rows, scene).nll
-    better = refine.refine(rows, phased, 8)
-    assert PhasedPosterior(rows, better).conditioned.nll < PhasedPosterior(rows, phased).conditioned.nll
+    rows = _rows()
+    for scene in (_scene(), _phased()):
+        assert Posterior(rows, refine.refine(rows, scene, 8)).nll < Posterior(rows, scene).nll
 
 
 def test_packed_queries_equal_the_processes():
-    rows, members = _rows(), [PhasedPosterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
+    rows, members = _rows(), [Posterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
     tones = torch.tensor([2.40e9, 2.42e9, 2.44e9], dtype=torch.float64)
     queries = torch.rand(7, 3, dtype=torch.float64) * 3
     means, _, _ = Query(members).means(queries, tones)
@@ -154,17 +152,17 @@ def test_packed_queries_equal_the_processes():
 
 def test_variance_is_that_of_the_joint_gaussian():
     """Schur complement of the covariance of rows and query together."""
-    rows, phased = _rows(), _phased()
+    rows, scene = _rows(), _phased()
     query = torch.tensor([[1.0, 1.2, 0.4]], dtype=torch.float64)
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    _, variance, _ = Query([PhasedPosterior(rows, phased)]).means(query, tone)
+    _, variance, _ = Query([Posterior(rows, scene)]).means(query, tone)
     both = Rows(
         torch.cat([rows.position, query]),
         torch.cat([rows.frequency, tone]),
         torch.cat([rows.target, torch.zeros(1, 1, dtype=torch.complex64)]),
         torch.arange(COUNT + 1),
     )
-    inverse = PhasedPosterior(both, phased).conditioned.factor.inverse
+    inverse = Posterior(both, scene).conditioned.factor.inverse
     block = inverse[[COUNT, 2 * COUNT + 1]][:, [COUNT, 2 * COUNT + 1]]
     assert variance.item() == pytest.approx(torch.linalg.inv(block).trace().item(), rel=1e-3)
 
@@ -172,19 +170,19 @@ def test_variance_is_that_of_the_joint_gaussian():
 def test_variances_of_many_queries_are_those_of_each_alone():
     tones = torch.tensor([2.4e9], dtype=torch.float64)
     queries = torch.rand(5, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 3
-    query = Query([PhasedPosterior(_rows(), _phased()), PhasedPosterior(_rows(), _phased(0.7))], 10)
+    query = Query([Posterior(_rows(), _phased()), Posterior(_rows(), _phased(0.7))], 10)
     _, variance, prior = query.means(queries, tones)
     alone = [query.means(one[None], tones)[1:] for one in queries]
     torch.testing.assert_close(
         torch.stack([variance, prior], 1), torch.cat([torch.stack(p, 1) for p in alone])
     )
-    whole = Query([PhasedPosterior(_rows(), _phased())]).means(queries, tones)[1]
+    whole = Query([Posterior(_rows(), _phased())]).means(queries, tones)[1]
     assert bool((variance >= whole - 1e-5).all())  # fewer rows know less
     assert bool((variance <= prior).all())
 
 
 def test_without_variance_the_means_are_the_same():
-    members, tones = [PhasedPosterior(_rows(), _phased())], torch.tensor([2.4e9], dtype=torch.float64)
+    members, tones = [Posterior(_rows(), _phased())], torch.tensor([2.4e9], dtype=torch.float64)
     queries = torch.rand(3, 3, dtype=torch.float64) * 3
     mean, variance, prior = Query(members, variance_rows=0).means(queries, tones)
     assert torch.equal(mean, Query(members).means(queries, tones)[0])

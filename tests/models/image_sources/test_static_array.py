@@ -8,17 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gains import phased
 from rooms import nmse
 
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.models.image_sources.backprojection import quick_score, score
 from gsparc.models.image_sources.clutter.residual import Residual, _cost
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, steering
+from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import gather, static_array
+from gsparc.models.image_sources.scene import Scene, steering
 from gsparc.models.image_sources.search_cache import SearchCache
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import bisector, images, orientations, reflect
@@ -250,7 +251,7 @@ def test_the_inner_matrix_of_hardly_any_noise_has_a_factor():
 def test_clutter_is_looked_for_without_noise():
     rows, scene = _rows_and_scene()
     silent = replace(scene, log_noise=-40.0, visibility=KernelVisibility(0.999, 5.0, 50.0))
-    again = Residual(rows, PhasedScene(silent, torch.zeros(2), 0.15))
+    again = Residual(rows, phased(silent, torch.zeros(2), 0.15))
     assert np.isfinite(again.nll(torch.ones(2, len(rows)), silent.log_amplitude).item())
 
 
@@ -301,7 +302,5 @@ def test_one_antenna_is_a_case_of_several():
     mine = rows.take(torch.nonzero(rows.element == 0).flatten())
     alone = replace(mine, array=None, element=None)
     assert Posterior(mine, scene).nll == pytest.approx(Posterior(alone, scene).nll, rel=1e-4)
-    phased = [
-        PhasedPosterior(each, PhasedScene.of(each, scene, 0.4)).conditioned.nll for each in (mine, alone)
-    ]
-    assert phased[0] == pytest.approx(phased[1], rel=1e-4)
+    one, other = (Posterior(each, with_phases(each, scene, 0.4)).nll for each in (mine, alone))
+    assert one == pytest.approx(other, rel=1e-4)

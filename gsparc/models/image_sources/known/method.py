@@ -15,7 +15,7 @@ from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.ensemble import SEARCH_END, compact, left_out_error
-from gsparc.models.image_sources.gp_likelihood import Scene, direct_amplitude
+from gsparc.models.image_sources.gp_likelihood import with_phases
 from gsparc.models.image_sources.known.images import (
     MOST_PATCHES,
     Mirrors,
@@ -25,9 +25,9 @@ from gsparc.models.image_sources.known.images import (
     visible_sequences,
 )
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.phased_gp import PhasedScene
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene, direct_amplitude
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
@@ -78,16 +78,16 @@ class KnownWallsGP(ImageSourceGP):
             return near(values) + prior.cost(values[4], start.sequences)
 
         scene = refine(rows, start, STEPS[0], floor, over, near)
-        phased = PhasedScene.of(rows, scene, QUADRATURE)
-        phased = learn_visibility(rows, phased, STEPS[1], settings.visibility, floor, over)
-        prior = ReflectionPhasePrior.of(phased)
-        phased = refine(rows, phased, STEPS[2], floor, over, both)
-        error = left_out_error(rows, phased, floor)
+        scene = with_phases(rows, scene, QUADRATURE)
+        scene = learn_visibility(rows, scene, STEPS[1], settings.visibility, floor, over)
+        prior = ReflectionPhasePrior.of(scene)
+        scene = refine(rows, scene, STEPS[2], floor, over, both)
+        error = left_out_error(rows, scene, floor)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
             len(scene.sequences), len(scene.planes), error,
         )  # fmt: skip
-        return [Member(phased, error)]
+        return [Member(scene, error)]
 
     def _scene(self, rows: Rows, settings: SearchSettings, clutter: bool) -> Scene:
         """The static end and its images that some receiver sees, with amplitudes to start from."""
