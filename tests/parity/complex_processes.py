@@ -23,6 +23,7 @@ from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_gp import VisibilityGP
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.ops import Pose
+from gsparc.processes.left_out import groups_of
 from gsparc.training.context import FitContext
 
 Arrays = dict[str, np.ndarray]
@@ -245,6 +246,6 @@ def evidence_of_waves() -> Arrays:
     found["slope"] = evidence.slope(part, values.power, at).numpy()
     places = groups[0].places.numpy()
     for depth in (0, 2):
-        cell = cells(places, depth + 1) if depth else np.arange(len(places))
-        found[f"cells{depth}"] = evidence.left_out_cells(part, values.power, cell).numpy()
+        groups = groups_of(cells(places, depth + 1)) if depth else None
+        found[f"cells{depth}"] = evidence.left_out(part, values.power, [groups])[0].numpy()
     return found

@@ -258,6 +258,14 @@ def _of_waves(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor, fi
     return fixed * smooth(distance, shape.reach) + varying * smooth(distance, values.gain)
 
 
+def signals(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+    """Covariances (n, n) complex128 of the groups' signals, relative to each one's scale."""
+    return [
+        field + specular(shape, values, group.slot, group.places, group.places)
+        for field, group in zip(diffuse_fields(groups, shape, values), groups, strict=True)
+    ]
+
+
 def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
     """Variance (n,) of the signal."""
     found = shape.of("isotropic", values.power)[0] + directional(shape, values, [slot])[0].sum()

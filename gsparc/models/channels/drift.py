@@ -15,9 +15,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group, thinned
-from gsparc.models.channels.covariance import Shape, Values, diffuse_fields, specular, temporal
+from gsparc.models.channels.covariance import Shape, Values, temporal
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.left_out import groups_of
 from gsparc.processes.worker import stop_when_late
 
 STRETCH = 400  # rows looked at
@@ -44,7 +43,7 @@ def with_drift(
 
     Args:
         groups: see `contiguous_rows`.
-        signals: covariances (n, n) of theirs, see `signals_of`.
+        signals: covariances (n, n) of theirs, see `covariance.signals`.
         shape, values: without correlated noise.
     """
     noise = float(shape.of("noise", values.power)[0])
@@ -79,30 +78,6 @@ def with_drift(
     for name, level in zip(("noise", "fast", "drift"), np.exp(found.x), strict=True):
         power[fresh.where(name)] = float(level)
     return fresh, replace(values, power=power), before - float(found.fun)
-
-
-def left_out_cells(group: Group, signal: Tensor, other: Tensor, cells: list[np.ndarray]) -> list[Tensor]:
-    """Errors (n, D) of rows whose signal is predicted without any of their cell, for each of some cells (n,).
-
-    Args:
-        group: rows.
-        signal: (n, n) covariance of the signal.
-        other: (n, n) covariance of what disturbs it.
-        cells: numbers (n,) of cells.
-    """
-    other = other.to(torch.complex128)
-    given = Conditioned.of(signal + other, group.target)
-    own = [None if len(np.unique(cell)) == len(cell) else groups_of(cell) for cell in cells]
-    return [given.left_out_signal(other, groups)[0] for groups in own]
-
-
-def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
-    """Covariances (n, n) of the groups' signals."""
-    fields = diffuse_fields(groups, shape, values)
-    return [
-        field + specular(shape, values, group.slot, group.places, group.places)
-        for field, group in zip(fields, groups, strict=True)
-    ]
 
 
 def _likelihood(

@@ -18,12 +18,12 @@ from gsparc.models.channels.common import Common
 from gsparc.models.channels.covariance import (
     Shape,
     Values,
-    diffuse_fields,
     diffuse_of,
     directional,
     disturbance,
     explained,
     prior,
+    signals,
     specular,
 )
 from gsparc.models.image_sources.run_factors import RunFactors
@@ -252,13 +252,10 @@ class ChannelField(ConditionalField):
     def answer(self, batch: Batch) -> Posterior:
         """Answer rows of known stations, in the phase and level of their runs."""
         found = self(batch.tx, batch.rx, batch.station)
-        if len(self.runs) == 1:
-            return found
-        factor = self.runs.of(batch.run).to(found.mean.device)
-        turned = factor[:, None, None].to(found.mean.dtype)
-        explained = None if found.explained is None else found.explained * turned
-        variance = found.variance * factor.abs().square().float()
-        return replace(found, mean=found.mean * turned, variance=variance, explained=explained)
+        turned: Posterior = self.runs.restored(found, batch.run)
+        if turned is found or found.explained is None:
+            return turned
+        return replace(turned, explained=found.explained * self.runs.factor(found.mean, batch.run))
 
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
@@ -404,12 +401,8 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
 
 def _covariances(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
     """(n, n) complex128 of each group's rows with what disturbs them, relative to its scale."""
-    return [
-        field
-        + specular(shape, values, group.slot, group.places, group.places)
-        + disturbance(shape, values, group)
-        for field, group in zip(diffuse_fields(groups, shape, values), groups, strict=True)
-    ]
+    both = zip(signals(groups, shape, values), groups, strict=True)
+    return [signal + disturbance(shape, values, group) for signal, group in both]
 
 
 def _stored(slot: Slot) -> dict[str, Any]:

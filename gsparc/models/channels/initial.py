@@ -9,27 +9,27 @@ cells of nearby places and in 8. Powers of many directions fit any field: theirs
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import POSITIVE, Checked, setting, switch, whole
 from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
 from gsparc.models.channels.columns import Group, ends_of, gather, run_factors_of, thinned
 from gsparc.models.channels.complex_gp import CHOSEN_ON, LENGTHS, NOISES
-from gsparc.models.channels.covariance import BEYOND, Shape, Values, disturbance
+from gsparc.models.channels.covariance import BEYOND, Shape, Values, disturbance, signals
 from gsparc.models.channels.evidence import (
+    Cache,
     Compressed,
-    Kept,
+    Grouping,
     compressed,
     compressible,
     evidence,
     fit_powers,
-    left_out_cells,
+    left_out,
     normalised,
     without,
 )
@@ -40,6 +40,7 @@ from gsparc.models.channels.probe import best_offset
 from gsparc.models.haste import factor_s
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import groups_of
 from gsparc.processes.worker import Cancelled, cancelled_by
 from gsparc.training.time_budget import TimeBudget
 
@@ -66,7 +67,7 @@ NO_WORSE = 1.1  # largest of any one of them
 
 
 @dataclass(frozen=True)
-class ChannelSettings(Checked):
+class ChannelSettings:
     """Terms that are tried beside the isotropic diffuse field, and what they are learned on.
 
     Attributes:
@@ -82,16 +83,16 @@ class ChannelSettings(Checked):
         mirrors: planes that several static ends share, at most; 0 for none.
     """
 
-    constant: bool = setting(True, switch())
-    direct: bool = setting(True, switch())
-    directions: bool = setting(True, switch())
-    correlated: bool = setting(True, switch())
-    angles: int = setting(24, whole(4, 200))
-    rows: int = setting(400, whole(8))
-    tied: int = setting(64, whole(4, 500))
-    narrow: float = setting(16.0, POSITIVE)
-    knots: int = setting(9, whole(2, 100))
-    mirrors: int = setting(8, whole(0, 32))
+    constant: bool = True
+    direct: bool = True
+    directions: bool = True
+    correlated: bool = True
+    angles: int = 24
+    rows: int = 400
+    tied: int = 64
+    narrow: float = 16.0
+    knots: int = 9
+    mirrors: int = 8
 
 
 @dataclass(frozen=True)
@@ -205,11 +206,16 @@ def _strongest(shape: Shape, values: Values) -> tuple[Shape, Values]:
     return replace(shape, angles=shape.angles[strong]), replace(values, power=kept)
 
 
+def _groupings(places: Tensor) -> list[Grouping]:
+    """Rows (n,) left out one by one, then in the cells of each of `DEPTHS`."""
+    deep = [groups_of(cells(places.numpy(), depth)) for depth in DEPTHS]
+    return [None, *(groups if len(groups) < len(places) else None for groups in deep)]
+
+
 def _left_out(part: Compressed, power: Tensor) -> np.ndarray:
     """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
-    places = part.group.places.numpy()
-    grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
-    return np.stack([left_out_cells(part, power, cell).abs().square().mean(1).numpy() for cell in grouping])
+    errors = left_out(part, power, _groupings(part.group.places))
+    return np.stack([error.abs().square().mean(1).numpy() for error in errors])
 
 
 @dataclass(frozen=True)
@@ -221,7 +227,7 @@ class _Search:
     every: tuple[Group, ...]
     start: tuple[Shape, Values]
     wavelength: float
-    kept: Kept
+    cache: Cache = field(default_factory=dict)
 
     @staticmethod
     def of(
@@ -237,7 +243,7 @@ class _Search:
         if not compressible(groups[0], *start):
             groups = thinned(every, DENSE_COLUMNS, min(settings.rows, DENSE_ROWS))
         wavelength = 2 * math.pi / every[0].slot.wavenumber
-        return _Search(settings, groups, every, start, wavelength, Kept())
+        return _Search(settings, groups, every, start, wavelength)
 
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes; what the seconds end is as if it had not been tried."""
@@ -261,9 +267,7 @@ class _Search:
             kept.append(self._step(kept[-1], after, name, notes))
 
         step(self._fitted(*self.start), "powers by likelihood")
-        one_end = (
-            self.every[0].places.shape[1] == 3
-        )  # where both move, what waves have in common is not known
+        one_end = self.one_end  # where both move, what waves have in common is not known
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
@@ -290,7 +294,7 @@ class _Search:
         return after if keep else before
 
     def _compressed(self, shape: Shape, values: Values) -> tuple[Compressed, ...]:
-        return compressed(self.groups, shape, values, self.kept)
+        return compressed(self.groups, shape, values, self.cache)
 
     def _measured(self, shape: Shape, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
         """With what left-out rows say."""
@@ -313,33 +317,32 @@ class _Search:
         numbers = sum(2 * group.target.numel() for group in self.groups)
         return 0.5 * parameters * math.log(numbers)
 
-    def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
-        """With leakage and the direct wave; the best of a few lengths."""
-        one_end = self.every[0].places.shape[1] == 3
-        shape = replace(before.shape, constant=self.settings.constant and one_end, direct=direct)
-        return self._moved(self._of_lengths(shape, before.values, before.shape, direct, budget))
+    @property
+    def one_end(self) -> bool:
+        """Whether one end stands."""
+        return self.every[0].places.shape[1] == 3
 
-    def _of_lengths(
-        self, shape: Shape, values: Values, old: Shape, gains: bool, budget: TimeBudget
-    ) -> Candidate:
-        """Lengths of the envelope and of gains from a short fit each, then powers."""
+    def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
+        """With leakage and the direct wave; lengths by a short fit each, then powers."""
+        old, values = before.shape, before.values
+        shape = replace(old, constant=self.settings.constant and self.one_end, direct=direct)
         powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
         start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
         values = replace(values, power=torch.tensor(start, dtype=torch.float64))
         tried: list[tuple[Values, float]] = []
         for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
-            for gain in GAINS if gains else GAINS[:1]:
+            for gain in GAINS if direct else GAINS[:1]:
                 if tried and budget.over(LENGTHS_SHARE):
                     break
                 lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
                 trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
                 tried.append(fit_powers(self._compressed(shape, trial), shape, trial, 0.0, SHORT))
-        return self._fitted(shape, min(tried, key=lambda each: each[1])[0])
+        return self._moved(self._fitted(shape, min(tried, key=lambda each: each[1])[0]))
 
     def _moved(self, found: Candidate) -> Candidate:
         """With static ends where they really are."""
         shape, values = found.shape, found.values
-        if not shape.direct or self.every[0].places.shape[1] > 3:
+        if not shape.direct or not self.one_end:
             return found
         offset = best_offset(self._compressed(shape, values), shape, values, self.wavelength)
         if offset is None:
@@ -357,9 +360,8 @@ class _Search:
         rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(shape, values)
         wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
         parts = wide._compressed(shape, values)
-        planes, sequences = find_mirrors(
-            rough, parts, shape, values, self.wavelength, self.settings.mirrors, late
-        )
+        most = self.settings.mirrors
+        planes, sequences = find_mirrors(rough, parts, shape, values, self.wavelength, most, late)
         if not sequences:
             return None
         power, end = values.power, shape.where("noise")[0]
@@ -431,18 +433,16 @@ class _Search:
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
         groups = drift.contiguous_rows(self.every)
-        signals = drift.signals_of(groups, before.shape, before.values)
-        shape, values, gain = drift.with_drift(groups, signals, before.shape, before.values)
-        errors = [np.zeros(1 + len(DEPTHS)), np.zeros(1 + len(DEPTHS))]
-        for group, signal in zip(groups, signals, strict=True):
-            places = group.places.numpy()
-            grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
+        known = signals(groups, before.shape, before.values)
+        shape, values, gain = drift.with_drift(groups, known, before.shape, before.values)
+        errors = np.zeros((2, 1 + len(DEPTHS)))
+        for group, signal in zip(groups, known, strict=True):
             for found, of, at in zip(errors, (before.shape, shape), (before.values, values), strict=True):
-                other = disturbance(of, at, group)
-                left = drift.left_out_cells(group, signal, other, grouping)
+                other = disturbance(of, at, group).to(torch.complex128)
+                given = Conditioned.of(signal + other, group.target)
+                left = [given.left_out_signal(other, rows)[0] for rows in _groupings(group.places)]
                 found += [float(error.abs().square().mean()) / len(groups) for error in left]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
-        known = replace(before, nll=0.0, errors=errors[0])
         after = Candidate(shape, values, worth - gain, errors[1])
-        kept = self._step(known, after, "noise correlated over rows", notes)
-        return after if kept is after else before
+        start = replace(before, nll=0.0, errors=errors[0])
+        return after if self._step(start, after, "noise correlated over rows", notes) is after else before
