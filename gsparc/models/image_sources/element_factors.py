@@ -23,12 +23,6 @@ from gsparc.models.image_sources.scene import Scene
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 
 
-def aligned(rows: Rows, factors: Tensor) -> Rows:
-    """Rows of a static array times what their antennas' channels must be multiplied by, (E,) complex64."""
-    assert rows.element is not None
-    return replace(rows, target=rows.target * factors[rows.element, None])
-
-
 def direct_path(rows: Rows, static: Tensor) -> Scene:
     """The static end (3,) [m] alone, with its share of the power of unit rows."""
     scene = Scene(static, torch.zeros(0, 4).double(), ((),), torch.zeros(1), math.log(UNEXPLAINED))
@@ -53,9 +47,9 @@ def element_factors(rows: Rows, scene: Scene, noise_floor: float) -> Tensor | No
     each = np.ones(len(rows.array), np.complex128)
     each[known] = found / found[0]
     factors = torch.from_numpy(each.astype(np.complex64))
-    turned = aligned(rows, factors)
-    scale = turned.target.abs().square().mean().sqrt()  # a common factor is the sources' to have
-    nll = Posterior(replace(turned, target=turned.target / scale), scene, noise_floor).nll
+    target = rows.target * factors[rows.element, None]
+    scale = target.abs().square().mean().sqrt()  # a common factor is the sources' to have
+    nll = Posterior(replace(rows, target=target / scale), scene, noise_floor).nll
     jacobian = 2 * float((factors.abs().log()[rows.element] - scale.log()).double().sum())
     gain = conditioned.nll - (nll - jacobian)
     cost = (len(known) - 1) * math.log(len(rows))

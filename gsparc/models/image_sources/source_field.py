@@ -17,9 +17,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.directional.method import DirectionalGP
-from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows, gather
 from gsparc.models.image_sources.scene import correlations
 from gsparc.models.method_field import MethodField
@@ -105,9 +103,7 @@ class SourceField(FramedField):
             )
         ]
         data = replace(data, target=data.target * method.factors.numpy()[:, None])
-        held = method.frame.inside(gather(data, rows, method.row_limit, method.seed))
-        method.members = [Posterior(held, scene, method.noise_floor) for scene in scenes]
-        method.query = Query(method.members)
+        method._conditioned(method.frame.inside(gather(data, rows, method.row_limit, method.seed)), scenes)
 
 
 class RayField(FramedField):

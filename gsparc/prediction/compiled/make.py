@@ -14,9 +14,7 @@ from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.image_sources.clutter.blocking import Clutter
-from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
 from gsparc.models.mixture.mixture import Mixture
@@ -180,8 +178,7 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     scene = replace(member.scene, clutter=Clutter.none())
     alone = ImageSourceGP.__new__(ImageSourceGP)
     alone.__dict__.update(method.__dict__, weights=torch.ones(1))
-    alone.members = [Posterior(rows, scene, method.noise_floor)]
-    alone.query = Query(alone.members)
+    alone._conditioned(rows, [scene])
     form = sources_form(alone, data.site, alone.query)
     return replace(form, predictor=Predictor(alone, data.site))
 

@@ -7,7 +7,7 @@ from shoeboxes import as_arrays
 
 from gsparc.data.own import from_arrays
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import SourceKind, box_of, kinds
+from gsparc.models.image_sources.rows import box_of, scatterers
 from gsparc.training.context import FitContext
 
 SCATTERERS = np.array([[2.3, 0.9, 0.8], [1.1, 1.9, 1.2]])
@@ -50,10 +50,10 @@ def test_scatterers_are_found_and_told_from_images(tmp_path):
     method, _, error = _fit(data, fold, tmp_path)
     scene = method.members[0].scene
     places = (scene.sources + method.frame.middle).numpy() + data.site.origin
-    named = kinds(scene.sources, box_of(method.members[0].rows, scene.transmitter))
-    inside = places[[k is SourceKind.SCATTERER for k in named]]
+    scattered = scatterers(scene.sources, box_of(method.members[0].rows, scene.transmitter)).numpy()
+    inside = places[scattered]
     nearest = np.linalg.norm(SCATTERERS[:, None] - inside[None], axis=-1).min(1)
     assert (nearest < 0.1 * WAVELENGTH).all() and error < 0.01
     images = told.images.of(told.tx[0])[told.images.order == 1]
-    outside = places[[k is SourceKind.IMAGE for k in named]]
+    outside = places[~scattered]
     assert (np.linalg.norm(images[:, None] - outside[None], axis=-1).min(1) < 0.3 * WAVELENGTH).all()
