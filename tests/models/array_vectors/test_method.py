@@ -31,15 +31,17 @@ from gsparc.training.context import FitContext
 SMALL = FieldSettings(count=64)
 
 
-def _fold(rows, seed=0):
-    order = np.random.default_rng(seed).permutation(rows)
+def _fold(rows):
+    order = np.random.default_rng(0).permutation(rows)
     cut = rows // 5
     return Fold(np.sort(order[2 * cut :]), np.sort(order[cut : 2 * cut]), np.sort(order[:cut]))
 
 
-def _split(rows):
-    folds = (_fold(rows),)
-    return Split("known", folds, indices_hash(folds))
+@pytest.fixture(scope="module")
+def small(known_campaign, tmp_path_factory):
+    """64 Gaussians fitted to 96 of the spectra, its report and folder."""
+    method, folder = ArrayField(SMALL), tmp_path_factory.mktemp("run")
+    return method, method.fit(known_campaign[0], _fold(160), FitContext(folder)), folder
 
 
 @pytest.mark.parametrize("grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)])
@@ -123,12 +125,10 @@ def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
     assert np.corrcoef(chosen.unknown, np.log(chosen.error))[0, 1] > 0.5
 
 
-def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
-    data, _ = known_campaign
-    split = _split(160)
-    method = ArrayField(SMALL)
-    report = method.fit(data, split.folds[0], FitContext(tmp_path))
-    assert report.seconds > 0 and (tmp_path / "array_recovery.csv").exists()
+def test_beats_neighbours_is_stored_and_restored(known_campaign, small, tmp_path):
+    data, folds = known_campaign[0], (_fold(160),)
+    split, (method, report, folder) = Split("known", folds, indices_hash(folds)), small
+    assert report.seconds > 0 and (folder / "array_recovery.csv").exists()
     nearest = method_class("nearest")()
     nearest.fit(data, split.folds[0], FitContext(tmp_path))
     ours, theirs = (score([m], data, split) for m in (method, nearest))
@@ -141,10 +141,8 @@ def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
     assert again.size() == 64
 
 
-def test_confidence_falls_and_error_grows_with_distance(known_campaign, tmp_path):
-    data, _ = known_campaign
-    method = ArrayField(SMALL)
-    method.fit(data, _fold(160), FitContext(tmp_path))
+def test_confidence_falls_and_error_grows_with_distance(known_campaign, small):
+    data, method = known_campaign[0], small[0]
     batch = data.batch(np.array([40]))
     away = torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.3], [0, 0, 5.0]])
     found = method.predict(batch.tx + away, batch.rx)
@@ -154,11 +152,9 @@ def test_confidence_falls_and_error_grows_with_distance(known_campaign, tmp_path
     torch.testing.assert_close(found.mean[-1], background, atol=1e-3, rtol=0)
 
 
-def test_position_errors_cost_smoothly(known_campaign, tmp_path):
+def test_position_errors_cost_smoothly(known_campaign, small):
     """The sensitivity hook: millimetres change a spectrum by little, centimetres by more."""
-    data, _ = known_campaign
-    method = ArrayField(SMALL)
-    method.fit(data, _fold(160), FitContext(tmp_path))
+    data, method = known_campaign[0], small[0]
     batch = data.batch(np.arange(0, 160, 8))
     still = method.predict(batch.tx, batch.rx).mean
     moved = [method.predict(batch.tx + shift, batch.rx).mean for shift in (0.001, 0.01, 0.1)]
@@ -166,10 +162,8 @@ def test_position_errors_cost_smoothly(known_campaign, tmp_path):
     assert error[0] < 0.02 and error[0] < error[1] < error[2]
 
 
-def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, tmp_path, monkeypatch):
-    data, _ = known_campaign
-    whole, few = ArrayField(SMALL), ArrayField(SMALL)
-    whole.fit(data, _fold(160), FitContext(tmp_path))
+def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, small, tmp_path, monkeypatch):
+    data, whole, few = known_campaign[0], small[0], ArrayField(SMALL)
     few.settings = replace(
         few.settings, emission=replace(few.settings.emission, encoding=EncodingSettings(anchors=40))
     )
@@ -193,20 +187,13 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
         ArrayField().predict(torch.zeros(1, 3), None)
 
 
-@pytest.mark.parametrize("rows", [1, 3])
-def test_very_few_rows(known_campaign, tmp_path, rows):
+@pytest.mark.parametrize("rows", [1, 3, 96])
+def test_very_few_rows_and_duplicate_positions(known_campaign, tmp_path, rows):
     data, _ = known_campaign
+    if rows == 96:
+        data = replace(data, tx=np.repeat(data.tx[::4], 4, axis=0))
     method = ArrayField(SMALL)
-    method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 10)), FitContext(tmp_path))
-    batch = data.batch(np.arange(4))
-    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
-
-
-def test_duplicate_positions(known_campaign, tmp_path):
-    data, _ = known_campaign
-    data = replace(data, tx=np.repeat(data.tx[::4], 4, axis=0))
-    method = ArrayField(SMALL)
-    method.fit(data, _fold(160), FitContext(tmp_path))
+    method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 100)), FitContext(tmp_path))
     batch = data.batch(np.arange(4))
     assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
 

@@ -59,10 +59,6 @@ def _fold(data):
     return make_split(data.moving, SplitSettings(name="random"), place=data.place).folds[0]
 
 
-def _known(fold):
-    return np.concatenate([fold.train, fold.val])
-
-
 def _tied(data, rows):
     middle = torch.from_numpy(data.moving).mean(0)
     angles = sphere(16)[:8]
@@ -105,7 +101,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
 def test_one_field_of_all_ends_is_better_than_plain_processes():
     data = _ceiling(shift=(0.03, -0.02, 0.0))
     fold = _fold(data)
-    field, notes = initialise(data, _known(fold), QUICK)
+    field, notes = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
     assert len(field.stations) == 6 and any("angles to ends" in note for note in notes)
     assert not learns(field)  # the likelihood of all rows has found its parameters
     batch, plain = data.batch(fold.test), for_links(ComplexGP, data)
@@ -148,7 +144,7 @@ def test_runs_of_all_ends_differ_by_one_phase():
     runs = np.arange(80) % 2
     data = _ceiling(runs=runs)
     fold = _fold(data)
-    field, _ = initialise(data, _known(fold), QUICK)
+    field, _ = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
     found = field.runs.factors[1] / field.runs.factors[0]
     torch.testing.assert_close(found.abs(), torch.ones(()).double())
     assert abs(abs(float(found.angle())) - 0.9) < 0.1
@@ -210,7 +206,7 @@ def test_measured_ceiling_in_squares():
     data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
     split = make_split(data.moving, SplitSettings(name="blocks", side_m=0.6), place=data.place)
     fold = split.folds[0]
-    field, _ = initialise(data, _known(fold), ChannelSettings())
+    field, _ = initialise(data, np.concatenate([fold.train, fold.val]), ChannelSettings())
     plain, batch = for_links(ComplexGP, data), data.batch(fold.test)
     plain.fit(data, fold, FitContext())
     with torch.no_grad():

@@ -64,7 +64,8 @@ def test_variance_is_of_the_size_of_the_error(small):
     error = (prediction.mean - data.targets(fold.test)).abs().square().mean((1, 2))
     assert 0.5 < prediction.variance.mean() / error.mean() < 2
     assert prediction.confidence.min() > 0.9
-    outside = method.predict(torch.zeros(1, 3), _shifted(data, fold.test[:1], 30.0))
+    rx = data.batch(fold.test[:1]).rx
+    outside = method.predict(torch.zeros(1, 3), replace(rx, position=rx.position + 30.0))
     assert outside.confidence[0] <= prediction.confidence.min()
 
 
@@ -98,20 +99,15 @@ def test_paths_of_averaged_solutions_were_those_of_the_heaviest(small):
     assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
 
 
-def _shifted(data, index, metres):
-    rx = data.batch(index).rx
-    return type(rx)(rx.position + metres, rx.rotation)
-
-
-def test_state_is_restored(small, tmp_path):
-    _, data, fold, method, _ = small
+def test_state_is_restored_and_the_report_counts_searches(small, tmp_path):
+    _, data, fold, method, report = small
     torch.save(method.state(), tmp_path / "state.pt")
     again = ImageSourceGP()
     again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     before, after = (_predicted(m, data, fold.test) for m in (method, again))
     torch.testing.assert_close(after.mean, before.mean)
     torch.testing.assert_close(after.variance, before.variance)
-    assert again.size() == method.size() >= 7
+    assert again.size() == method.size() >= 7 and "1 of 1 searches" in report.notes[0] and report.seconds > 0
 
 
 def test_one_query_is_like_many(small):
@@ -121,12 +117,6 @@ def test_one_query_is_like_many(small):
         torch.testing.assert_close(
             _predicted(method, data, np.array([row])).mean[0], many.mean[i], rtol=1e-3, atol=1e-4
         )
-
-
-def test_report_counts_searches(small):
-    *_, report = small
-    assert report.seconds > 0
-    assert "1 of 1 searches" in report.notes[0]
 
 
 def test_a_small_budget_ends_after_the_first_search(tmp_path):
@@ -189,16 +179,12 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     _, data, fold = shoebox(100, size=(3.0, 2.5, 2.2), max_order=1, frequency_hz=frequency)
     mask = np.zeros(data.target.shape, bool)
     mask[..., ::4] = True
-    known = _masked(data, mask)
+    known = replace(data, mask=mask)
     assert set(gather(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
     method = ImageSourceGP(searches=1, search_rows=200, margin=4.0)
     method.fit(known, fold, FitContext(tmp_path))
     prediction = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
-
-
-def _masked(data, mask):
-    return type(data)(**{**vars(data), "mask": mask})
 
 
 def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
@@ -214,16 +200,17 @@ def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
     assert len(few) == 10
 
 
-def test_spectra_and_unknown_ends_are_refused_in_one_line(tmp_path):
+def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):
+    """Of zero channels the library's sequences about a matrix that is not positive definite came."""
     fold = Fold(np.arange(30), np.arange(30, 36), np.arange(36, 48))
     with pytest.raises(ValueError, match="needs complex channels"):
         ImageSourceGP().fit(invent("spectrum"), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match="not fitted"):
         ImageSourceGP().state()
-
-
-def test_it_has_its_name():
-    assert method_class("image_source_gp") is ImageSourceGP
+    _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
+    silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
+    with pytest.raises(ValueError, match="every training channel is zero"):
+        ImageSourceGP(**QUICK).fit(silent, fold, FitContext(tmp_path))
 
 
 @pytest.mark.slow
@@ -274,11 +261,3 @@ def learned_and_true_visibility(method, told, data, index, most=6):
             learned.append(learned_gains[:, distance.argmin()] / full)
             seen.append(told.visible[index, i])
     return np.stack(learned, 1), np.stack(seen, 1)
-
-
-def test_zero_training_channels_are_refused(tmp_path):
-    """The library's sequences about a matrix that is not positive definite came."""
-    _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
-    silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
-    with pytest.raises(ValueError, match="every training channel is zero"):
-        ImageSourceGP(**QUICK).fit(silent, fold, FitContext(tmp_path))

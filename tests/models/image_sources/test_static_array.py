@@ -24,8 +24,6 @@ from gsparc.models.image_sources.search_cache import SearchCache
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import bisector, images, orientations, reflect
 from gsparc.physics.waves import LIGHT
-from gsparc.processes import worker
-from gsparc.processes.factor import ROUNDING, Factor
 from gsparc.training.context import FitContext
 
 CARRIER = 2.4e9
@@ -255,16 +253,6 @@ def test_clutter_is_looked_for_without_noise():
     assert np.isfinite(again.nll(torch.ones(2, len(rows)), silent.log_amplitude).item())
 
 
-def test_a_ridge_is_no_larger_than_rounding_explains():
-    """As many rows of one place: rank one, mended by noise under the stated bound."""
-    ones = torch.ones(300, 300)
-    lower = Factor.of(ones).lower
-    assert lower.dtype == torch.float32
-    assert (lower.double() @ lower.double().T - ones).abs().max() <= 16 * ROUNDING * 300
-    with pytest.raises(ValueError, match="no Cholesky factor"):
-        Factor.of(ones - 1e-2 * torch.eye(300))
-
-
 def test_budget_is_kept(tmp_path):
     """To a tenth and a step, however many searches are asked for."""
     data, fold = _uplink(100)
@@ -287,13 +275,6 @@ def test_an_interrupt_ends_all_searches_and_names_the_checkpoint(tmp_path, monke
         ImageSourceGP(searches=2, margin=8.0).fit(data, fold, FitContext(tmp_path))
     assert time.monotonic() - begun < 0.5 + 2.0 + 1.0
     assert SearchCache(None, tmp_path / "last.ckpt").spent.wall > 0
-
-
-def test_a_cancelled_worker_ends():
-    worker.raise_if_cancelled()
-    with worker.cancelled_by(lambda: True), pytest.raises(worker.Cancelled):
-        Factor.of(torch.eye(2))
-    Factor.of(torch.eye(2))
 
 
 def test_one_antenna_is_a_case_of_several():
