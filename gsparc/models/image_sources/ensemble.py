@@ -19,7 +19,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.processes.worker import Cancelled, cancelled_by
+from gsparc.processes.worker import Cancelled, cancelled_by, late_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -74,28 +74,26 @@ def search_many(
 
     def made(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
-        rows, over = row_sets[number], partial(budget.over, SEARCH_END)
-        rounds_over = partial(budget.over, ROUNDS_END)
-        scene = Search(rows, transmitter, settings, seed + number, rounds_over, over).run()
-        scene = with_phases(rows, scene, QUADRATURE)
-        scene = learn_visibility(rows, scene, 10, settings.visibility, noise_floor, over)
-        scene = refine(rows, scene, 20, noise_floor, late=over)
-        error = left_out_error(rows, scene, noise_floor)
+        rows, last_round = row_sets[number], partial(budget.over, ROUNDS_END)
+        scene = Search(rows, transmitter, settings, seed + number, last_round).run()
+        scene = with_phases(rows, scene, QUADRATURE, noise_floor)
+        scene = refine(rows, learn_visibility(rows, scene, 10, settings.visibility), 20)
+        error = left_out_error(rows, scene)
         hidden = scene.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
         if clutter and not hidden and compact(rows):
             generator = torch.Generator().manual_seed(seed + number)
-            scene = find_clutter(rows, scene, generator, late=over, noise_floor=noise_floor)
-            error = left_out_error(rows, scene, noise_floor)
+            scene = find_clutter(rows, scene, generator)
+            error = left_out_error(rows, scene)
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if done := cache.find(number):
+        if done := cache.find(number, noise_floor):
             errors.append(done.left_out)
             return done
         if unwanted() or (number > 0 and budget.over(LAST_START)):
             return None
         try:
-            with cancelled_by(unwanted):
+            with cancelled_by(unwanted), late_when(partial(budget.over, SEARCH_END)):
                 member = made(number)
         except Cancelled:
             return None
@@ -140,15 +138,15 @@ def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
             )  # fmt: skip
 
 
-def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
+def refined(rows: Rows, member: Member) -> Member:
     """A search's result on rows that have changed a little."""
-    scene = refine(rows, member.scene, 20, noise_floor)
-    return Member(scene, left_out_error(rows, scene, noise_floor), member.number)
+    scene = refine(rows, member.scene, 20)
+    return Member(scene, left_out_error(rows, scene), member.number)
 
 
-def left_out_error(rows: Rows, scene: Scene, noise_floor: float) -> float:
+def left_out_error(rows: Rows, scene: Scene) -> float:
     """NMSE of the rows, each receiver predicted from the others."""
-    error = rows.target - Posterior(rows, scene, noise_floor).left_out()
+    error = rows.target - Posterior(rows, scene).left_out()
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
 
@@ -167,13 +165,13 @@ def beaten(error: float, rival: float) -> bool:
     return error > BEATEN * rival
 
 
-def affordable_rows(rows: Rows, found: list[Member], noise_floor: float, budget: TimeBudget) -> int:
+def affordable_rows(rows: Rows, found: list[Member], budget: TimeBudget) -> int:
     """Rows of final processes that fit into the rest of the budget; all of one search at least.
 
     A covariance of n rows takes n^3; that of a search's rows is timed.
     """
     started = budget.spent
-    assert Posterior(rows, found[0].scene, noise_floor).conditioned
+    assert Posterior(rows, found[0].scene).conditioned
     each = max(budget.spent - started, 1e-6)
     rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
     return max(int(len(rows) * (rest / (each * len(found))) ** (1 / 3)), len(rows))

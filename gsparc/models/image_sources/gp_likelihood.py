@@ -24,10 +24,8 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.processes.conditioned import Conditioned
-
-JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
 
 
 def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
@@ -138,8 +136,8 @@ class PhasedGains(CircularGains):
 class Posterior:
     """Posterior of a scene's gains given rows, circular or of fixed phases (`Scene.phase`)."""
 
-    def __init__(self, rows: Rows, scene: Scene, noise_floor: float = JITTER) -> None:
-        self.rows, self.scene, self.noise_floor = rows, scene, noise_floor
+    def __init__(self, rows: Rows, scene: Scene) -> None:
+        self.rows, self.scene = rows, scene
 
     @cached_property
     def waves(self) -> Tensor:
@@ -162,7 +160,7 @@ class Posterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        return self._summed.given(torch.tensor(self.scene.log_noise).exp() + self.noise_floor)
+        return self._summed.given(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
 
     @property
     def covariance(self) -> Tensor:
@@ -211,8 +209,9 @@ class Posterior:
         return self.rows.target - torch.complex(error[:n], error[n:])
 
 
-def with_phases(rows: Rows, scene: Scene, quadrature: float) -> Scene:
-    """The scene with the phases of each source's mean gain under the circular process."""
-    posterior = Posterior(rows, scene)
+def with_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
+    """The scene with the phases of each source's mean gain under the circular process, and a noise floor."""
+    posterior = Posterior(rows, replace(scene, noise_floor=JITTER))
     gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
-    return replace(scene, phase=gain.angle(), quadrature=quadrature if rows.target.shape[1] == 1 else 1.0)
+    one = rows.target.shape[1] == 1
+    return replace(scene, phase=gain.angle(), quadrature=quadrature if one else 1.0, noise_floor=noise_floor)

@@ -142,7 +142,7 @@ class ImageSourceGP(FramedMethod):
         calibrated = static_array(data.site, self.antennas) is not None and self.offsets == "none"
         if calibrated:
             start = self._row_sets(data, known, 1)[0]
-            data = self._calibrated(data, start, direct_path(start, self._transmitter()))
+            data = self._calibrated(data, start, direct_path(start, self._transmitter(), self.noise_floor))
         if self.offsets != "none":
             data = self._without_offsets(data, known, budget)
             notes.append(
@@ -154,10 +154,10 @@ class ImageSourceGP(FramedMethod):
             again = self._calibrated(data, row_sets[found[0].number], found[0].scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known, self.searches)
-                found = [refined(row_sets[one.number], one, self.noise_floor) for one in found]
+                found = [refined(row_sets[one.number], one) for one in found]
         self.weights = ensemble_weights(found)
         rows = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-        affordable = affordable_rows(row_sets[0], found, self.noise_floor, budget)
+        affordable = affordable_rows(row_sets[0], found, budget)
         if affordable < len(rows):
             budget.limited = True
             notes.append(f"{self.name}: {affordable} of {len(rows)} rows in the final process: time is short")
@@ -170,7 +170,7 @@ class ImageSourceGP(FramedMethod):
 
     def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
-        self.members = [Posterior(rows, scene, self.noise_floor) for scene in scenes]
+        self.members = [Posterior(rows, scene) for scene in scenes]
         self.query = Query(self.members)
 
     def _described(self, found: list[Member], budget: TimeBudget) -> list[str]:
@@ -199,7 +199,7 @@ class ImageSourceGP(FramedMethod):
 
     def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
         """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
-        factors = element_factors(rows, scene, self.noise_floor)
+        factors = element_factors(rows, scene)
         if factors is None:
             return data
         self.factors = self.factors * factors
@@ -274,7 +274,7 @@ class ImageSourceGP(FramedMethod):
             budget.limited |= now.limited
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)
-                gains = Posterior(rows[0], scene, self.noise_floor).mean_gains
+                gains = Posterior(rows[0], scene).mean_gains
                 aligned = self._remove_offsets(data, known, scene, gains)
         return aligned
 
@@ -392,7 +392,7 @@ class ImageSourceGP(FramedMethod):
         rows = self._restore_frame(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
         self.factors = state["factors"]
-        self._conditioned(rows, [Scene.from_state(stored) for stored in state["scenes"]])
+        self._conditioned(rows, [Scene.from_state(stored, self.noise_floor) for stored in state["scenes"]])
 
     def size(self) -> int:
         """Sources of the largest scene."""
@@ -403,4 +403,4 @@ def _loudest(member: Posterior, share: float, contribution: Tensor) -> Posterior
     """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
     count = max(1, math.ceil(share * len(contribution)))
     kept = sorted({0, *contribution.topk(count).indices.tolist()})
-    return Posterior(member.rows, member.scene.only(kept), member.noise_floor)
+    return Posterior(member.rows, member.scene.only(kept))

@@ -167,7 +167,7 @@ class RowVariance:
     def __init__(self, member: Posterior, place_of: Tensor, count: int) -> None:
         few = torch.linspace(0, len(member.rows) - 1, min(count, len(member.rows))).long()
         if len(few) < len(member.rows):
-            member = Posterior(member.rows.take(few), member.scene, member.noise_floor)
+            member = Posterior(member.rows.take(few), member.scene)
         scene, kernel = member.scene, member.scene.visibility
         self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.contiguous()
         self.phasor, self.power = scene.turns, scene.log_amplitude.mul(2).exp()

@@ -9,11 +9,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import JITTER, PhasedGains, Posterior
+from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene, correlations, steering
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
+from gsparc.processes.worker import late
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
@@ -24,28 +25,17 @@ PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and al
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
-Late = Callable[[], bool]
 # Negative log prior [nats] of transmitter, planes (P, 4), log amplitudes (K,), log noise and phases (K,).
 Cost = Callable[[list[Tensor]], Tensor]
 
 
-def no_deadline() -> bool:
-    """Of work without an end in time."""
-    return False
-
-
-def refine(
-    rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER, late: Late = no_deadline,
-    cost: Cost | None = None,
-) -> Scene:  # fmt: skip
+def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
     """The best scene of `steps` steps of Adam (D. P. Kingma and J. Ba, ICLR 2015), or of those until `late`.
 
     Args:
         rows: measurements.
         scene: the start; its phases move where gains have them.
         steps: at least 0.
-        noise_floor: known variance of the noise, in units of the rows' power.
-        late: asked after every step; none follows when it says so.
         cost: a negative log prior, added to the negative log likelihood.
     """
     values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
@@ -57,7 +47,7 @@ def refine(
     for step in range(steps + 1):
         if step % REFRESH == 0:
             correlation = correlations(rows, images(values[0], values[1], scene.sequences), scene.visibility)
-        value, gradient = _likelihood(rows, scene, values, correlation, noise_floor)
+        value, gradient = _likelihood(rows, scene, values, correlation)
         if cost is not None:
             leaves = [v.detach().requires_grad_() for v in values]
             with torch.enable_grad():
@@ -85,7 +75,7 @@ def refine(
 
 
 def _likelihood(
-    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor, noise_floor: float
+    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its derivatives by the values: `d nll = trace(G dK)`."""
     transmitter, planes, *phases = (v.detach().requires_grad_() for v in (*values[:2], *values[4:]))
@@ -94,10 +84,10 @@ def _likelihood(
         waves = waves * torch.polar(torch.ones(()), phase)
     waves = waves * scene.visible_share(rows.position)
     scaled, noise = waves.detach() * values[2].exp(), values[3].exp()
-    gains = Posterior(rows, scene, noise_floor).gains()
+    gains = Posterior(rows, scene).gains()
     for k, one in enumerate(correlation):
         gains.add(scaled[:, k], one)
-    conditioned = gains.given(noise + noise_floor)
+    conditioned = gains.given(noise + scene.noise_floor)
     by_waves = gains.by_waves(conditioned.slope, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
     leaves = [transmitter, planes, *phases]
@@ -108,11 +98,8 @@ def _likelihood(
     return conditioned.nll, [by_place, by_plane, by_amplitude, by_noise, *by_phase]
 
 
-def learn_visibility(
-    rows: Rows, scene: Scene, steps: int, centre: KernelVisibility, noise_floor: float = JITTER,
-    late: Late = no_deadline,
-) -> Scene:  # fmt: skip
-    """Parameters of the visibility kernel by likelihood, with a log-normal prior about `centre`.
+def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibility) -> Scene:
+    """Parameters of the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
     `quadrature` is learned as well, unless it is 1: its prior is about the present one.
@@ -122,8 +109,6 @@ def learn_visibility(
         scene: the start.
         steps: of Adam.
         centre: of the prior.
-        noise_floor: known variance of the noise, in units of the rows' power.
-        late: asked before every step; none follows when it says so.
     """
     shares, least, wide = ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
     about, value = (kernel.parameters(least, *shares) for kernel in (centre, scene.visibility))
@@ -139,7 +124,7 @@ def learn_visibility(
     for _ in range(steps):
         if late():
             break
-        posterior = Posterior(rows, current(), noise_floor)
+        posterior = Posterior(rows, current())
         slope, gains = posterior.conditioned.slope, posterior.gains()
         if isinstance(gains, PhasedGains) and gains.quadrature < 1:
             gains.quadrature = torch.sigmoid(value[3])

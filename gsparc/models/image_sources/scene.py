@@ -17,6 +17,8 @@ from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, images
 from gsparc.physics.waves import ranges, wave
 
+JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
+
 
 @final
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Scene:
         phase: (K,) float32 [rad] of gains of constant phase; None: gains are circular.
         quadrature: in (0, 1], twice the share of a gain's variance in quadrature to its phase; 1 with several
             outputs, which have no common phase.
+        noise_floor: known variance of the noise, beside what is estimated, in the same units.
     """
 
     transmitter: Tensor
@@ -45,6 +48,7 @@ class Scene:
     clutter: Clutter = field(default_factory=Clutter.none)
     phase: Tensor | None = None
     quadrature: float = 1.0
+    noise_floor: float = JITTER
 
     @cached_property
     def sources(self) -> Tensor:
@@ -112,7 +116,7 @@ class Scene:
         )
 
     def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers of a scene with phases."""
+        """Plain tensors and numbers of a scene with phases, without the noise floor."""
         kernel = self.visibility
         return {
             "transmitter": self.transmitter,
@@ -129,7 +133,7 @@ class Scene:
         }
 
     @staticmethod
-    def from_state(state: dict[str, Any]) -> Scene:
+    def from_state(state: dict[str, Any], noise_floor: float) -> Scene:
         """Inverse of `state`."""
         return Scene(
             state["transmitter"],
@@ -141,6 +145,7 @@ class Scene:
             Clutter(state["boxes"], state["patches"], tuple(state["patched"])),
             state["phase"],
             float(state["turning"]),
+            noise_floor,
         )
 
 

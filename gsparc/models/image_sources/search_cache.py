@@ -82,11 +82,13 @@ class SearchCache:
         self._kept, self.spent, self.limited_by = kept, spent, stored.get("limited_by")
         log.info("reusing %d cached searches (%.0f s of training time)", len(kept), wall)
 
-    def find(self, number: int) -> Member | None:
+    def find(self, number: int, noise_floor: float) -> Member | None:
         """The finished search of this number, or None."""
         with self._lock:
             kept = self._kept.get(f"search {number}")
-        return None if kept is None else Member(Scene.from_state(kept["scene"]), kept["left_out"], number)
+        if kept is None:
+            return None
+        return Member(Scene.from_state(kept["scene"], noise_floor), kept["left_out"], number)
 
     def put(self, member: Member, limited_by: Clock | None) -> None:
         """Store a finished search, and what has ended one so far; the file is written atomically."""

@@ -84,7 +84,7 @@ class SourceField(FramedField):
             waves = scene.unobstructed(rows) * seen * scene.log_amplitude.exp()
             correlation = correlations(rows, scene.sources.detach(), scene.visibility)
             covariance = torch.einsum("nk,mk,knm->nm", waves, waves.conj(), correlation.to(waves.dtype))
-            noise = float(np.exp(member.scene.log_noise)) + self.method.noise_floor
+            noise = float(np.exp(scene.log_noise)) + scene.noise_floor
             density = leave_one_out_density(covariance + noise * torch.eye(len(rows)), rows.target)
             each.append(density * self.method.weights[number])
         summed = torch.stack(each).sum(0)

@@ -24,7 +24,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import all_sequences
-from gsparc.processes.worker import Cancelled, cancelled_by
+from gsparc.processes.worker import Cancelled, cancelled_by, late_when
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
@@ -265,10 +265,11 @@ def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
     rows, *_ = _beside_a_table(60)
     start, looks = _bare(), []
     late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
-    found = find_clutter(rows, start, torch.Generator().manual_seed(0), late)
+    with late_when(late):
+        found = find_clutter(rows, start, torch.Generator().manual_seed(0))
     assert isinstance(found, Scene) and len(looks) < 60
     with cancelled_by(lambda: True), pytest.raises(Cancelled):
-        find_clutter(rows, start, torch.Generator().manual_seed(0), late)
+        find_clutter(rows, start, torch.Generator().manual_seed(0))
 
 
 def test_an_infinite_mirror_becomes_finite():

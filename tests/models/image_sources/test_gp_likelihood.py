@@ -91,7 +91,7 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
     seen = correlations(rows, scene.sources, scene.visibility)
     values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
     values += [] if scene.phase is None else [scene.phase]
-    nll, gradient = refine._likelihood(rows, scene, values, seen, 1e-5)
+    nll, gradient = refine._likelihood(rows, scene, values, seen)
     assert nll == pytest.approx(Posterior(rows, scene).nll, rel=1e-5)
     for i, value in enumerate(values):
         step = 3e-4 if i < 2 else 2e-2
@@ -100,7 +100,7 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
             for sign in (1, -1):
                 moved = [v.clone() for v in values]
                 moved[i].view(-1)[j] += sign * step
-                ends.append(refine._likelihood(rows, scene, moved, seen, 1e-5)[0])
+                ends.append(refine._likelihood(rows, scene, moved, seen)[0])
             numeric = (ends[0] - ends[1]) / (2 * step)
             assert gradient[i].reshape(-1)[j].item() == pytest.approx(numeric, rel=0.05, abs=0.15), (i, j)
     assert Posterior(rows, refine.refine(rows, scene, 8)).nll < nll

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gains import gains
+from gains import fitted, gains
 from invented import invent
 from rooms import WAVELENGTH, furnished, nmse, shoebox
+from scenes import error
 from shoeboxes import as_arrays
 
 from gsparc import load
@@ -22,8 +23,6 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
-
-QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0}
 
 
 def _predicted(method, data, index):
@@ -46,23 +45,20 @@ def found_share(method, told, within=0.1, order=2):
 def small(tmp_path_factory):
     torch.manual_seed(0)
     told, data, fold = shoebox(200, size=(3.0, 2.5, 2.2), max_order=1)
-    method = ImageSourceGP(**QUICK)
-    report = method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
-    return told, data, fold, method, report
+    return told, data, fold, *fitted(data, fold, tmp_path_factory.mktemp("run"))
 
 
 def test_first_order_images_are_found_and_the_channel_extrapolates(small):
     told, data, fold, method, _ = small
     assert found_share(method, told, order=1) == 1.0
-    prediction = _predicted(method, data, fold.test)
-    assert nmse(prediction.mean.numpy(), data.targets(fold.test).numpy()) < 0.01
+    assert error(method, data, fold.test) < 0.01
 
 
 def test_variance_is_of_the_size_of_the_error(small):
     _, data, fold, method, _ = small
     prediction = _predicted(method, data, fold.test)
-    error = (prediction.mean - data.targets(fold.test)).abs().square().mean((1, 2))
-    assert 0.5 < prediction.variance.mean() / error.mean() < 2
+    missed = (prediction.mean - data.targets(fold.test)).abs().square().mean((1, 2))
+    assert 0.5 < prediction.variance.mean() / missed.mean() < 2
     assert prediction.confidence.min() > 0.9
     rx = data.batch(fold.test[:1]).rx
     outside = method.predict(torch.zeros(1, 3), replace(rx, position=rx.position + 30.0))
@@ -142,8 +138,7 @@ def test_a_search_far_behind_another_solution_is_the_last(tmp_path):
 
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
-    method = ImageSourceGP(searches=8, search_rows=60, margin=1.0)
-    report = method.fit(data, fold, FitContext(tmp_path))
+    method, report = fitted(data, fold, tmp_path, searches=8, search_rows=60, margin=1.0)
     assert "of 8 searches (noise floor reached)" in report.notes[0]  # not the budget
     # both threads may have started one more when the second ended
     assert 2 <= len(method.members) <= 2 + torch.get_num_threads()
@@ -156,22 +151,17 @@ def test_a_moving_transmitter_is_a_moving_receiver(tmp_path):
     arrays["rx_position"], arrays["tx_position"] = arrays["tx_position"], arrays["rx_position"]
     swapped = from_arrays(arrays)
     assert swapped.site.moving_end == "tx" and np.array_equal(swapped.moving, data.moving)
-    method = ImageSourceGP(**QUICK, clutter=False)
-    method.fit(swapped, fold, FitContext(tmp_path))
-    predicted = _predicted(method, swapped, fold.test).mean.numpy()
-    assert nmse(predicted, swapped.targets(fold.test).numpy()) < 0.01
+    method, _ = fitted(swapped, fold, tmp_path, clutter=False)
+    assert error(method, swapped, fold.test) < 0.01
 
 
 def test_known_array_elements_are_receivers_of_their_own(tmp_path):
     array = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1, array=array)
-    rows = gather(data, fold.train, 10_000, 0)
-    assert rows.target.shape == (3 * len(fold.train), 1)
-    method = ImageSourceGP(**QUICK)
-    method.fit(data, fold, FitContext(tmp_path))
-    prediction = _predicted(method, data, fold.test)
-    assert prediction.mean.shape == (len(fold.test), 3, 1)
-    assert nmse(prediction.mean.numpy(), data.targets(fold.test).numpy()) < 0.03
+    assert gather(data, fold.train, 10_000, 0).target.shape == (3 * len(fold.train), 1)
+    method, _ = fitted(data, fold, tmp_path)
+    assert _predicted(method, data, fold.test).mean.shape == (len(fold.test), 3, 1)
+    assert error(method, data, fold.test) < 0.03
 
 
 def test_tones_not_measured_are_predicted_by_delay(tmp_path):
@@ -181,8 +171,7 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     mask[..., ::4] = True
     known = replace(data, mask=mask)
     assert set(gather(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
-    method = ImageSourceGP(searches=1, search_rows=200, margin=4.0)
-    method.fit(known, fold, FitContext(tmp_path))
+    method, _ = fitted(known, fold, tmp_path, search_rows=200)
     prediction = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
 
@@ -191,13 +180,10 @@ def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
     frequency = 2.4e9 + np.arange(64) * 1e6
     _, data, fold = shoebox(30, size=(3.0, 2.5, 2.2), max_order=0, frequency_hz=frequency)
     rows = gather(data, fold.train, 4 * len(fold.train), 0)
-    assert len(rows) == 4 * len(fold.train)
+    assert len(rows) == 4 * len(fold.train) and len(rows.frequency.unique()) > 16
     for receiver in rows.receiver.unique():
-        tones = rows.frequency[rows.receiver == receiver]
-        assert (tones.diff() >= 15e6).all()
-    assert len(rows.frequency.unique()) > 16
-    few = gather(data, fold.train, 10, 0)
-    assert len(few) == 10
+        assert (rows.frequency[rows.receiver == receiver].diff() >= 15e6).all()
+    assert len(gather(data, fold.train, 10, 0)) == 10
 
 
 def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):
@@ -210,7 +196,7 @@ def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):
     _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
     silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
     with pytest.raises(ValueError, match="every training channel is zero"):
-        ImageSourceGP(**QUICK).fit(silent, fold, FitContext(tmp_path))
+        fitted(silent, fold, tmp_path)
 
 
 @pytest.mark.slow
@@ -219,8 +205,7 @@ def test_every_source_of_a_shoebox_is_found(tmp_path):
     told, data, fold = shoebox(450)
     method = ImageSourceGP(searches=1)
     method.fit(data, fold, FitContext(tmp_path))
-    assert found_share(method, told) >= 0.9
-    assert nmse(_predicted(method, data, fold.test).mean.numpy(), data.targets(fold.test).numpy()) <= 0.01
+    assert found_share(method, told) >= 0.9 and error(method, data, fold.test) <= 0.01
 
 
 @pytest.mark.slow
@@ -228,8 +213,7 @@ def test_visibility_behind_a_pillar_is_learned(tmp_path):
     told, data, fold = shoebox(450, pillar=True)
     method = ImageSourceGP(searches=2)
     method.fit(data, fold, FitContext(tmp_path))
-    predicted = _predicted(method, data, fold.test).mean.numpy()
-    assert nmse(predicted, data.targets(fold.test).numpy()) <= 0.02
+    assert error(method, data, fold.test) <= 0.02
     learned, true = learned_and_true_visibility(method, told, data, fold.test)
     assert np.corrcoef(learned[:, 0], true[:, 0])[0, 1] > 0.9
 
@@ -242,8 +226,7 @@ def test_a_furnished_room(tmp_path):
     method.fit(data, fold, FitContext(tmp_path))
     # The farthest wall may stay a wavelength off: a phase of its own makes up for it.
     assert found_share(method, told, within=0.5, order=1) >= 6 / 7
-    assert found_share(method, told, within=1.5, order=1) == 1.0
-    assert nmse(_predicted(method, data, fold.test).mean.numpy(), data.targets(fold.test).numpy()) <= 0.02
+    assert found_share(method, told, within=1.5, order=1) == 1.0 and error(method, data, fold.test) <= 0.02
 
 
 def learned_and_true_visibility(method, told, data, index, most=6):

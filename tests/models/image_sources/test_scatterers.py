@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from rooms import WAVELENGTH, nmse, shoebox
+from gains import fitted
+from rooms import WAVELENGTH, shoebox
+from scenes import error
 from shoeboxes import as_arrays
 
 from gsparc.data.own import from_arrays
-from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import box_of, scatterers
-from gsparc.training.context import FitContext
 
 SCATTERERS = np.array([[2.3, 0.9, 0.8], [1.1, 1.9, 1.2]])
 
@@ -30,30 +30,22 @@ def _scattered(tx, rx):
     return 0.5 * (np.exp(-2j * np.pi * (before + after) / WAVELENGTH) / before / after).sum(1)
 
 
-def _fit(data, fold, tmp_path):
-    method = ImageSourceGP(searches=1, search_rows=220, margin=4.0, clutter=False)
-    report = method.fit(data, fold, FitContext(tmp_path))
-    batch = data.batch(fold.test)
-    error = nmse(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy())
-    return method, report, error
-
-
 def test_without_scatterers_none_is_invented(tmp_path):
     _, data, fold = _room()
-    _, report, error = _fit(data, fold, tmp_path)
-    assert error < 0.01 and "0 scatterers" in " ".join(report.notes)
+    method, report = fitted(data, fold, tmp_path, clutter=False)
+    assert error(method, data, fold.test) < 0.01 and "0 scatterers" in " ".join(report.notes)
 
 
 @pytest.mark.slow
 def test_scatterers_are_found_and_told_from_images(tmp_path):
     told, data, fold = _room(_scattered)
-    method, _, error = _fit(data, fold, tmp_path)
+    method, _ = fitted(data, fold, tmp_path, clutter=False)
     scene = method.members[0].scene
     places = (scene.sources + method.frame.middle).numpy() + data.site.origin
     scattered = scatterers(scene.sources, box_of(method.members[0].rows, scene.transmitter)).numpy()
     inside = places[scattered]
     nearest = np.linalg.norm(SCATTERERS[:, None] - inside[None], axis=-1).min(1)
-    assert (nearest < 0.1 * WAVELENGTH).all() and error < 0.01
+    assert (nearest < 0.1 * WAVELENGTH).all() and error(method, data, fold.test) < 0.01
     images = told.images.of(told.tx[0])[told.images.order == 1]
     outside = places[~scattered]
     assert (np.linalg.norm(images[:, None] - outside[None], axis=-1).min(1) < 0.3 * WAVELENGTH).all()

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import JITTER, PhasedGains, shares, stacked
+from gsparc.models.image_sources.gp_likelihood import PhasedGains, shares, stacked
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.processes.factor import Factor
@@ -32,14 +32,13 @@ class Residual:
     Args:
         rows: R = 1.
         scene: its clutter attenuates the varying part; callers pass the visible shares of the constant part.
-        noise_floor: known variance of the noise, in units of the rows' power.
 
     Attributes:
         scene: as given, constant share and noise chosen by likelihood.
     """
 
-    def __init__(self, rows: Rows, scene: Scene, noise_floor: float = JITTER) -> None:
-        self.rows, self.noise_floor = rows, noise_floor
+    def __init__(self, rows: Rows, scene: Scene) -> None:
+        self.rows, self.noise_floor = rows, scene.noise_floor
         self.target = stacked(rows.target)[0][:, 0]
         self.waves = scene.unobstructed(rows)
         self._cached = self._parts(scene)

@@ -23,14 +23,14 @@ from gsparc.models.image_sources.clutter.finite_mirrors import (
 )
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
 from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual
-from gsparc.models.image_sources.gp_likelihood import JITTER, Posterior
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import Cancelled, cancelled_by, raise_if_cancelled
+from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
@@ -49,36 +49,29 @@ BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
 
 
-def find_clutter(
-    rows: Rows,
-    scene: Scene,
-    generator: torch.Generator,
-    late: Callable[[], bool] = lambda: False,
-    noise_floor: float = JITTER,
-) -> Scene:
+def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
     """The scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:
-    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `late`, what was
+    found so far is the result.
 
     Args:
         rows: of one output, as many as in a search.
         scene: from the final refinement of a search.
         generator: of the candidates.
-        late: asked again and again; what was found so far is the result when it says so.
-        noise_floor: known variance of the noise, in units of the rows' power.
     """
     # The kernel learned without clutter explains it: reset
     fresh = replace(scene, visibility=INITIAL_KERNEL, quadrature=min(scene.quadrature, QUADRATURE))
-    found = _ClutterSearcher(rows, fresh, generator, noise_floor).run(late)
-    before, after = (Posterior(rows, each, noise_floor).nll for each in (scene, found))
+    found = _ClutterSearcher(rows, fresh, generator).run()
+    before, after = (Posterior(rows, each).nll for each in (scene, found))
     return found if after < before - PROGRESS else scene
 
 
 class _ClutterSearcher:
-    def __init__(self, rows: Rows, scene: Scene, generator: torch.Generator, noise_floor: float) -> None:
+    def __init__(self, rows: Rows, scene: Scene, generator: torch.Generator) -> None:
         self.rows, self.generator = rows, generator
-        self.noise_floor, self.wavelength = noise_floor, LIGHT / float(rows.frequency.mean())
+        self.wavelength = LIGHT / float(rows.frequency.mean())
         self.parameter_cost = math.log(2 * len(rows)) / 2  # cost of a parameter [nats]
         self.tried: list[SmallMirror] = []
         ends = torch.stack([rows.position.amin(0) - BEYOND, rows.position.amax(0) + BEYOND])
@@ -88,7 +81,7 @@ class _ClutterSearcher:
     # ---- state ----
     def _refactor(self, scene: Scene) -> None:
         """Factor the residual's covariance at a scene."""
-        self.residual = Residual(self.rows, scene, self.noise_floor)
+        self.residual = Residual(self.rows, scene)
         self.phase_prior = ReflectionPhasePrior.of(scene)
         self._set_scene(self.residual.scene)
 
@@ -135,7 +128,7 @@ class _ClutterSearcher:
         self._set_scene(replace(found, clutter=replace(found.clutter, boxes=boxes)))
 
     # ---- the loop ----
-    def run(self, late: Callable[[], bool]) -> Scene:
+    def run(self) -> Scene:
         start = self.nll
         best = self.whole = start, self.scene
         try:
@@ -179,10 +172,7 @@ class _ClutterSearcher:
         self._refactor(self.scene)
         self._drop_sequences()
         prior, sequences = self.phase_prior, self.scene.sequences
-        moved = refine(
-            self.rows, self.scene, STEPS, self.noise_floor, cost=lambda v: prior.cost(v[4], sequences)
-        )
-        self._refactor(moved)
+        self._refactor(refine(self.rows, self.scene, STEPS, lambda v: prior.cost(v[4], sequences)))
 
     def _descend_soft(self, soft: float) -> None:
         """Descend with softer edges, whose gradients reach farther, then with sharp ones."""

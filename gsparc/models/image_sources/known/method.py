@@ -33,6 +33,7 @@ from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ class KnownWallsGP(ImageSourceGP):
         cache: SearchCache,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search."""
-        rows, floor, over = row_sets[0], self.noise_floor, partial(budget.over, SEARCH_END)
+        rows = row_sets[0]
         start = self._scene(rows, settings, clutter)
 
         def near(values: list[Tensor]) -> Tensor:
@@ -77,12 +78,12 @@ class KnownWallsGP(ImageSourceGP):
         def both(values: list[Tensor]) -> Tensor:
             return near(values) + prior.cost(values[4], start.sequences)
 
-        scene = refine(rows, start, STEPS[0], floor, over, near)
-        scene = with_phases(rows, scene, QUADRATURE)
-        scene = learn_visibility(rows, scene, STEPS[1], settings.visibility, floor, over)
-        prior = ReflectionPhasePrior.of(scene)
-        scene = refine(rows, scene, STEPS[2], floor, over, both)
-        error = left_out_error(rows, scene, floor)
+        with late_when(partial(budget.over, SEARCH_END)):
+            scene = with_phases(rows, refine(rows, start, STEPS[0], near), QUADRATURE, self.noise_floor)
+            scene = learn_visibility(rows, scene, STEPS[1], settings.visibility)
+            prior = ReflectionPhasePrior.of(scene)
+            scene = refine(rows, scene, STEPS[2], both)
+        error = left_out_error(rows, scene)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
             len(scene.sequences), len(scene.planes), error,
@@ -111,7 +112,7 @@ class KnownWallsGP(ImageSourceGP):
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
             transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
-            math.log(settings.noise), settings.visibility,
+            math.log(settings.noise), settings.visibility, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide
         return replace(bare, clutter=held).only([*range(len(sequences))], held.plane)
