@@ -186,10 +186,13 @@ def _field(data: object, angles: int, correlated: bool, mirrors: int, tilt: int 
     power = torch.linspace(0.2, 1.1, len(shape.names), dtype=torch.float64)
     planes = torch.tensor([[0.1, 0.0, 1.0, -0.7]], dtype=torch.float64)[:mirrors]
     planes = planes / planes[:, :3].norm(dim=1, keepdim=True)
-    lengths = torch.tensor([0.4, 0.3], dtype=torch.float64)
+    envelope, gain = torch.tensor([0.4, 0.3], dtype=torch.float64)
     offset = torch.tensor([0.01, -0.02, 0.0], dtype=torch.float64)
-    values = Values(power, lengths[0], lengths[1], offset, torch.linspace(1, -1, tilt).double(), planes)
-    field = ChannelField(data.site, shape, values, tuple(data.target.shape[1:]))
+    values = Values(
+        **shape.state(), power=power, envelope=envelope, gain=gain, offset=offset,
+        towards=torch.linspace(1, -1, tilt).double(), planes=planes,
+    )  # fmt: skip
+    field = ChannelField(data.site, values, tuple(data.target.shape[1:]))
     field.condition(data, np.arange(len(data) - 8))
     return field
 
@@ -239,8 +242,8 @@ def evidence_of_waves() -> Arrays:
     data = channel(120)
     field, found = _field(data, 4, False, 1), {}
     groups = tuple(map(evidence.normalised, thinned(gather(data, np.arange(120), True), 1, 110)))
-    values = field._held
-    (part,) = evidence.compressed(groups, field.shape, values)
+    values = field._constants
+    (part,) = evidence.compressed(groups, values)
     at = evidence.solved(part, values.power)
     found |= {"nll": np.array(at.nll), "scale": np.array(at.scale)}
     found["slope"] = evidence.slope(part, values.power, at).numpy()

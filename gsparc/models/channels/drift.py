@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group, thinned
-from gsparc.models.channels.covariance import Shape, Values, temporal
+from gsparc.models.channels.covariance import Values, temporal
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.worker import stop_when_late
 
@@ -36,17 +36,15 @@ def contiguous_rows(groups: tuple[Group, ...]) -> tuple[Group, ...]:
     return tuple(found)
 
 
-def with_drift(
-    groups: tuple[Group, ...], signals: list[Tensor], shape: Shape, values: Values
-) -> tuple[Shape, Values, float]:
-    """The shape and values with correlated noise, and what evidence gains on `groups` [nats].
+def with_drift(groups: tuple[Group, ...], signals: list[Tensor], values: Values) -> tuple[Values, float]:
+    """The terms with correlated noise, and what evidence gains on `groups` [nats].
 
     Args:
         groups: see `contiguous_rows`.
         signals: covariances (n, n) of theirs, see `covariance.signals`.
-        shape, values: without correlated noise.
+        values: without correlated noise.
     """
-    noise = float(shape.of("noise", values.power)[0])
+    noise = float(values.of("noise")[0])
     eye = [torch.eye(len(group), dtype=torch.float64) for group in groups]
     terms = [[one, *temporal(values.envelope, group)] for one, group in zip(eye, groups, strict=True)]
     before = sum(
@@ -73,11 +71,11 @@ def with_drift(
         options={"maxiter": STEPS},
         callback=stop_when_late,
     )
-    fresh = replace(shape, correlated=True)
     power = torch.cat([values.power.clone(), torch.zeros(2, dtype=torch.float64)])
+    fresh = replace(values, correlated=True, power=power)
     for name, level in zip(("noise", "fast", "drift"), np.exp(found.x), strict=True):
         power[fresh.where(name)] = float(level)
-    return fresh, replace(values, power=power), before - float(found.fun)
+    return fresh, before - float(found.fun)
 
 
 def _likelihood(

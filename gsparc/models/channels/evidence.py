@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.covariance import Shape, Values, angle_knot_weights, directions, waves_of
+from gsparc.models.channels.covariance import Values, angle_knot_weights, directions, waves_of
 from gsparc.models.channels.kernels import envelope, plain, smooth
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
@@ -122,29 +122,29 @@ def normalised(group: Group) -> Group:
 
 
 def compressed(
-    groups: tuple[Group, ...], shape: Shape, values: Values, cache: Cache | None = None
+    groups: tuple[Group, ...], values: Values, cache: Cache | None = None
 ) -> tuple[Compressed, ...]:
     """Terms of all groups; those of one set of displacements and one wavelength share the diffuse field's.
 
     `cache` keeps matrices of places that further candidates and groups need again.
     """
     cache, found = {} if cache is None else cache, []
-    noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
+    noise = float(values.of("noise")[0] / values.of("isotropic")[0])
     for group in groups:
         places = group.displacements
-        kernel = group.slot.wavenumber, float(values.envelope), noise, shape.concentration
-        key = (places, *kernel, shape.angles.numpy().tobytes())
+        kernel = group.slot.wavenumber, float(values.envelope), noise, values.concentration
+        key = (places, *kernel, values.angles.numpy().tobytes())
         if key not in cache:
-            cache[key] = _field(group, shape, values, noise)
+            cache[key] = _field(group, values, noise)
         basis, room = cache[key]
-        for length in (shape.reach, float(values.gain)):
+        for length in (values.reach, float(values.gain)):
             if (places, length) not in cache:
                 cache[places, length] = _roots(group, length)
-        roots = cache[places, shape.reach], cache[places, float(values.gain)]
-        terms = tuple(map(Term.of, _factors(group, shape, values, basis, *roots)))
-        bins = torch.zeros(len(shape.angles), 0, dtype=torch.float64)
+        roots = cache[places, values.reach], cache[places, float(values.gain)]
+        terms = tuple(map(Term.of, _factors(group, values, basis, *roots)))
+        bins = torch.zeros(len(values.angles), 0, dtype=torch.float64)
         if len(values.towards):
-            bins = angle_knot_weights(shape, (group.slot.end + values.offset)[None], len(values.towards))[0]
+            bins = angle_knot_weights(values, (group.slot.end + values.offset)[None], len(values.towards))[0]
         found.append(Compressed(group, basis, room, terms, bins, *_projected(group, basis)))
     return tuple(found)
 
@@ -155,14 +155,14 @@ def _projected(group: Group, basis: Tensor) -> tuple[Tensor, float]:
     return target, max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
 
 
-def compressible(group: Group, shape: Shape, values: Values) -> bool:
+def compressible(group: Group, values: Values) -> bool:
     """Whether the places tell far fewer waves apart than there are rows."""
-    noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
+    noise = float(values.of("noise")[0] / values.of("isotropic")[0])
     alike = plain(group.places, group.places, group.slot.wavenumber, values.envelope)
     return int((torch.linalg.eigvalsh(alike) > FLOOR * noise).sum()) <= WORTH * len(group)
 
 
-def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Tensor, Tensor]:
+def _field(group: Group, values: Values, noise: float) -> tuple[Tensor, Tensor]:
     places, wavenumber = group.places, group.slot.wavenumber
     distance = apart(places, places)
     bound = envelope(distance, values.envelope)
@@ -172,8 +172,8 @@ def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Te
     whole = int(kept.sum()) > WORTH * len(group)
     basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
     room = [alike.to(torch.complex128)]
-    for angle in shape.angles:
-        one = directions(angle[None], shape.concentration, wavenumber, places, places, distance)
+    for angle in values.angles:
+        one = directions(angle[None], values.concentration, wavenumber, places, places, distance)
         room.append(one[0] * bound)
     if whole:
         return basis, torch.stack(room)
@@ -191,12 +191,12 @@ def _roots(group: Group, length: float) -> Tensor:
 
 
 def _factors(
-    group: Group, shape: Shape, values: Values, basis: Tensor, fixed: Tensor, varying: Tensor
+    group: Group, values: Values, basis: Tensor, fixed: Tensor, varying: Tensor
 ) -> tuple[Tensor, ...]:
     wide = basis.T.to(torch.complex128)
-    found = [wide @ fixed.to(torch.complex128)] if shape.constant else []
-    waves = waves_of(shape, values, group.slot, group.places)[:, :, None]
-    for part in waves.split([int(shape.direct), shape.count]):
+    found = [wide @ fixed.to(torch.complex128)] if values.constant else []
+    waves = waves_of(values, group.slot, group.places)[:, :, None]
+    for part in waves.split([int(values.direct), values.count]):
         found += [wide @ (wave * root) for root in (fixed, varying) for wave in part]
     return tuple(found)
 
@@ -251,12 +251,12 @@ def evidence(parts: tuple[Compressed, ...], values: Values) -> float:
 
 
 def fit_powers(
-    parts: tuple[Compressed, ...], shape: Shape, values: Values, shrinkage: float, steps: int = STEPS
+    parts: tuple[Compressed, ...], values: Values, shrinkage: float, steps: int = STEPS
 ) -> tuple[Values, float]:
     """With powers and `Values.towards` of largest evidence, its negative logarithm without the priors.
 
     Args:
-        parts, shape: of the groups.
+        parts: of the groups.
         values: to start from.
         shrinkage: rows that an inverse Gamma prior of directions' powers about their mean counts for.
         steps: of L-BFGS at most.
@@ -264,7 +264,7 @@ def fit_powers(
     start, towards = values.power, values.towards
     count = len(start)
     begin = torch.cat([start.log().clamp(LOWEST, HIGHEST), towards])
-    angles = shape.where("direction")
+    angles = values.where("direction")
 
     def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
         log = torch.from_numpy(logs)

@@ -16,7 +16,7 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.covariance import Shape, Values, image_waves
+from gsparc.models.channels.covariance import Values, image_waves
 from gsparc.models.channels.evidence import Compressed
 from gsparc.models.channels.probe import Probe, summed_gains
 from gsparc.physics.mirror_planes import Reflections, images
@@ -41,18 +41,16 @@ Probes = tuple[Probe, ...]
 class _Searcher:
     """Planes and images that are kept, and probes of few rows of few ends (`rough`) and of all with them."""
 
-    def __init__(
-        self, rough: Probes, probes: Probes, shape: Shape, values: Values, wavelength: float
-    ) -> None:
+    def __init__(self, rough: Probes, probes: Probes, values: Values, wavelength: float) -> None:
         self.rough, self.probes, self.wavelength = rough, probes, wavelength
-        self.shape, self.values = shape, values
+        self.values = values
         self.ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
         self.planes, self.sequences, self.risen = values.planes[:0], list[Reflections](), 0.0
 
     def waves(self, probe: Probe, planes: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """(W, n) of images in planes (P, 4)."""
-        shape, values = replace(self.shape, sequences=sequences), replace(self.values, planes=planes)
-        return image_waves(shape, values, probe.group.slot, probe.group.places)
+        values = replace(self.values, sequences=sequences, planes=planes)
+        return image_waves(values, probe.group.slot, probe.group.places)
 
     def gains(
         self, probes: Probes, planes: Tensor, sequences: tuple[Reflections, ...],
@@ -98,7 +96,7 @@ class _Searcher:
 
     def moved(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
         """A plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
-        middle, shift = self.shape.middle, STEP * self.wavelength / 2
+        middle, shift = self.values.middle, STEP * self.wavelength / 2
         across = torch.linalg.cross(plane[:3], torch.tensor([0.0, 0.0, 1.0]).double())
         if float(across.norm()) < 0.5:
             across = torch.tensor([1.0, 0.0, 0.0]).double()
@@ -117,7 +115,7 @@ class _Searcher:
 
 
 def find_mirrors(
-    coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], shape: Shape, values: Values,
+    coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], values: Values,
     wavelength: float, most: int, late: Callable[[], bool],
 ) -> tuple[Tensor, tuple[Reflections, ...]]:  # fmt: skip
     """Planes (W, 4) float64, local, and images in them; none where all together are not worth it.
@@ -125,7 +123,7 @@ def find_mirrors(
     Args:
         coarse: few rows of few ends, for the grid.
         parts: of all ends.
-        shape, values: the terms beside.
+        values: the terms beside.
         wavelength: [m].
         most: planes.
         late: asked again and again; nothing new is tried when it says so.
@@ -134,10 +132,10 @@ def find_mirrors(
         tuple(Probe.of(part, part.own(values.power, values.towards)) for part in each)
         for each in (coarse, parts)
     )
-    search = _Searcher(rough, probes, shape, values, wavelength)
+    search = _Searcher(rough, probes, values, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
-    grid, turn = candidates(rough, shape, values, wavelength)
+    grid, turn = candidates(rough, values, wavelength)
     while len(search.planes) < most and not late():
         scores = search.gains(search.rough, grid, _single(len(grid)), _about).max(1).values
         if not len(search.planes):
@@ -160,7 +158,7 @@ def find_mirrors(
     return (planes, tuple(search.sequences)) if 2 * search.risen > LEAST * numbers else (planes[:0], ())
 
 
-def candidates(probes: Probes, shape: Shape, values: Values, wavelength: float) -> tuple[Tensor, float]:
+def candidates(probes: Probes, values: Values, wavelength: float) -> tuple[Tensor, float]:
     """Upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
     places = torch.cat([probe.group.places for probe in probes])
     points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + values.offset])
@@ -175,7 +173,7 @@ def candidates(probes: Probes, shape: Shape, values: Values, wavelength: float) 
         margin = max(MARGIN * float(high - low), LEAST_MARGIN_M)
         number = min(max(int((float(high - low) + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
         offsets = torch.linspace(float(low) - margin, float(high) + margin, number, dtype=torch.float64)
-        offsets = offsets[(offsets - shape.middle @ normal).abs() > STEP * wavelength]
+        offsets = offsets[(offsets - values.middle @ normal).abs() > STEP * wavelength]
         found.append(torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1))
     return torch.cat(found), turn
 

@@ -284,8 +284,8 @@ class DirectionalGP(FramedMethod):
         dtype = self.power.dtype
         retained = torch.zeros(0, len(flat), len(self.rows), dtype=dtype)
         if len(self.uncertain):
-            unsure, carrier = self.positions.only(self.uncertain), torch.tensor(self.frame.carrier_hz)
-            retained = coherence(unsure.phase_vectors(flat, carrier, dtype), self.phase_vectors)
+            several, carrier = self.positions.only(self.uncertain), torch.tensor(self.frame.carrier_hz)
+            retained = coherence(several.phase_vectors(flat, carrier, dtype), self.phase_vectors)
         return QueryGeometry(
             flat,
             count,

@@ -163,7 +163,7 @@ class ImageSourceGP(FramedMethod):
             notes.append(f"{self.name}: {affordable} of {len(rows)} rows in the final process: time is short")
             rows = rows.take(torch.linspace(0, len(rows) - 1, affordable).long())
         self._conditioned(rows, [member.scene for member in found])
-        self.held = self._held(data, known, found, len(rows))
+        self.held = self._left_out_rows(data, known, found, len(rows))
         notes += self._described(found, budget)
         limited = less_repeatable(budget.limited_by, cache.limited_by)
         return FitReport(budget.counted.wall, tuple(notes), limited)
@@ -237,7 +237,7 @@ class ImageSourceGP(FramedMethod):
         groups = self._groups
         return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
 
-    def _held(
+    def _left_out_rows(
         self, data: Measurements, known: np.ndarray, found: list[Member], most: int
     ) -> LeftOutRows | None:
         """Rows of every group predicted by the searches that left it out, from at most `most` others."""

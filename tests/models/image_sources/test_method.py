@@ -17,7 +17,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import gather
+from gsparc.models.image_sources.rows import box_of, gather, scatterers
 from gsparc.models.image_sources.source_field import SourceField
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.registry import method_class
@@ -95,7 +95,7 @@ def test_paths_of_averaged_solutions_were_those_of_the_heaviest(small):
     assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
 
 
-def test_state_is_restored_and_the_report_counts_searches(small, tmp_path):
+def test_state_is_restored_and_the_report_counts_searches_and_sources(small, tmp_path):
     _, data, fold, method, report = small
     torch.save(method.state(), tmp_path / "state.pt")
     again = ImageSourceGP()
@@ -104,6 +104,7 @@ def test_state_is_restored_and_the_report_counts_searches(small, tmp_path):
     torch.testing.assert_close(after.mean, before.mean)
     torch.testing.assert_close(after.variance, before.variance)
     assert again.size() == method.size() >= 7 and "1 of 1 searches" in report.notes[0] and report.seconds > 0
+    assert any("0 scatterers" in note for note in report.notes)  # none is invented
 
 
 def test_one_query_is_like_many(small):
@@ -244,3 +245,25 @@ def learned_and_true_visibility(method, told, data, index, most=6):
             learned.append(learned_gains[:, distance.argmin()] / full)
             seen.append(told.visible[index, i])
     return np.stack(learned, 1), np.stack(seen, 1)
+
+
+@pytest.mark.slow
+def test_scatterers_are_found_and_told_from_images(tmp_path):
+    """In a room of weak walls; a scattered wave has both legs, 1 / (d1 d2)."""
+    true = np.array([[2.3, 0.9, 0.8], [1.1, 1.9, 1.2]])
+    told, _, fold = shoebox(220, size=(3.0, 2.5, 2.2), max_order=1, reflection=-0.4)
+    before = np.linalg.norm(true - told.tx[0], axis=1)
+    after = np.linalg.norm(told.rx[:, None] - true[None], axis=-1)
+    waves = (np.exp(-2j * np.pi * (before + after) / WAVELENGTH) / before / after).sum(1)
+    arrays = as_arrays(told)
+    arrays["csi"] = arrays["csi"] + 0.5 * waves[:, None, None] * WAVELENGTH / (4 * np.pi)
+    data = from_arrays(arrays)
+    method, _ = fitted(data, fold, tmp_path, clutter=False)
+    scene = method.members[0].scene
+    places = (scene.sources + method.frame.middle).numpy() + data.site.origin
+    scattered = scatterers(scene.sources, box_of(method.members[0].rows, scene.transmitter)).numpy()
+    images = told.images.of(told.tx[0])[told.images.order == 1]
+    for wanted, found, within in ((true, places[scattered], 0.1), (images, places[~scattered], 0.3)):
+        nearest = np.linalg.norm(wanted[:, None] - found[None], axis=-1).min(1)
+        assert (nearest < within * WAVELENGTH).all()
+    assert error(method, data, fold.test) < 0.01
