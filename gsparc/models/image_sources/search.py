@@ -175,7 +175,7 @@ class Search:
                 self.generator, spread,
             )  # fmt: skip
             added = 0
-            for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
+            for position, gained, amplitude in found:
                 if gained < FREE_SCORE:
                     continue
                 sequence, plane = self._parent(position, posterior)

@@ -49,7 +49,8 @@ def test_the_strong_images_are_found(data):
     space = Lags(site.array, site.grid, site.wavelength)
     power = torch.from_numpy(data.target[:60].astype(np.float32) / 255) ** 2
     receivers = torch.from_numpy(data.moving[:60]).float()
-    found = find_sources(space.of(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, seed=0)
+    given = space.of(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, 0
+    found = find_sources(*given, lambda: np.inf)
     mirrored = images(ROOM, 1).of(TRANSMITTER)
     above = mirrored[mirrored[:, 2] > 0] - site.origin
     distance = np.linalg.norm(above[:, None] - found.numpy()[None], axis=-1).min(1)
