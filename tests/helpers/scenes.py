@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from campaigns import spectra
 from shoeboxes import as_arrays, scatter
 
@@ -67,5 +68,15 @@ def shadowed(rows: int = 200, range_m: float = 2.0, noise_db: float = 0.5) -> tu
 def error(method, data: Measurements, rows: np.ndarray) -> float:
     """sum |e|^2 / sum |target|^2 on the rows."""
     batch = data.batch(rows)
-    miss = (method.predict(batch.tx, batch.rx).mean - batch.target).abs().square().sum()
-    return float(miss / batch.target.abs().square().sum())
+    return _share(method.predict(batch.tx, batch.rx).mean, batch.target)
+
+
+def answer_error(model, data: Measurements, rows: np.ndarray) -> float:
+    """The same of a method's or a field's answers to rows, in the phase of their runs."""
+    batch = data.batch(rows)
+    with torch.no_grad():
+        return _share(model.answer(batch).mean, batch.target)
+
+
+def _share(mean: torch.Tensor, target: torch.Tensor) -> float:
+    return float((mean - target).abs().square().sum() / target.abs().square().sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from gains import phased
 from rooms import directed
 from small_worlds import CARRIER, ceiling, channel, fold
 
@@ -15,13 +16,14 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.kernels import cells, sphere
 from gsparc.models.directional import method as directional_gp
 from gsparc.models.image_sources.clutter.residual import Residual
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_gp import VisibilityGP
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.ops import Pose
+from gsparc.processes.left_out import groups_of
 from gsparc.training.context import FitContext
 
 Arrays = dict[str, np.ndarray]
@@ -120,8 +122,7 @@ def image_sources_circular() -> Arrays:
 
 def image_sources_phased() -> Arrays:
     """Gains of constant phase: weights, likelihood, left-out rows, predictions and their variance."""
-    phased = PhasedScene(_scene(), torch.tensor([0.3, -1.0, 2.0]), 0.2)
-    posterior = PhasedPosterior(_rows(), phased)
+    posterior = Posterior(_rows(), phased(_scene(), torch.tensor([0.3, -1.0, 2.0])))
     query = torch.from_numpy(np.random.default_rng(1).uniform(0, 3, (6, 3)))
     means, variance, prior = Query([posterior]).means(query, torch.tensor([CARRIER, CARRIER + 1e7]).double())
     return {
@@ -134,17 +135,16 @@ def image_sources_phased() -> Arrays:
 
 def residual_of_a_scene() -> Arrays:
     """What clutter is sought against: likelihood, what each source is worth, scores of changes."""
-    phased = PhasedScene(_scene(), torch.tensor([0.3, -1.0, 2.0]), 0.2)
-    rows = _rows()
-    residual = Residual(rows, phased)
+    rows, scene = _rows(), phased(_scene(), torch.tensor([0.3, -1.0, 2.0]))
+    residual = Residual(rows, scene)
     share = torch.linspace(0.4, 1, 90).view(3, 30)
-    level = phased.scene.log_amplitude
+    level = scene.log_amplitude
     scorer = residual.scorer(share, level)
-    gain, multiple = scorer.score_waves(phased.waves(rows))
+    gain, multiple = scorer.score_waves(scene.waves(rows))
     return {
         "nll": residual.nll(share, level).float().numpy().reshape(1),
         "worth": residual.nats_per_source(share, level).numpy(), "weights": scorer.alpha.numpy(),
-        "score": scorer.score(phased.waves(rows)).numpy(), "gain": gain.numpy(), "by": multiple.numpy(),
+        "score": scorer.score(scene.waves(rows)).numpy(), "gain": gain.numpy(), "by": multiple.numpy(),
     }  # fmt: skip
 
 
@@ -186,10 +186,13 @@ def _field(data: object, angles: int, correlated: bool, mirrors: int, tilt: int 
     power = torch.linspace(0.2, 1.1, len(shape.names), dtype=torch.float64)
     planes = torch.tensor([[0.1, 0.0, 1.0, -0.7]], dtype=torch.float64)[:mirrors]
     planes = planes / planes[:, :3].norm(dim=1, keepdim=True)
-    lengths = torch.tensor([0.4, 0.3], dtype=torch.float64)
+    envelope, gain = torch.tensor([0.4, 0.3], dtype=torch.float64)
     offset = torch.tensor([0.01, -0.02, 0.0], dtype=torch.float64)
-    values = Values(power, lengths[0], lengths[1], offset, torch.linspace(1, -1, tilt).double(), planes)
-    field = ChannelField(data.site, shape, values, tuple(data.target.shape[1:]))
+    values = Values(
+        **shape.state(), power=power, envelope=envelope, gain=gain, offset=offset,
+        towards=torch.linspace(1, -1, tilt).double(), planes=planes,
+    )  # fmt: skip
+    field = ChannelField(data.site, values, tuple(data.target.shape[1:]))
     field.condition(data, np.arange(len(data) - 8))
     return field
 
@@ -239,13 +242,13 @@ def evidence_of_waves() -> Arrays:
     data = channel(120)
     field, found = _field(data, 4, False, 1), {}
     groups = tuple(map(evidence.normalised, thinned(gather(data, np.arange(120), True), 1, 110)))
-    values = field._held
-    (part,) = evidence.compressed(groups, field.shape, values)
+    values = field._constants
+    (part,) = evidence.compressed(groups, values)
     at = evidence.solved(part, values.power)
     found |= {"nll": np.array(at.nll), "scale": np.array(at.scale)}
     found["slope"] = evidence.slope(part, values.power, at).numpy()
     places = groups[0].places.numpy()
     for depth in (0, 2):
-        cell = cells(places, depth + 1) if depth else np.arange(len(places))
-        found[f"cells{depth}"] = evidence.left_out_cells(part, values.power, cell).numpy()
+        groups = groups_of(cells(places, depth + 1)) if depth else None
+        found[f"cells{depth}"] = evidence.left_out(part, values.power, [groups])[0].numpy()
     return found

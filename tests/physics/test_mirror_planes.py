@@ -3,8 +3,8 @@ import itertools
 import pytest
 import torch
 
-from gsparc.models.image_sources.gp_likelihood import Scene
 from gsparc.models.image_sources.reflection_orders import find_walls, orthogonal_walls, reassign
+from gsparc.models.image_sources.scene import Scene
 from gsparc.physics.mirror_planes import all_sequences, bisector, images, reflect
 
 WALLS = torch.tensor(

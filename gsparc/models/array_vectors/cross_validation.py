@@ -14,7 +14,6 @@ import torch
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from gsparc.field.confidence import fit_errors
 from gsparc.models.array_vectors.vector_gp import align, refine_alignment
 from gsparc.models.left_out_images import LeftOut, mean_log_error, predict_left_out
 from gsparc.processes.factor import Factor
@@ -43,13 +42,6 @@ class Tuned:
     unknown: np.ndarray
     error: np.ndarray
     left_out: LeftOut | None = None
-
-    def error_model(self) -> tuple[float, float]:
-        """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
-
-        See `fit_errors`.
-        """
-        return fit_errors(self.unknown, self.error)
 
 
 def tune(

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
+from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import seen_by_array
 from gsparc.field.initial import InitTask, Start
@@ -133,7 +134,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
-        tuned.error_model(),
+        fit_errors(tuned.unknown, tuned.error),
         tuned.left_out,
         elapsed,
         training,

@@ -115,7 +115,7 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
     station = np.zeros(len(rows), np.int64)
     if data.station is not None and data.site.stations is not None:
         station = data.station[rows]
-    taken = _taken(data)
+    numbers_of = _order_of(data)
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
     target = torch.from_numpy(np.asarray(data.target[rows])).to(torch.complex128)
@@ -130,12 +130,12 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
             here = torch.from_numpy(measured)
             chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(here), -1)
             places = slot.places(moving[here], turned[here])
-            order = torch.from_numpy(taken[rows[measured]])
+            order = torch.from_numpy(numbers_of[rows[measured]])
             found.append(Group(slot, here, places, chosen, torch.from_numpy(run[measured]), order))
     return tuple(found)
 
 
-def _taken(data: Measurements) -> np.ndarray:
+def _order_of(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station."""
     if data.station is None:
         return np.arange(len(data), dtype=np.float64)
@@ -195,7 +195,7 @@ def carrier_of(site: Site, station: int) -> float:
     return float(site.carrier_hz)
 
 
-def asked(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Moving and static ends' places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
 
     Where both ends move, the moving places are (B, 6).

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group, Slot
-from gsparc.models.channels.covariance import Shape, Values, prior, waves_of
+from gsparc.models.channels.covariance import Values, prior, waves_of
 from gsparc.physics.mirror_planes import images
 
 
@@ -29,46 +29,46 @@ class Common:
     level: float
 
     @staticmethod
-    def of(shape: Shape, values: Values, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
+    def of(values: Values, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
         """From groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
-            waves, power, away = _waves(shape, values, group.slot, group.places)
+            waves, power, away = _waves(values, group.slot, group.places)
             gains.append(away * power * (waves.conj() @ alpha).mean(1))
-            levels.append(scale * float(_away(shape, values, group.slot)) ** 2)
+            levels.append(scale * float(_away(values, group.slot)) ** 2)
         each = torch.stack(gains)
         count, gain = len(each), each.mean(0)
         whole, mean = each.abs().square().mean(0), gain.abs().square()
         steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
         spread = (whole - steady) / count
-        sure = steady / (steady + spread).clamp_min(1e-300)
-        explained = steady * sure
+        reliability = steady / (steady + spread).clamp_min(1e-300)
+        explained = steady * reliability
         # The direct wave stays: unsure as its gain may be, its shape is right.
-        sure[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
-        return Common(gain * sure, explained, sum(levels) / count)
+        reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
+        return Common(gain * reliability, explained, sum(levels) / count)
 
-    def at(self, shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def at(self, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
-        before = self.level / _away(shape, values, slot) ** 2 * prior(shape, values, slot, places)
-        waves, _, away = _waves(shape, values, slot, places)
+        before = self.level / _away(values, slot) ** 2 * prior(values, slot, places)
+        waves, _, away = _waves(values, slot, places)
         waves = waves / away[:, None]
         after = before - self.explained @ waves.abs().square()
         return self.gain @ waves, after.clamp_min(0), before
 
 
-def _waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _waves(values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Waves (J, n) of an end and its images, their powers (J,) and distances to the middle (J,) [m]."""
-    if not shape.direct:
+    if not values.direct:
         none = places.new_zeros(0)
         return places.new_zeros(0, len(places), dtype=torch.complex128), none, none
     end = slot.end + values.offset
-    placed = torch.cat([end[None], images(end, values.planes, shape.sequences)])
-    away = torch.linalg.vector_norm(placed - shape.middle, dim=-1)
-    return waves_of(shape, values, slot, places), shape.gains(values.power)[0], away
+    placed = torch.cat([end[None], images(end, values.planes, values.sequences)])
+    away = torch.linalg.vector_norm(placed - values.middle, dim=-1)
+    return waves_of(values, slot, places), values.gains()[0], away
 
 
-def _away(shape: Shape, values: Values, slot: Slot) -> Tensor:
+def _away(values: Values, slot: Slot) -> Tensor:
     """Distance () [m] of the end to the places' middle; 1 where no wave of it is known."""
-    if not shape.direct:
+    if not values.direct:
         return torch.ones((), dtype=torch.float64)
-    return torch.linalg.vector_norm(slot.end + values.offset - shape.middle)
+    return torch.linalg.vector_norm(slot.end + values.offset - values.middle)

@@ -247,6 +247,6 @@ def _density(kernel: WaveKernel, at: Tensor, values: Tensor, counts: Tensor, sca
     missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
     variance, again = 1 + noise[:, 0] - known, float((counts[:, 0] - 1).sum())
     power = float((missed.abs().square().mean(1) / variance).sum()) + float(scatter.sum()) / kernel.noise
-    unsure = float(variance.log().sum()) + again * math.log(kernel.noise)
+    spread = float(variance.log().sum()) + again * math.log(kernel.noise)
     count = len(at) + again
-    return math.log(max(power / count, 1e-300)) + unsure / count
+    return math.log(max(power / count, 1e-300)) + spread / count

@@ -83,27 +83,19 @@ class Shape:
         """Numbers of the powers of this name, which are consecutive."""
         return [i for i, each in enumerate(self.names) if each == name]
 
-    def of(self, name: str, power: Tensor) -> Tensor:
-        """Powers (m,) of this name; of one that there is not, none."""
-        return power[self._parts.get(name, slice(0))]
-
     @cached_property
-    def _parts(self) -> dict[str, slice]:
+    def parts(self) -> dict[str, slice]:
+        """Where each name's powers are."""
         return {name: slice(self.names.index(name), max(self.where(name)) + 1) for name in self.names}
 
-    def gains(self, power: Tensor) -> list[Tensor]:
-        """Powers (W,) of the fixed gains of all `waves_of`, and of those that vary."""
-        named = ("direct", "source"), ("direct_smooth", "source_smooth")
-        return [torch.cat([self.of(name, power) for name in names]) for names in named]
-
     def state(self) -> dict[str, Any]:
-        """What it is made of."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        """Which terms there are, as it is made again of."""
+        return {each.name: getattr(self, each.name) for each in fields(Shape)}
 
 
-@dataclass(frozen=True)
-class Values:
-    """What is learned by gradient.
+@dataclass(frozen=True, kw_only=True)
+class Values(Shape):
+    """The terms, and what is learned by gradient.
 
     Attributes:
         power: (P,) float64, see `Shape.names`; relative to each group's scale.
@@ -121,28 +113,37 @@ class Values:
     towards: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     planes: Tensor = field(default_factory=lambda: torch.zeros(0, 4, dtype=torch.float64))
 
+    def of(self, name: str) -> Tensor:
+        """Powers (m,) of this name; of one that there is not, none."""
+        return self.power[self.parts.get(name, slice(0))]
 
-def direct_wave(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+    def gains(self) -> list[Tensor]:
+        """Powers (W,) of the fixed gains of all `waves_of`, and of those that vary."""
+        named = ("direct", "source"), ("direct_smooth", "source_smooth")
+        return [torch.cat([self.of(name) for name in names]) for names in named]
+
+
+def direct_wave(values: Values, slot: Slot, places: Tensor) -> Tensor:
     """(n,) complex128, of size 1 in the middle; of places (n, 6), from one moving end to the other."""
     if places.shape[1] > 3:
-        between, middle = places[:, :3] - places[:, 3:], shape.middle[:3] - shape.middle[3:]
+        between, middle = places[:, :3] - places[:, 3:], values.middle[:3] - values.middle[3:]
         away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / slot.wavenumber)
         return steering(between, torch.zeros_like(middle), slot.wavenumber, away)
     end = slot.end + values.offset
-    return steering(places, end, slot.wavenumber, torch.linalg.vector_norm(end - shape.middle))
+    return steering(places, end, slot.wavenumber, torch.linalg.vector_norm(end - values.middle))
 
 
-def image_waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+def image_waves(values: Values, slot: Slot, places: Tensor) -> Tensor:
     """(W, n) complex128 of all images, each of size 1 in the middle."""
-    if not shape.count:
+    if not values.count:
         return places.new_zeros(0, len(places), dtype=torch.complex128)
     end = slot.end + values.offset
-    given = images(end, values.planes, shape.sequences)
-    reference = torch.linalg.vector_norm(given - shape.middle, dim=-1)
+    given = images(end, values.planes, values.sequences)
+    reference = torch.linalg.vector_norm(given - values.middle, dim=-1)
     waves = [
         steering(places, source, slot.wavenumber, away) for source, away in zip(given, reference, strict=True)
     ]
-    return torch.stack(waves) * mirrored(values.planes, shape.sequences, end, shape.middle)[:, None]
+    return torch.stack(waves) * mirrored(values.planes, values.sequences, end, values.middle)[:, None]
 
 
 def mirrored(planes: Tensor, sequences: Sequence[Reflections], end: Tensor, middle: Tensor) -> Tensor:
@@ -154,28 +155,26 @@ def mirrored(planes: Tensor, sequences: Sequence[Reflections], end: Tensor, midd
     )
 
 
-def diffuse_of(
-    shape: Shape, values: Values, wavenumber: float, powers: Tensor, a: Tensor, b: Tensor
-) -> Tensor:
+def diffuse_of(values: Values, wavenumber: float, powers: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """The diffuse field's covariance (T, n, m) complex128 of T static ends, places a (n, 3) and b (m, 3) [m].
 
     `powers` (T, M) are the ends' of directions.
     """
-    found = shape.of("isotropic", values.power)[0] * plain(a, b, wavenumber, values.envelope)
+    found = values.of("isotropic")[0] * plain(a, b, wavenumber, values.envelope)
     found = found[None].expand(len(powers), *found.shape)
-    if not len(shape.angles):
+    if not len(values.angles):
         return found.to(torch.complex128)
     distance = apart(a, b)
     bound = envelope(distance, values.envelope)
     block = max(BLOCK // max(distance.numel(), 1), 1)
-    for angles, power in zip(shape.angles.split(block), powers.split(block, dim=1), strict=False):
+    for angles, power in zip(values.angles.split(block), powers.split(block, dim=1), strict=False):
         if len(angles):
-            correlations = directions(angles, shape.concentration, wavenumber, a, b, distance)
+            correlations = directions(angles, values.concentration, wavenumber, a, b, distance)
             found = found + torch.tensordot(power.to(correlations.dtype), correlations, 1) * bound
     return found.to(torch.complex128)
 
 
-def diffuse_fields(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+def diffuse_fields(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
     """Covariances (n, n) of the groups' diffuse fields; correlations of shared places are computed once."""
     alike: dict[tuple[bytes, float], list[int]] = {}
     for number, group in enumerate(groups):
@@ -183,22 +182,22 @@ def diffuse_fields(groups: tuple[Group, ...], shape: Shape, values: Values) -> l
     found: list[Tensor] = [torch.empty(0)] * len(groups)
     for (_, wavenumber), numbers in alike.items():
         places = groups[numbers[0]].places
-        powers = directional(shape, values, [groups[number].slot for number in numbers])
-        rows = max(BLOCK // (len(places) * max(len(shape.angles), 1)), 1) if len(powers) > 1 else len(places)
-        parts = [diffuse_of(shape, values, wavenumber, powers, part, places) for part in places.split(rows)]
+        powers = directional(values, [groups[number].slot for number in numbers])
+        rows = max(BLOCK // (len(places) * max(len(values.angles), 1)), 1) if len(powers) > 1 else len(places)
+        parts = [diffuse_of(values, wavenumber, powers, part, places) for part in places.split(rows)]
         whole = torch.cat(parts, 1)
         for at, number in enumerate(numbers):
             found[number] = whole[min(at, len(whole) - 1)]
     return found
 
 
-def directional(shape: Shape, values: Values, slots: Sequence[Slot]) -> Tensor:
+def directional(values: Values, slots: Sequence[Slot]) -> Tensor:
     """Powers (T, M) of directions as ends have them; (1, M) where all have the same."""
-    power = shape.of("direction", values.power)
+    power = values.of("direction")
     if not len(values.towards) or not len(power):
         return power[None]
     ends = torch.stack([slot.end for slot in slots]) + values.offset
-    return power * (angle_knot_weights(shape, ends, len(values.towards)) @ values.towards).exp()
+    return power * (angle_knot_weights(values, ends, len(values.towards)) @ values.towards).exp()
 
 
 def angle_knot_weights(shape: Shape, ends: Tensor, knots: int) -> Tensor:
@@ -227,51 +226,59 @@ def directions(
     return directed((wavenumber * distance).square(), along, concentration)
 
 
-def waves_of(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+def waves_of(values: Values, slot: Slot, places: Tensor) -> Tensor:
     """(W, n) complex128: the direct wave where there is one, then those of all images."""
-    mirrored_waves = image_waves(shape, values, slot, places)
-    if not shape.direct:
+    mirrored_waves = image_waves(values, slot, places)
+    if not values.direct:
         return mirrored_waves
-    return torch.cat([direct_wave(shape, values, slot, places)[None], mirrored_waves])
+    return torch.cat([direct_wave(values, slot, places)[None], mirrored_waves])
 
 
-def explained(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
+def explained(values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
     """The images' share (n, m) of the covariance."""
-    return _of_waves(shape, values, slot, a, b, int(shape.direct))
+    return _of_waves(values, slot, a, b, int(values.direct))
 
 
-def specular(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
+def specular(values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
     """Covariance (n, m) of all but the diffuse field."""
-    found = _of_waves(shape, values, slot, a, b, 0)
-    if not shape.constant:
+    found = _of_waves(values, slot, a, b, 0)
+    if not values.constant:
         return found
-    return found + shape.of("constant", values.power)[0] * smooth(apart(a, b), shape.reach)
+    return found + values.of("constant")[0] * smooth(apart(a, b), values.reach)
 
 
-def _of_waves(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor, first: int) -> Tensor:
+def _of_waves(values: Values, slot: Slot, a: Tensor, b: Tensor, first: int) -> Tensor:
     """Covariance (n, m) of the waves from number `first` on."""
     distance = apart(a, b)
-    before, after = (waves_of(shape, values, slot, places)[first:] for places in (a, b))
+    before, after = (waves_of(values, slot, places)[first:] for places in (a, b))
     if not len(before):
         return torch.zeros(len(a), len(b), dtype=torch.complex128)
-    fixed, varying = ((before.T * power[first:]) @ after.conj() for power in shape.gains(values.power))
-    return fixed * smooth(distance, shape.reach) + varying * smooth(distance, values.gain)
+    fixed, varying = ((before.T * power[first:]) @ after.conj() for power in values.gains())
+    return fixed * smooth(distance, values.reach) + varying * smooth(distance, values.gain)
 
 
-def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+def signals(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
+    """Covariances (n, n) complex128 of the groups' signals, relative to each one's scale."""
+    return [
+        field + specular(values, group.slot, group.places, group.places)
+        for field, group in zip(diffuse_fields(groups, values), groups, strict=True)
+    ]
+
+
+def prior(values: Values, slot: Slot, places: Tensor) -> Tensor:
     """Variance (n,) of the signal."""
-    found = shape.of("isotropic", values.power)[0] + directional(shape, values, [slot])[0].sum()
-    found = found + shape.of("constant", values.power).sum()
-    level = waves_of(shape, values, slot, places).abs().square()
-    return (found + torch.stack(shape.gains(values.power)).sum(0) @ level).expand(len(places))
+    found = values.of("isotropic")[0] + directional(values, [slot])[0].sum()
+    found = found + values.of("constant").sum()
+    level = waves_of(values, slot, places).abs().square()
+    return (found + torch.stack(values.gains()).sum(0) @ level).expand(len(places))
 
 
-def disturbance(shape: Shape, values: Values, group: Group) -> Tensor:
+def disturbance(values: Values, group: Group) -> Tensor:
     """Covariance (n, n) float64 of what is no signal of the place: noise and drift of training rows."""
-    found = torch.eye(len(group), dtype=torch.float64) * shape.of("noise", values.power)
-    if shape.correlated:
+    found = torch.eye(len(group), dtype=torch.float64) * values.of("noise")
+    if values.correlated:
         fast, drift = temporal(values.envelope, group)
-        found = found + shape.of("fast", values.power) * fast + shape.of("drift", values.power) * drift
+        found = found + values.of("fast") * fast + values.of("drift") * drift
     return found
 
 

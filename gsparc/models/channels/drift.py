@@ -15,9 +15,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group, thinned
-from gsparc.models.channels.covariance import Shape, Values, diffuse_fields, specular, temporal
+from gsparc.models.channels.covariance import Values, temporal
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.left_out import groups_of
 from gsparc.processes.worker import stop_when_late
 
 STRETCH = 400  # rows looked at
@@ -37,17 +36,15 @@ def contiguous_rows(groups: tuple[Group, ...]) -> tuple[Group, ...]:
     return tuple(found)
 
 
-def with_drift(
-    groups: tuple[Group, ...], signals: list[Tensor], shape: Shape, values: Values
-) -> tuple[Shape, Values, float]:
-    """The shape and values with correlated noise, and what evidence gains on `groups` [nats].
+def with_drift(groups: tuple[Group, ...], signals: list[Tensor], values: Values) -> tuple[Values, float]:
+    """The terms with correlated noise, and what evidence gains on `groups` [nats].
 
     Args:
         groups: see `contiguous_rows`.
-        signals: covariances (n, n) of theirs, see `signals_of`.
-        shape, values: without correlated noise.
+        signals: covariances (n, n) of theirs, see `covariance.signals`.
+        values: without correlated noise.
     """
-    noise = float(shape.of("noise", values.power)[0])
+    noise = float(values.of("noise")[0])
     eye = [torch.eye(len(group), dtype=torch.float64) for group in groups]
     terms = [[one, *temporal(values.envelope, group)] for one, group in zip(eye, groups, strict=True)]
     before = sum(
@@ -74,35 +71,11 @@ def with_drift(
         options={"maxiter": STEPS},
         callback=stop_when_late,
     )
-    fresh = replace(shape, correlated=True)
     power = torch.cat([values.power.clone(), torch.zeros(2, dtype=torch.float64)])
+    fresh = replace(values, correlated=True, power=power)
     for name, level in zip(("noise", "fast", "drift"), np.exp(found.x), strict=True):
         power[fresh.where(name)] = float(level)
-    return fresh, replace(values, power=power), before - float(found.fun)
-
-
-def left_out_cells(group: Group, signal: Tensor, other: Tensor, cells: list[np.ndarray]) -> list[Tensor]:
-    """Errors (n, D) of rows whose signal is predicted without any of their cell, for each of some cells (n,).
-
-    Args:
-        group: rows.
-        signal: (n, n) covariance of the signal.
-        other: (n, n) covariance of what disturbs it.
-        cells: numbers (n,) of cells.
-    """
-    other = other.to(torch.complex128)
-    given = Conditioned.of(signal + other, group.target)
-    own = [None if len(np.unique(cell)) == len(cell) else groups_of(cell) for cell in cells]
-    return [given.left_out_signal(other, groups)[0] for groups in own]
-
-
-def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
-    """Covariances (n, n) of the groups' signals."""
-    fields = diffuse_fields(groups, shape, values)
-    return [
-        field + specular(shape, values, group.slot, group.places, group.places)
-        for field, group in zip(fields, groups, strict=True)
-    ]
+    return fresh, before - float(found.fun)
 
 
 def _likelihood(

@@ -9,9 +9,7 @@ outside of them there is noise alone. Each group's scale is profiled out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,12 +18,12 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.covariance import Shape, Values, angle_knot_weights, directions, waves_of
+from gsparc.models.channels.covariance import Values, angle_knot_weights, directions, waves_of
 from gsparc.models.channels.kernels import envelope, plain, smooth
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart
-from gsparc.processes.left_out import left_out
+from gsparc.processes.left_out import left_out as left_out_rows
 from gsparc.processes.worker import stop_when_late
 
 FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
@@ -37,6 +35,9 @@ WEAK = 1e-3  # pull of every log power to where it started, which holds those th
 TILTED = 0.5  # pull of logarithms of factors towards ends to 0: a prior of standard deviation 1
 STEPS = 30
 SETTLED = 1e-6  # relative change of the objective at which steps end
+
+Cache = dict[tuple[bytes | float, ...], Any]
+Grouping = list[Tensor] | None  # rows that are left out together; None: one by one
 
 
 @dataclass(frozen=True)
@@ -120,51 +121,48 @@ def normalised(group: Group) -> Group:
     return replace(group, target=group.target / level)
 
 
-class Kept:
-    """Matrices of places that further candidates and groups need again."""
-
-    def __init__(self) -> None:
-        self._found: dict[tuple[bytes | float, ...], Any] = {}
-
-    def of(self, key: tuple[bytes | float, ...], make: Callable[[], Any]) -> Any:
-        """What `make` returned the first time."""
-        if key not in self._found:
-            self._found[key] = make()
-        return self._found[key]
-
-
 def compressed(
-    groups: tuple[Group, ...], shape: Shape, values: Values, kept: Kept | None = None
+    groups: tuple[Group, ...], values: Values, cache: Cache | None = None
 ) -> tuple[Compressed, ...]:
-    """Terms of all groups; those of one set of displacements and one wavelength share the diffuse field's."""
-    kept, found = kept or Kept(), []
-    noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
+    """Terms of all groups; those of one set of displacements and one wavelength share the diffuse field's.
+
+    `cache` keeps matrices of places that further candidates and groups need again.
+    """
+    cache, found = {} if cache is None else cache, []
+    noise = float(values.of("noise")[0] / values.of("isotropic")[0])
     for group in groups:
-        key, wavenumber, length = group.displacements, group.slot.wavenumber, float(values.envelope)
-        basis, room = kept.of(
-            (key, wavenumber, length, noise, shape.angles.numpy().tobytes(), shape.concentration),
-            partial(_field, group, shape, values, noise),
-        )
-        fixed = kept.of((key, shape.reach), partial(_roots, group, shape.reach))
-        varying = kept.of((key, float(values.gain)), partial(_roots, group, float(values.gain)))
-        target = basis.T.to(torch.complex128) @ group.target
-        rest = float(group.target.abs().square().sum() - target.abs().square().sum())
-        terms = tuple(map(Term.of, _factors(group, shape, values, basis, fixed, varying)))
-        bins = torch.zeros(len(shape.angles), 0, dtype=torch.float64)
+        places = group.displacements
+        kernel = group.slot.wavenumber, float(values.envelope), noise, values.concentration
+        key = (places, *kernel, values.angles.numpy().tobytes())
+        if key not in cache:
+            cache[key] = _field(group, values, noise)
+        basis, room = cache[key]
+        for length in (values.reach, float(values.gain)):
+            if (places, length) not in cache:
+                cache[places, length] = _roots(group, length)
+        roots = cache[places, values.reach], cache[places, float(values.gain)]
+        terms = tuple(map(Term.of, _factors(group, values, basis, *roots)))
+        bins = torch.zeros(len(values.angles), 0, dtype=torch.float64)
         if len(values.towards):
-            bins = angle_knot_weights(shape, (group.slot.end + values.offset)[None], len(values.towards))[0]
-        found.append(Compressed(group, basis, room, terms, bins, target, max(rest, 0.0)))
+            bins = angle_knot_weights(values, (group.slot.end + values.offset)[None], len(values.towards))[0]
+        found.append(Compressed(group, basis, room, terms, bins, *_projected(group, basis)))
     return tuple(found)
 
 
-def compressible(group: Group, shape: Shape, values: Values) -> bool:
+def _projected(group: Group, basis: Tensor) -> tuple[Tensor, float]:
+    """Targets (r, D) in a basis (n, r), and the sum of squares outside it."""
+    target = basis.T.to(torch.complex128) @ group.target
+    return target, max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
+
+
+def compressible(group: Group, values: Values) -> bool:
     """Whether the places tell far fewer waves apart than there are rows."""
-    noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
+    noise = float(values.of("noise")[0] / values.of("isotropic")[0])
     alike = plain(group.places, group.places, group.slot.wavenumber, values.envelope)
     return int((torch.linalg.eigvalsh(alike) > FLOOR * noise).sum()) <= WORTH * len(group)
 
 
-def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Tensor, Tensor]:
+def _field(group: Group, values: Values, noise: float) -> tuple[Tensor, Tensor]:
     places, wavenumber = group.places, group.slot.wavenumber
     distance = apart(places, places)
     bound = envelope(distance, values.envelope)
@@ -174,8 +172,8 @@ def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Te
     whole = int(kept.sum()) > WORTH * len(group)
     basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
     room = [alike.to(torch.complex128)]
-    for angle in shape.angles:
-        one = directions(angle[None], shape.concentration, wavenumber, places, places, distance)
+    for angle in values.angles:
+        one = directions(angle[None], values.concentration, wavenumber, places, places, distance)
         room.append(one[0] * bound)
     if whole:
         return basis, torch.stack(room)
@@ -193,12 +191,12 @@ def _roots(group: Group, length: float) -> Tensor:
 
 
 def _factors(
-    group: Group, shape: Shape, values: Values, basis: Tensor, fixed: Tensor, varying: Tensor
+    group: Group, values: Values, basis: Tensor, fixed: Tensor, varying: Tensor
 ) -> tuple[Tensor, ...]:
     wide = basis.T.to(torch.complex128)
-    found = [wide @ fixed.to(torch.complex128)] if shape.constant else []
-    waves = waves_of(shape, values, group.slot, group.places)[:, :, None]
-    for part in waves.split([int(shape.direct), shape.count]):
+    found = [wide @ fixed.to(torch.complex128)] if values.constant else []
+    waves = waves_of(values, group.slot, group.places)[:, :, None]
+    for part in waves.split([int(values.direct), values.count]):
         found += [wide @ (wave * root) for root in (fixed, varying) for wave in part]
     return tuple(found)
 
@@ -210,10 +208,8 @@ def without(part: Compressed, left: Tensor) -> Compressed:
     room = torch.complex(mixed @ part.room.real @ mixed.T, mixed @ part.room.imag @ mixed.T)
     wide = mixed.to(torch.complex128)
     group = part.group.take(rest)
-    target = basis.T.to(torch.complex128) @ group.target
-    outside = float(group.target.abs().square().sum() - target.abs().square().sum())
     terms = tuple(Term.of(wide @ term.factor) for term in part.terms)
-    return Compressed(group, basis, room, terms, part.ways, target, max(outside, 0.0))
+    return Compressed(group, basis, room, terms, part.ways, *_projected(group, basis))
 
 
 def solved(part: Compressed, power: Tensor) -> Solved:
@@ -255,12 +251,12 @@ def evidence(parts: tuple[Compressed, ...], values: Values) -> float:
 
 
 def fit_powers(
-    parts: tuple[Compressed, ...], shape: Shape, values: Values, shrinkage: float, steps: int = STEPS
+    parts: tuple[Compressed, ...], values: Values, shrinkage: float, steps: int = STEPS
 ) -> tuple[Values, float]:
     """With powers and `Values.towards` of largest evidence, its negative logarithm without the priors.
 
     Args:
-        parts, shape: of the groups.
+        parts: of the groups.
         values: to start from.
         shrinkage: rows that an inverse Gamma prior of directions' powers about their mean counts for.
         steps: of L-BFGS at most.
@@ -268,7 +264,7 @@ def fit_powers(
     start, towards = values.power, values.towards
     count = len(start)
     begin = torch.cat([start.log().clamp(LOWEST, HIGHEST), towards])
-    angles = shape.where("direction")
+    angles = values.where("direction")
 
     def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
         log = torch.from_numpy(logs)
@@ -308,22 +304,25 @@ def fit_powers(
     return fitted, evidence(parts, fitted)
 
 
-def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:
-    """Errors (n, D) of rows predicted without any of their cell (n,) (Rasmussen and Williams 2006, 5.12).
+def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
+    """Errors (n, D) of rows left out with their group, of each grouping (Rasmussen and Williams 2006, 5.12).
 
     Powers (P,) are its own.
     """
     at, noise = solved(part, power), power[len(part.room) + len(part.terms)]
-    wide = part.basis.to(torch.complex128)
+    wide, inverse = part.basis.to(torch.complex128), at.given.factor.inverse
     alpha = wide @ at.given.weights + (part.group.target - wide @ part.target) / noise
-    if len(np.unique(cell)) == len(cell):
-        inside, outside = (wide @ at.given.factor.inverse) * wide.conj(), 1 - wide.abs().square().sum(1)
-        return left_out(inside.sum(1).real + outside / noise, alpha)[0]
-    error = torch.empty_like(alpha)
-    for number in np.unique(cell):
-        mine = torch.from_numpy(np.flatnonzero(cell == number))
-        own = wide[mine]
-        block = own @ (at.given.factor.inverse @ own.mH) - own @ own.mH / noise
-        block.diagonal().add_(1 / noise)
-        error[mine] = Factor.of(block).solved(alpha[mine])
-    return error
+    found = []
+    for groups in groupings:
+        if groups is None:
+            inside, outside = (wide @ inverse) * wide.conj(), 1 - wide.abs().square().sum(1)
+            error, _ = left_out_rows(inside.sum(1).real + outside / noise, alpha)
+        else:
+            error = torch.empty_like(alpha)
+            for mine in groups:
+                own = wide[mine]
+                block = own @ (inverse @ own.mH) - own @ own.mH / noise
+                block.diagonal().add_(1 / noise)
+                error[mine] = Factor.of(block).solved(alpha[mine])
+        found.append(error)
+    return found

@@ -13,17 +13,17 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
-from gsparc.models.channels.columns import Group, Slot, asked, gather, run_factors_of, static_place
+from gsparc.models.channels.columns import Group, Slot, gather, query_ends, run_factors_of, static_place
 from gsparc.models.channels.common import Common
 from gsparc.models.channels.covariance import (
     Shape,
     Values,
-    diffuse_fields,
     diffuse_of,
     directional,
     disturbance,
     explained,
     prior,
+    signals,
     specular,
 )
 from gsparc.models.image_sources.run_factors import RunFactors
@@ -82,8 +82,7 @@ class ChannelField(ConditionalField):
 
     Args:
         site: kind csi, of a known carrier; one end static, or several stations.
-        shape: which terms there are.
-        values: where learning starts.
+        values: the terms, and where learning starts.
         channel: (A, K) of the targets.
 
     Attributes:
@@ -96,9 +95,9 @@ class ChannelField(ConditionalField):
     kind = "diffuse"
     reads_rows = True
 
-    def __init__(self, site: Site, shape: Shape, values: Values, channel: tuple[int, int]) -> None:
+    def __init__(self, site: Site, values: Values, channel: tuple[int, int]) -> None:
         super().__init__()
-        self.site, self.shape, self.channel = site, shape, channel
+        self.site, self.shape, self.channel = site, Shape(**values.state()), channel
         self.log_power = nn.Parameter(values.power.log())
         self.log_envelope = nn.Parameter(values.envelope.log())
         self.log_gain = nn.Parameter(values.gain.log())
@@ -115,13 +114,17 @@ class ChannelField(ConditionalField):
     @property
     def values(self) -> Values:
         """The parameters as they are, differentiable."""
-        lengths = self.log_envelope.exp(), self.log_gain.exp()
-        return Values(self.log_power.exp(), *lengths, self.offset, self.towards, self.planes)
+        return Values(
+            **self.shape.state(), power=self.log_power.exp(), envelope=self.log_envelope.exp(),
+            gain=self.log_gain.exp(), offset=self.offset, towards=self.towards, planes=self.planes,
+        )  # fmt: skip
 
     @property
-    def _held(self) -> Values:
+    def _constants(self) -> Values:
         """The parameters as they are, as constants."""
-        return Values(**{name: value.detach() for name, value in vars(self.values).items()})
+        values = self.values
+        learned = ("power", "envelope", "gain", "offset", "towards", "planes")
+        return replace(values, **{name: getattr(values, name).detach() for name in learned})
 
     @property
     def apart(self) -> bool:
@@ -158,10 +161,10 @@ class ChannelField(ConditionalField):
         Raises:
             ValueError: not conditioned yet.
         """
-        moving, _, turned, nearest = asked(self.site, batch.tx, batch.rx)
+        moving, _, turned, nearest = query_ends(self.site, batch.tx, batch.rx)
         station = self._numbers(batch.station, nearest)
         target = batch.target.cpu().to(torch.complex128) / self.runs.of(batch.run)[:, None, None]
-        shape, values = self.shape, self.values
+        values = self.values
         total, entries = torch.zeros(len(moving), dtype=torch.float64), torch.zeros(len(moving))
         for known in self._conditioned():
             slot = known.group.slot
@@ -174,9 +177,7 @@ class ChannelField(ConditionalField):
             run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
             places = slot.places(moving[here], turned[here])
             group = Group(slot, here, places, _entries(target, here, slot), run, order)
-            error, variance = Conditioned.of(
-                _covariances((group,), shape, values)[0], group.target
-            ).left_out()
+            error, variance = Conditioned.of(_covariances((group,), values)[0], group.target).left_out()
             variance = known.scale * variance
             density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
             outputs = group.target.shape[1]
@@ -202,22 +203,22 @@ class ChannelField(ConditionalField):
 
     def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
         """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
-        shape, values = self.shape, self.values
-        all_factors = [Factor.of(covariance) for covariance in _covariances(groups, shape, values)]
+        values = self.values
+        all_factors = [Factor.of(covariance) for covariance in _covariances(groups, values)]
         if factors is None:
             factors = run_factors_of(groups, all_factors, len(runs))
         self.runs = RunFactors(runs, factors)
-        found, noise = [], float(shape.of("noise", values.power))
+        found, noise = [], float(values.of("noise"))
         for group, factor in zip(groups, all_factors, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])
             given = Conditioned(factor, aligned.target, factor.solved(aligned.target))
-            found.append(Weights(aligned, given, max(given.scale, 1e-300), noise, shape.is_real))
+            found.append(Weights(aligned, given, max(given.scale, 1e-300), noise, values.is_real))
         self.weights = tuple(found)
         self.stations = {}
         for known in found:
             self.stations.setdefault(known.group.slot.station, []).append(known)
         heard = [(known.group, known.given.weights, known.scale) for known in found]
-        self.common = Common.of(shape, self._held, heard) if len(self.stations) > 1 else None
+        self.common = Common.of(self._constants, heard) if len(self.stations) > 1 else None
 
     def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
         """See `ConditionalField`; in the phase and level of the largest run.
@@ -229,7 +230,7 @@ class ChannelField(ConditionalField):
             station: (B,) int64 static ends; None takes those at the static places, the first of several at
                 one. Of one that no row was learned of, what ends have in common answers (`Common`).
         """
-        moving, static, turned, nearest = asked(self.site, tx, rx)
+        moving, static, turned, nearest = query_ends(self.site, tx, rx)
         station = self._numbers(station, nearest)
         count, longest = len(moving), max(len(each.group) for each in self._conditioned())
         parts = [
@@ -252,42 +253,39 @@ class ChannelField(ConditionalField):
     def answer(self, batch: Batch) -> Posterior:
         """Answer rows of known stations, in the phase and level of their runs."""
         found = self(batch.tx, batch.rx, batch.station)
-        if len(self.runs) == 1:
-            return found
-        factor = self.runs.of(batch.run).to(found.mean.device)
-        turned = factor[:, None, None].to(found.mean.dtype)
-        explained = None if found.explained is None else found.explained * turned
-        variance = found.variance * factor.abs().square().float()
-        return replace(found, mean=found.mean * turned, variance=variance, explained=explained)
+        turned: Posterior = self.runs.restored(found, batch.run)
+        if turned is found or found.explained is None:
+            return turned
+        return replace(turned, explained=found.explained * self.runs.factor(found.mean, batch.run))
 
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
-        shape, values, size = self.shape, self._held, math.prod(self.channel)
+        values, size = self._constants, math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
         share = torch.zeros_like(mean) if self.count else mean
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
-        disturbed = sum(shape.of(name, values.power).sum() for name in ("noise", "fast", "drift"))
+        disturbed = sum(values.of(name).sum() for name in ("noise", "fast", "drift"))
         for alike in self._by_places(moving, turned, station):
             slots, places, learned = (
                 [one.group.slot for one, _, _ in alike],
                 alike[0][2],
                 alike[0][0].group.places,
             )
-            powers = directional(shape, values, slots)
-            fields = diffuse_of(shape, values, slots[0].wavenumber, powers, places, learned)
+            powers = directional(values, slots)
+            fields = diffuse_of(values, slots[0].wavenumber, powers, places, learned)
             for number, (known, here, _) in enumerate(alike):
                 slot = slots[number]
-                cross = fields[min(number, len(fields) - 1)] + specular(shape, values, slot, places, learned)
+                cross = fields[min(number, len(fields) - 1)] + specular(values, slot, places, learned)
                 slot.put(mean, here, known.given.mean(cross))
                 if self.count:
-                    slot.put(share, here, known.given.mean(explained(shape, values, slot, places, learned)))
-                told = known.given.known(cross) if exact else known.learned(cross)
+                    slot.put(share, here, known.given.mean(explained(values, slot, places, learned)))
+                removed = known.given.known(cross) if exact else known.learned(cross)
                 weight = known.scale * known.group.target.shape[1] / size
-                whole = prior(shape, values, slot, places) + disturbed
-                after.index_add_(0, here, weight * (whole - told).clamp_min(0))
+                whole = prior(values, slot, places) + disturbed
+                after.index_add_(0, here, weight * (whole - removed).clamp_min(0))
                 before.index_add_(0, here, weight * whole)
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
         for place in static[unheard].detach().unique(dim=0):
@@ -306,8 +304,8 @@ class ChannelField(ConditionalField):
                 slot, learned = known.group.slot, known.group
                 places = slot.places(moving[here], turned[here])
                 first = numbers(learned.places)[0].tobytes()
-                asked_at = numbers(places).tobytes()
-                key = (slot.wavenumber, learned.displacements, first, asked_at)
+                queried = numbers(places).tobytes()
+                key = (slot.wavenumber, learned.displacements, first, queried)
                 found.setdefault(key, []).append((known, here, places))
         return list(found.values())
 
@@ -323,12 +321,12 @@ class ChannelField(ConditionalField):
     ) -> None:
         """Write what ends have in common for queries `here` of a static end at `place` (3,)."""
         assert self.common is not None
-        size, values = math.prod(self.channel), self._held
+        size, values = math.prod(self.channel), self._constants
         for template in next(iter(self.stations.values())):
             slot = template.group.slot
             slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
             places = slot.places(moving[here], turned[here])
-            found, variance, prior_variance = self.common.at(self.shape, values, slot, places)
+            found, variance, prior_variance = self.common.at(values, slot, places)
             outputs = template.group.target.shape[1]
             slot.put(mean, here, found[:, None].expand(-1, outputs))
             after.index_add_(0, here, variance * outputs / size)
@@ -339,13 +337,13 @@ class ChannelField(ConditionalField):
 
         What rows have in common by their order alone is not predicted: no query has it.
         """
-        shape, values = self.shape, self.values
+        values = self.values
         mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
         variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
         with torch.no_grad():
             for known in self._conditioned():
                 group, outputs = known.group, known.group.target.shape[1]
-                other = disturbance(shape, values, group).to(torch.complex128)
+                other = disturbance(values, group).to(torch.complex128)
                 residual, error = known.given.left_out_signal(other)
                 assert error is not None
                 predicted = group.target - residual
@@ -387,11 +385,10 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
     shape, kept = dict(state["shape"]), state["values"]
     shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
-    lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
-    some = {name: kept[name] for name in ("towards", "planes") if name in kept}  # what is learned
-    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], **some)
+    learned = {name: kept[name] for name in ("offset", "towards", "planes") if name in kept}
+    logs = {name: kept[f"log_{name}"].exp() for name in ("power", "envelope", "gain")}
     antennas, tones = (int(n) for n in state["channel"])
-    field = ChannelField(site, Shape(**shape), values, (antennas, tones))
+    field = ChannelField(site, Values(**shape, **learned, **logs), (antennas, tones))
     with torch.no_grad():
         for name, parameter in field.named_parameters():
             parameter.copy_(kept[name])
@@ -402,14 +399,10 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     return field
 
 
-def _covariances(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+def _covariances(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
     """(n, n) complex128 of each group's rows with what disturbs them, relative to its scale."""
-    return [
-        field
-        + specular(shape, values, group.slot, group.places, group.places)
-        + disturbance(shape, values, group)
-        for field, group in zip(diffuse_fields(groups, shape, values), groups, strict=True)
-    ]
+    both = zip(signals(groups, values), groups, strict=True)
+    return [signal + disturbance(values, group) for signal, group in both]
 
 
 def _stored(slot: Slot) -> dict[str, Any]:

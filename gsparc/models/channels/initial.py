@@ -9,27 +9,27 @@ cells of nearby places and in 8. Powers of many directions fit any field: theirs
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import POSITIVE, Checked, setting, switch, whole
 from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
 from gsparc.models.channels.columns import Group, ends_of, gather, run_factors_of, thinned
 from gsparc.models.channels.complex_gp import CHOSEN_ON, LENGTHS, NOISES
-from gsparc.models.channels.covariance import BEYOND, Shape, Values, disturbance
+from gsparc.models.channels.covariance import BEYOND, Values, disturbance, signals
 from gsparc.models.channels.evidence import (
+    Cache,
     Compressed,
-    Kept,
+    Grouping,
     compressed,
     compressible,
     evidence,
     fit_powers,
-    left_out_cells,
+    left_out,
     normalised,
     without,
 )
@@ -40,6 +40,7 @@ from gsparc.models.channels.probe import best_offset
 from gsparc.models.haste import factor_s
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import groups_of
 from gsparc.processes.worker import Cancelled, cancelled_by
 from gsparc.training.time_budget import TimeBudget
 
@@ -66,7 +67,7 @@ NO_WORSE = 1.1  # largest of any one of them
 
 
 @dataclass(frozen=True)
-class ChannelSettings(Checked):
+class ChannelSettings:
     """Terms that are tried beside the isotropic diffuse field, and what they are learned on.
 
     Attributes:
@@ -82,16 +83,16 @@ class ChannelSettings(Checked):
         mirrors: planes that several static ends share, at most; 0 for none.
     """
 
-    constant: bool = setting(True, switch())
-    direct: bool = setting(True, switch())
-    directions: bool = setting(True, switch())
-    correlated: bool = setting(True, switch())
-    angles: int = setting(24, whole(4, 200))
-    rows: int = setting(400, whole(8))
-    tied: int = setting(64, whole(4, 500))
-    narrow: float = setting(16.0, POSITIVE)
-    knots: int = setting(9, whole(2, 100))
-    mirrors: int = setting(8, whole(0, 32))
+    constant: bool = True
+    direct: bool = True
+    directions: bool = True
+    correlated: bool = True
+    angles: int = 24
+    rows: int = 400
+    tied: int = 64
+    narrow: float = 16.0
+    knots: int = 9
+    mirrors: int = 8
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,6 @@ class Candidate:
         errors: squared errors, left out one by one and in the cells of `DEPTHS`, relative to the power.
     """
 
-    shape: Shape
     values: Values
     nll: float
     errors: np.ndarray
@@ -137,16 +137,14 @@ def initialise(
     search = _Search.of(data, rows, settings, start, factors)
     best, more = search.run(budget)
     channel = (int(data.target.shape[1]), int(data.target.shape[2]))
-    field = ChannelField(data.site, best.shape, best.values, channel)
+    field = ChannelField(data.site, best.values, channel)
     field.condition(data, rows)
     # Steps on a few rows of each end would find less than the likelihood of all of them has.
     field.requires_grad_(ends_of(search.every) == 1)
     return field, (*notes, *more)
 
 
-def _isotropic(
-    data: Measurements, rows: np.ndarray, budget: TimeBudget
-) -> tuple[tuple[Shape, Values], Tensor, list[str]]:
+def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[Values, Tensor, list[str]]:
     """Envelope and noise on the grid of `complex_gp`, and the factors of runs, as measured."""
     groups = gather(data, rows, False)
     looked = thinned(groups, 8, CHOSEN_ON)
@@ -169,13 +167,21 @@ def _isotropic(
     _, factors, length, noise = min(tried, key=lambda t: t[0])
     everywhere = torch.cat([group.places for group in groups])
     extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
-    none, reach = torch.zeros(0, 3, dtype=torch.float64), BEYOND * max(extent, wavelength)
-    shape = Shape(none, CONCENTRATION, False, False, False, everywhere.mean(0), reach)
-    one = torch.tensor([1.0, noise], dtype=torch.float64)
-    lengths = torch.tensor(length).double(), torch.tensor(GAINS[0] * wavelength).double()
-    values = Values(one, *lengths, torch.zeros(3, dtype=torch.float64))
+    values = Values(
+        angles=torch.zeros(0, 3, dtype=torch.float64),
+        concentration=CONCENTRATION,
+        constant=False,
+        direct=False,
+        correlated=False,
+        middle=everywhere.mean(0),
+        reach=BEYOND * max(extent, wavelength),
+        power=torch.tensor([1.0, noise], dtype=torch.float64),
+        envelope=torch.tensor(length).double(),
+        gain=torch.tensor(GAINS[0] * wavelength).double(),
+        offset=torch.zeros(3, dtype=torch.float64),
+    )
     note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
-    return (shape, values), factors, [note]
+    return values, factors, [note]
 
 
 def _grid_point(
@@ -193,23 +199,28 @@ def _grid_point(
     return nll, factors
 
 
-def _strongest(shape: Shape, values: Values) -> tuple[Shape, Values]:
+def _strongest(values: Values) -> Values:
     """What all directions have in common, and weak ones, made part of the isotropic field."""
-    power, numbers = values.power, shape.where("direction")
+    power, numbers = values.power, values.where("direction")
     beyond = power[numbers] - power[numbers].min()
-    everywhere = power[shape.where("isotropic") + numbers].sum()
+    everywhere = power[values.where("isotropic") + numbers].sum()
     strong = beyond > WEAKEST * everywhere
     isotropic_power = everywhere - beyond[strong].sum()
     rest = power[len(numbers) + 1 :]
     kept = torch.cat([isotropic_power[None], beyond[strong], rest])
-    return replace(shape, angles=shape.angles[strong]), replace(values, power=kept)
+    return replace(values, angles=values.angles[strong], power=kept)
+
+
+def _groupings(places: Tensor) -> list[Grouping]:
+    """Rows (n,) left out one by one, then in the cells of each of `DEPTHS`."""
+    deep = [groups_of(cells(places.numpy(), depth)) for depth in DEPTHS]
+    return [None, *(groups if len(groups) < len(places) else None for groups in deep)]
 
 
 def _left_out(part: Compressed, power: Tensor) -> np.ndarray:
     """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
-    places = part.group.places.numpy()
-    grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
-    return np.stack([left_out_cells(part, power, cell).abs().square().mean(1).numpy() for cell in grouping])
+    errors = left_out(part, power, _groupings(part.group.places))
+    return np.stack([error.abs().square().mean(1).numpy() for error in errors])
 
 
 @dataclass(frozen=True)
@@ -219,30 +230,30 @@ class _Search:
     settings: ChannelSettings
     groups: tuple[Group, ...]
     every: tuple[Group, ...]
-    start: tuple[Shape, Values]
+    start: Values
     wavelength: float
-    kept: Kept
+    cache: Cache = field(default_factory=dict)
 
     @staticmethod
     def of(
         data: Measurements,
         rows: np.ndarray,
         settings: ChannelSettings,
-        start: tuple[Shape, Values],
+        start: Values,
         factors: Tensor,
     ) -> _Search:
         every = gather(data, rows, True)
         every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
         groups = thinned(every, COLUMNS, settings.rows)
-        if not compressible(groups[0], *start):
+        if not compressible(groups[0], start):
             groups = thinned(every, DENSE_COLUMNS, min(settings.rows, DENSE_ROWS))
         wavelength = 2 * math.pi / every[0].slot.wavenumber
-        return _Search(settings, groups, every, start, wavelength, Kept())
+        return _Search(settings, groups, every, start, wavelength)
 
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes; what the seconds end is as if it had not been tried."""
         notes: list[str] = []
-        kept = [self._measured(*self.start, self._compressed(*self.start))]
+        kept = [self._measured(self.start, self._compressed(self.start))]
         longest = max(len(group) for group in self.every)
         reserve = WEIGHTS * len(self.every) * factor_s(longest)  # for the weights in the end
         end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
@@ -260,15 +271,13 @@ class _Search:
         def step(after: Candidate, name: str) -> None:
             kept.append(self._step(kept[-1], after, name, notes))
 
-        step(self._fitted(*self.start), "powers by likelihood")
-        one_end = (
-            self.every[0].places.shape[1] == 3
-        )  # where both move, what waves have in common is not known
+        step(self._fitted(self.start), "powers by likelihood")
+        one_end = self.one_end  # where both move, what waves have in common is not known
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
             step(self._with_fixed(kept[-1], direct, budget), "leakage and direct wave")
-        if wanted.mirrors and kept[-1].shape.direct and ends_of(self.every) > 1:
+        if wanted.mirrors and kept[-1].values.direct and ends_of(self.every) > 1:
             mirrored = self._with_mirrors(kept[-1], budget)
             if mirrored is not None:
                 step(mirrored, f"mirror planes of all ends ({len(mirrored.values.planes)})")
@@ -289,111 +298,110 @@ class _Search:
         )
         return after if keep else before
 
-    def _compressed(self, shape: Shape, values: Values) -> tuple[Compressed, ...]:
-        return compressed(self.groups, shape, values, self.kept)
+    def _compressed(self, values: Values) -> tuple[Compressed, ...]:
+        return compressed(self.groups, values, self.cache)
 
-    def _measured(self, shape: Shape, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
+    def _measured(self, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
         """With what left-out rows say."""
         own = [part.own(values.power, values.towards) for part in parts]
         errors = np.mean(
             [_left_out(part, power).mean(1) for part, power in zip(parts, own, strict=True)], axis=0
         )
-        nll = evidence(parts, values) + self._worth(shape, values)
-        return Candidate(shape, values, nll, errors)
+        nll = evidence(parts, values) + self._worth(values)
+        return Candidate(values, nll, errors)
 
-    def _fitted(self, shape: Shape, values: Values) -> Candidate:
+    def _fitted(self, values: Values) -> Candidate:
         """With powers of largest evidence; measured."""
-        parts = self._compressed(shape, values)
-        return self._measured(shape, fit_powers(parts, shape, values, SHRINKAGE)[0], parts)
+        parts = self._compressed(values)
+        return self._measured(fit_powers(parts, values, SHRINKAGE)[0], parts)
 
-    def _worth(self, shape: Shape, values: Values) -> float:
+    def _worth(self, values: Values) -> float:
         """What the terms beside the isotropic field must gain [nats]."""
-        parameters = len(shape.names) - 2 + shape.direct + 3 * bool(values.offset.any()) + len(values.towards)
+        parameters = (
+            len(values.names) - 2 + values.direct + 3 * bool(values.offset.any()) + len(values.towards)
+        )
         parameters += 3 * len(values.planes)
         numbers = sum(2 * group.target.numel() for group in self.groups)
         return 0.5 * parameters * math.log(numbers)
 
-    def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
-        """With leakage and the direct wave; the best of a few lengths."""
-        one_end = self.every[0].places.shape[1] == 3
-        shape = replace(before.shape, constant=self.settings.constant and one_end, direct=direct)
-        return self._moved(self._of_lengths(shape, before.values, before.shape, direct, budget))
+    @property
+    def one_end(self) -> bool:
+        """Whether one end stands."""
+        return self.every[0].places.shape[1] == 3
 
-    def _of_lengths(
-        self, shape: Shape, values: Values, old: Shape, gains: bool, budget: TimeBudget
-    ) -> Candidate:
-        """Lengths of the envelope and of gains from a short fit each, then powers."""
-        powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
-        start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
+    def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
+        """With leakage and the direct wave; lengths by a short fit each, then powers."""
+        old = before.values
+        values = replace(old, constant=self.settings.constant and self.one_end, direct=direct)
+        powers = {name: float(old.of(name).sum()) for name in old.names}
+        start = [powers.get(name, NEW * powers["isotropic"]) for name in values.names]
         values = replace(values, power=torch.tensor(start, dtype=torch.float64))
         tried: list[tuple[Values, float]] = []
         for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
-            for gain in GAINS if gains else GAINS[:1]:
+            for gain in GAINS if direct else GAINS[:1]:
                 if tried and budget.over(LENGTHS_SHARE):
                     break
                 lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
                 trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
-                tried.append(fit_powers(self._compressed(shape, trial), shape, trial, 0.0, SHORT))
-        return self._fitted(shape, min(tried, key=lambda each: each[1])[0])
+                tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
+        return self._moved(self._fitted(min(tried, key=lambda each: each[1])[0]))
 
     def _moved(self, found: Candidate) -> Candidate:
         """With static ends where they really are."""
-        shape, values = found.shape, found.values
-        if not shape.direct or self.every[0].places.shape[1] > 3:
+        values = found.values
+        if not values.direct or not self.one_end:
             return found
-        offset = best_offset(self._compressed(shape, values), shape, values, self.wavelength)
+        offset = best_offset(self._compressed(values), values, self.wavelength)
         if offset is None:
             return found
-        moved = self._fitted(shape, replace(values, offset=offset))
+        moved = self._fitted(replace(values, offset=offset))
         return moved if moved.nll < found.nll else found
 
     def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
-        shape, values = before.shape, before.values
-        late = budget.over
+        values, late = before.values, budget.over
         if math.isfinite(budget.seconds):
             until = budget.spent + MIRRORS_SHARE * max(budget.seconds - budget.spent, 0.0)
             late = partial(budget.over, until / max(budget.seconds, 1e-9))
-        rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(shape, values)
+        rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(values)
         wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
-        parts = wide._compressed(shape, values)
-        planes, sequences = find_mirrors(
-            rough, parts, shape, values, self.wavelength, self.settings.mirrors, late
-        )
+        parts = wide._compressed(values)
+        most = self.settings.mirrors
+        planes, sequences = find_mirrors(rough, parts, values, self.wavelength, most, late)
         if not sequences:
             return None
-        power, end = values.power, shape.where("noise")[0]
-        level = NEW * float(shape.of("isotropic", power)[0])
-        shape = replace(shape, sequences=sequences)
-        fresh = torch.full((len(shape.names) - len(power),), level, dtype=torch.float64)
+        power, end = values.power, values.where("noise")[0]
+        level = NEW * float(values.of("isotropic")[0])
+        fresh = torch.full((2 * len(sequences),), level, dtype=torch.float64)
         power = torch.cat([power[:end], fresh, power[end:]])
-        return self._without_weak(self._fitted(shape, replace(values, planes=planes, power=power)))
+        mirrored = replace(values, sequences=sequences, planes=planes, power=power)
+        return self._without_weak(self._fitted(mirrored))
 
     def _without_weak(self, found: Candidate) -> Candidate:
         """Without the images that have no power."""
-        shape, values, power = found.shape, found.values, found.values.power
-        fixed, varying = (torch.tensor(shape.where(name)) for name in ("source", "source_smooth"))
+        values, power = found.values, found.values.power
+        fixed, varying = (torch.tensor(values.where(name)) for name in ("source", "source_smooth"))
         heard = power[fixed] + power[varying] > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
             return found
         silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
         rest = power[[i for i in range(len(power)) if i not in silent]]
-        seen = tuple(one for one, has in zip(shape.sequences, heard.tolist(), strict=True) if has)
-        return self._fitted(replace(shape, sequences=seen), replace(values, power=rest))
+        seen = tuple(one for one, has in zip(values.sequences, heard.tolist(), strict=True) if has)
+        return self._fitted(replace(values, sequences=seen, power=rest))
 
     def _with_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
-        shape, values = self._directed(before, self.settings.angles, CONCENTRATION)
-        parts = self._compressed(shape, values)
-        errors = self._crossed(parts, shape, values)
-        values, _ = fit_powers(parts, shape, values, SHRINKAGE, 2 * SHORT)
-        found = self._fitted(*_strongest(shape, values))
+        values = self._directed(before, self.settings.angles, CONCENTRATION)
+        parts = self._compressed(values)
+        errors = self._crossed(parts, values)
+        values, _ = fit_powers(parts, values, SHRINKAGE, 2 * SHORT)
+        found = self._fitted(_strongest(values))
         return replace(found, errors=np.maximum(found.errors, errors))
 
     def _of_all_ends(self, kept: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
         wide, before = replace(self, groups=thinned(self.every, ENDS, self.settings.rows)), kept[-1]
-        kept.append(wide._fitted(before.shape, before.values))
+        kept.append(wide._fitted(before.values))
         kept.append(wide._moved(kept[-1]))
         if known and self.settings.directions:
             kept.append(
@@ -402,47 +410,45 @@ class _Search:
 
     def _with_tied(self, before: Candidate) -> Candidate:
         """With powers of directions that depend on room and angle to the end, all equal at first."""
-        shape, values = self._directed(before, self.settings.tied, self.settings.narrow)
+        values = self._directed(before, self.settings.tied, self.settings.narrow)
         towards = torch.zeros(self.settings.knots, dtype=torch.float64)
-        return self._fitted(shape, replace(values, towards=towards))
+        return self._fitted(replace(values, towards=towards))
 
-    def _directed(self, before: Candidate, count: int, concentration: float) -> tuple[Shape, Values]:
+    def _directed(self, before: Candidate, count: int, concentration: float) -> Values:
         """With so many directions in place of those there are, of equal powers."""
-        group, old, power = max(self.groups, key=len), len(before.shape.angles), before.values.power
+        group, old, power = max(self.groups, key=len), len(before.values.angles), before.values.power
         angles = directions(group.places, group.slot.wavenumber, count)
         level = float(power[: 1 + old].sum())
         fresh = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
-        values = replace(before.values, power=torch.cat([fresh, power[1 + old :]]))
-        return replace(before.shape, angles=angles, concentration=concentration), values
+        power = torch.cat([fresh, power[1 + old :]])
+        return replace(before.values, angles=angles, concentration=concentration, power=power)
 
-    def _crossed(self, parts: tuple[Compressed, ...], shape: Shape, values: Values) -> np.ndarray:
+    def _crossed(self, parts: tuple[Compressed, ...], values: Values) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
         number = [cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
         errors = np.zeros(1 + len(DEPTHS))
         for fold in range(FOLDS):
-            held = [np.equal(each, fold) for each in number]
+            in_fold = [np.equal(each, fold) for each in number]
             rest = tuple(
-                without(part, torch.from_numpy(left)) for part, left in zip(parts, held, strict=True)
+                without(part, torch.from_numpy(left)) for part, left in zip(parts, in_fold, strict=True)
             )
-            power = fit_powers(rest, shape, values, SHRINKAGE, 2 * SHORT)[0].power
-            for part, left in zip(parts, held, strict=True):
+            power = fit_powers(rest, values, SHRINKAGE, 2 * SHORT)[0].power
+            for part, left in zip(parts, in_fold, strict=True):
                 errors += _left_out(part, power)[:, left].sum(1) / len(left) / len(parts)
         return errors
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
         groups = drift.contiguous_rows(self.every)
-        signals = drift.signals_of(groups, before.shape, before.values)
-        shape, values, gain = drift.with_drift(groups, signals, before.shape, before.values)
-        errors = [np.zeros(1 + len(DEPTHS)), np.zeros(1 + len(DEPTHS))]
-        for group, signal in zip(groups, signals, strict=True):
-            places = group.places.numpy()
-            grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
-            for found, of, at in zip(errors, (before.shape, shape), (before.values, values), strict=True):
-                other = disturbance(of, at, group)
-                left = drift.left_out_cells(group, signal, other, grouping)
+        known = signals(groups, before.values)
+        values, gain = drift.with_drift(groups, known, before.values)
+        errors = np.zeros((2, 1 + len(DEPTHS)))
+        for group, signal in zip(groups, known, strict=True):
+            for found, at in zip(errors, (before.values, values), strict=True):
+                other = disturbance(at, group).to(torch.complex128)
+                given = Conditioned.of(signal + other, group.target)
+                left = [given.left_out_signal(other, rows)[0] for rows in _groupings(group.places)]
                 found += [float(error.abs().square().mean()) / len(groups) for error in left]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
-        known = replace(before, nll=0.0, errors=errors[0])
-        after = Candidate(shape, values, worth - gain, errors[1])
-        kept = self._step(known, after, "noise correlated over rows", notes)
-        return after if kept is after else before
+        after = Candidate(values, worth - gain, errors[1])
+        start = replace(before, nll=0.0, errors=errors[0])
+        return after if self._step(start, after, "noise correlated over rows", notes) is after else before

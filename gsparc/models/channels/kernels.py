@@ -31,11 +31,6 @@ def smooth(distance: Tensor, length: Tensor | float) -> Tensor:
     return torch.exp(-0.5 * (distance / length).square())
 
 
-def isotropic(distance: Tensor, wavenumber: float) -> Tensor:
-    """sin(kd) / (kd), float64."""
-    return torch.sinc(distance * (wavenumber / math.pi))
-
-
 def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
     """Correlation (...) complex128 of waves that come from about one direction.
 

@@ -9,14 +9,14 @@ to where the likelihood is largest, and one by one kept while it rises by more t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import permutations
 
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.covariance import Shape, Values, image_waves
+from gsparc.models.channels.covariance import Values, image_waves
 from gsparc.models.channels.evidence import Compressed
 from gsparc.models.channels.probe import Probe, summed_gains
 from gsparc.physics.mirror_planes import Reflections, images
@@ -35,44 +35,52 @@ LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not wort
 PARAMETERS = 4  # of a plane: two angles, an offset and a power
 SAME = 0.25  # wavelengths between images of two sequences that are one
 
+Probes = tuple[Probe, ...]
 
-@dataclass(frozen=True)
+
 class _Searcher:
-    shape: Shape
-    values: Values
-    wavelength: float
-    ends: Tensor
+    """Planes and images that are kept, and probes of few rows of few ends (`rough`) and of all with them."""
+
+    def __init__(self, rough: Probes, probes: Probes, values: Values, wavelength: float) -> None:
+        self.rough, self.probes, self.wavelength = rough, probes, wavelength
+        self.values = values
+        self.ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
+        self.planes, self.sequences, self.risen = values.planes[:0], list[Reflections](), 0.0
 
     def waves(self, probe: Probe, planes: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """(W, n) of images in planes (P, 4)."""
-        shape, values = replace(self.shape, sequences=sequences), replace(self.values, planes=planes)
-        return image_waves(shape, values, probe.group.slot, probe.group.places)
+        values = replace(self.values, sequences=sequences, planes=planes)
+        return image_waves(values, probe.group.slot, probe.group.places)
 
     def gains(
-        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...],
+        self, probes: Probes, planes: Tensor, sequences: tuple[Reflections, ...],
         known: Callable[[Probe, Tensor], Tensor] = Probe.known,
     ) -> Tensor:  # fmt: skip
         """Rise of the log likelihood (W, levels) of each sequence alone."""
 
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
-            chosen = tuple(sequences[i] for i in chunk.tolist())
-            near = {index: i for i, index in enumerate(dict.fromkeys(sum(chosen, ())))}
-            renamed = tuple(tuple(near[index] for index in sequence) for sequence in chosen)
-            return self.waves(probe, planes[list(near)], renamed)
+            return self.waves(probe, planes, tuple(sequences[i] for i in chunk.tolist()))
 
         return summed_gains(probes, len(sequences), waves, LEVELS, known)
 
-    def added(
-        self, probes: tuple[Probe, ...], planes: Tensor, sequence: Reflections, level: float
-    ) -> tuple[Probe, ...]:
-        """With an image among the terms."""
-        return tuple(probe.added(self.waves(probe, planes, (sequence,))[0], level) for probe in probes)
+    def best(self, planes: Tensor, sequences: tuple[Reflections, ...]) -> tuple[int, float, float]:
+        """Number of the best sequence, its level, and what it gains [nats]."""
+        gains = self.gains(self.probes, planes, sequences)
+        number = int(gains.argmax()) // len(LEVELS)
+        return number, LEVELS[int(gains[number].argmax())], float(gains[number].max())
 
-    def is_new(
-        self, planes: Tensor, sequences: list[Reflections] | tuple[Reflections, ...], least: float
-    ) -> bool:
+    def keep(self, planes: Tensor, sequence: Reflections, level: float, gain: float) -> None:
+        """One more image, in planes of which the last may be new."""
+        self.rough, self.probes = (
+            tuple(probe.added(self.waves(probe, planes, (sequence,))[0], level) for probe in each)
+            for each in (self.rough, self.probes)
+        )
+        self.planes, self.risen = planes, self.risen + gain
+        self.sequences.append(sequence)
+
+    def is_new(self, planes: Tensor, sequences: Sequence[Reflections], least: float) -> bool:
         """Whether the last image of some end is at least so many wavelengths from that in each other."""
-        placed = images(self.ends, planes, sequences)
+        placed = images(self.ends, planes, list(sequences))
         away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
         return not bool((away < least * self.wavelength).any())
 
@@ -86,50 +94,36 @@ class _Searcher:
                 break
         return chosen
 
-    def best(
-        self, probes: tuple[Probe, ...], planes: Tensor, sequences: tuple[Reflections, ...]
-    ) -> tuple[int, float, float]:
-        """Number of the best sequence, its level, and what it gains [nats]."""
-        gains = self.gains(probes, planes, sequences)
-        number = int(gains.argmax()) // len(LEVELS)
-        return number, LEVELS[int(gains[number].argmax())], float(gains[number].max())
-
-    def moved(self, probes: tuple[Probe, ...], plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
+    def moved(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
         """A plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
-        middle, shift = self.shape.middle, STEP * self.wavelength / 2
+        middle, shift = self.values.middle, STEP * self.wavelength / 2
         across = torch.linalg.cross(plane[:3], torch.tensor([0.0, 0.0, 1.0]).double())
         if float(across.norm()) < 0.5:
             across = torch.tensor([1.0, 0.0, 0.0]).double()
-        level, gain = LEVELS[0], -math.inf
         axes = torch.stack([across, torch.linalg.cross(plane[:3], across)])
-        for _ in range(REFINED):
-            steps = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
-            moves = torch.cartesian_prod(steps, steps, steps)
-            normal = plane[:3] + turn * moves[:, :2] @ axes
+        steps = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
+        moves = torch.cartesian_prod(steps, steps, steps)
+        for halving in range(REFINED):
+            share = 0.5**halving
+            normal = plane[:3] + share * turn * moves[:, :2] @ axes
             normal = normal / normal.norm(dim=1, keepdim=True)
-            away = plane[3] - plane[:3] @ middle + shift * moves[:, 2]
+            away = plane[3] - plane[:3] @ middle + share * shift * moves[:, 2]
             tried = torch.cat([normal, (away + normal @ middle)[:, None]], 1)
-            number, level, gain = self.best(probes, tried, _single(len(tried)))
+            number, level, gain = self.best(tried, _single(len(tried)))
             plane = tried[number]
-            turn, shift = turn / 2, shift / 2
         return plane, level, gain
 
 
 def find_mirrors(
-    coarse: tuple[Compressed, ...],
-    parts: tuple[Compressed, ...],
-    shape: Shape,
-    values: Values,
-    wavelength: float,
-    most: int,
-    late: Callable[[], bool] = lambda: False,
-) -> tuple[Tensor, tuple[Reflections, ...]]:
+    coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], values: Values,
+    wavelength: float, most: int, late: Callable[[], bool],
+) -> tuple[Tensor, tuple[Reflections, ...]]:  # fmt: skip
     """Planes (W, 4) float64, local, and images in them; none where all together are not worth it.
 
     Args:
         coarse: few rows of few ends, for the grid.
         parts: of all ends.
-        shape, values: the terms beside.
+        values: the terms beside.
         wavelength: [m].
         most: planes.
         late: asked again and again; nothing new is tried when it says so.
@@ -138,59 +132,48 @@ def find_mirrors(
         tuple(Probe.of(part, part.own(values.power, values.towards)) for part in each)
         for each in (coarse, parts)
     )
-    ends = torch.stack([part.group.slot.end for part in parts]) + values.offset
-    search = _Searcher(shape, values, wavelength, ends)
+    search = _Searcher(rough, probes, values, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
-    grid, turn = candidates(rough, shape, values, wavelength)
-    planes, sequences, risen = grid[:0], list[Reflections](), 0.0
-    while len(planes) < most and not late():
-        scores = search.gains(rough, grid, _single(len(grid)), _about).max(1).values
-        if not len(planes):
+    grid, turn = candidates(rough, values, wavelength)
+    while len(search.planes) < most and not late():
+        scores = search.gains(search.rough, grid, _single(len(grid)), _about).max(1).values
+        if not len(search.planes):
             kept = scores.topk(min(PROMISING, len(grid))).indices
             grid, scores = grid[kept], scores[kept]
-        starts = search.starts(grid, scores)
-        plane, level, gain = max((search.moved(probes, at, turn / 2) for at in starts), key=lambda m: m[2])
+        moved = [search.moved(start, turn / 2) for start in search.starts(grid, scores)]
+        plane, level, gain = max(moved, key=lambda m: m[2])
         if gain < PARAMETERS * worth:
             break
-        planes, risen = torch.cat([planes, plane[None]]), risen + gain
-        fresh = (len(planes) - 1,)
-        rough, probes = (search.added(each, planes, fresh, level) for each in (rough, probes))
-        sequences.append(fresh)
-    pairs = list(permutations(range(len(planes)), 2))
-    while pairs and not late():
-        pairs = [pair for pair in pairs if search.is_new(planes, [*sequences, pair], SAME)]
+        search.keep(torch.cat([search.planes, plane[None]]), (len(search.planes),), level, gain)
+    planes, pairs = search.planes, list(permutations(range(len(search.planes)), 2))
+    while not late():
+        pairs = [pair for pair in pairs if search.is_new(planes, [*search.sequences, pair], SAME)]
         if not pairs:
             break
-        number, level, gain = search.best(probes, planes, tuple(pairs))
+        number, level, gain = search.best(planes, tuple(pairs))
         if gain < 2 * worth:
             break
-        probes = search.added(probes, planes, pairs[number], level)
-        sequences.append(pairs.pop(number))
-        risen += gain
-    return (planes, tuple(sequences)) if 2 * risen > LEAST * numbers else (planes[:0], ())
+        search.keep(planes, pairs.pop(number), level, gain)
+    return (planes, tuple(search.sequences)) if 2 * search.risen > LEAST * numbers else (planes[:0], ())
 
 
-def candidates(
-    probes: tuple[Probe, ...], shape: Shape, values: Values, wavelength: float
-) -> tuple[Tensor, float]:
+def candidates(probes: Probes, values: Values, wavelength: float) -> tuple[Tensor, float]:
     """Upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
     places = torch.cat([probe.group.places for probe in probes])
-    ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
-    points = torch.cat([places, ends])
+    points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + values.offset])
     extent = float(torch.linalg.vector_norm(places.amax(0) - places.amin(0)))
     count = min(max(math.ceil(2 * math.pi**2 * extent / wavelength / TURN_RAD), 4), MOST_TURNS)
     azimuth = torch.arange(4 * math.ceil(count / 4), dtype=torch.float64)
     turn = math.pi / len(azimuth)
-    upright = torch.stack([(azimuth * turn).cos(), (azimuth * turn).sin(), 0 * azimuth], 1)
+    normals = torch.stack([(azimuth * turn).cos(), (azimuth * turn).sin(), 0 * azimuth], 1)
     found = []
-    for normal in torch.cat([upright, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)]):
-        along = points @ normal
-        low, high = float(along.min()), float(along.max())
-        margin = max(MARGIN * (high - low), LEAST_MARGIN_M)
-        number = min(max(int((high - low + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
-        offsets = torch.linspace(low - margin, high + margin, number, dtype=torch.float64)
-        offsets = offsets[(offsets - shape.middle @ normal).abs() > STEP * wavelength]
+    for normal in torch.cat([normals, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)]):
+        low, high = (points @ normal).aminmax()
+        margin = max(MARGIN * float(high - low), LEAST_MARGIN_M)
+        number = min(max(int((float(high - low) + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
+        offsets = torch.linspace(float(low) - margin, float(high) + margin, number, dtype=torch.float64)
+        offsets = offsets[(offsets - values.middle @ normal).abs() > STEP * wavelength]
         found.append(torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1))
     return torch.cat(found), turn
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.covariance import Shape, Values, direct_wave
+from gsparc.models.channels.covariance import Values, direct_wave
 from gsparc.models.channels.evidence import Compressed, solved
 from gsparc.processes.factor import Factor
 
@@ -28,7 +28,7 @@ class Probe:
         group: whose, with targets of unit mean square.
         basis: B (n, r) complex128, outside of which there is noise alone.
         root: F (n, r) complex128.
-        taken: T (n, t) complex128, of the waves that were added.
+        downdate: T (n, t) complex128, of the waves that were added.
         alpha: (n, D) complex128, the inverse times the targets.
         noise, scale: the group's own powers.
     """
@@ -36,7 +36,7 @@ class Probe:
     group: Group
     basis: Tensor
     root: Tensor
-    taken: Tensor
+    downdate: Tensor
     alpha: Tensor
     noise: float
     scale: float
@@ -53,11 +53,11 @@ class Probe:
 
     def known(self, waves: Tensor) -> Tensor:
         """f^H C^-1 f (m,) float64 of waves (m, n)."""
-        inside, basis, taken = (
-            (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.taken)
+        inside, basis, downdate = (
+            (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.downdate)
         )
         outside = waves.abs().square().sum(1) - basis
-        return (inside + outside.clamp_min(0) / self.noise - taken).clamp_min(0)
+        return (inside + outside.clamp_min(0) / self.noise - downdate).clamp_min(0)
 
     def gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
         """Rise of the log likelihood (m,) [nats] with each of waves (m, n) complex128 alone, of some power.
@@ -70,11 +70,11 @@ class Probe:
 
     def added(self, wave: Tensor, level: float) -> Probe:
         """With a wave (n,) of some power among the terms."""
-        own = self.root @ (self.root.mH @ wave) - self.taken @ (self.taken.mH @ wave)
+        own = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
         own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
         share = level / (1 + level * float((wave.conj() @ own).real))
         alpha = self.alpha - share * own[:, None] * (wave.conj() @ self.alpha)[None]
-        return replace(self, alpha=alpha, taken=torch.cat([self.taken, share**0.5 * own[:, None]], 1))
+        return replace(self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * own[:, None]], 1))
 
 
 def summed_gains(
@@ -91,16 +91,13 @@ def summed_gains(
     return total
 
 
-def best_offset(
-    parts: tuple[Compressed, ...], shape: Shape, values: Values, wavelength: float
-) -> Tensor | None:
+def best_offset(parts: tuple[Compressed, ...], values: Values, wavelength: float) -> Tensor | None:
     """The offset (3,) float64 [m] of largest likelihood on a grid that is refined, or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """
-    power, names = values.power.clone(), shape.names
-    level = float(shape.of("direct", power).sum() + shape.of("direct_smooth", power).sum())
-    for number, name in enumerate(names):
+    power, level = values.power.clone(), float(values.of("direct").sum() + values.of("direct_smooth").sum())
+    for number, name in enumerate(values.names):
         if name in ("direct", "direct_smooth"):
             power[number] = 1e-12
     probes = [Probe.of(part, power) for part in parts]
@@ -108,7 +105,7 @@ def best_offset(
     def gain(offsets: Tensor) -> Tensor:
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
             moved = (replace(values, offset=offset) for offset in offsets[chunk])
-            return torch.stack([direct_wave(shape, at, probe.group.slot, probe.group.places) for at in moved])
+            return torch.stack([direct_wave(at, probe.group.slot, probe.group.places) for at in moved])
 
         prior = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
         return prior + summed_gains(probes, len(offsets), waves, (level,))[:, 0]

@@ -26,8 +26,9 @@ from gsparc.data.splits import Fold
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions, coherence
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse
-from gsparc.models.image_sources.gp_likelihood import steering, with_noise
+from gsparc.models.image_sources.gp_likelihood import with_noise
 from gsparc.models.image_sources.rows import Rows, gather
+from gsparc.models.image_sources.scene import steering
 from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.models.in_double import in_double
 from gsparc.models.method import LeftOut, Prediction
@@ -283,8 +284,8 @@ class DirectionalGP(FramedMethod):
         dtype = self.power.dtype
         retained = torch.zeros(0, len(flat), len(self.rows), dtype=dtype)
         if len(self.uncertain):
-            unsure, carrier = self.positions.only(self.uncertain), torch.tensor(self.frame.carrier_hz)
-            retained = coherence(unsure.phase_vectors(flat, carrier, dtype), self.phase_vectors)
+            several, carrier = self.positions.only(self.uncertain), torch.tensor(self.frame.carrier_hz)
+            retained = coherence(several.phase_vectors(flat, carrier, dtype), self.phase_vectors)
         return QueryGeometry(
             flat,
             count,

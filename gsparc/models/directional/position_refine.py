@@ -21,8 +21,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import steering, with_noise
+from gsparc.models.image_sources.gp_likelihood import with_noise
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import steering
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor

@@ -228,14 +228,14 @@ def _matching_round(rays: Rays, free: np.ndarray, error: float, rng: np.random.G
         top = int(score.argmax())
         near = left.take(left.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
         point, evidence = _refined(near, proposed[top], error)
-        taken = gain[top] > 0
+        assigned = gain[top] > 0
         if evidence >= MIN_EVIDENCE:
             found.append(point)
-            taken |= _gain(left.squared_error(point[None])[0], error) > 0
+            assigned |= _gain(left.squared_error(point[None])[0], error) > 0
         else:
             failed += 1
-        score -= gain[:, taken].sum(1)
-        gain[:, taken] = 0
+        score -= gain[:, assigned].sum(1)
+        gain[:, assigned] = 0
         score[top] = 0
     return found
 

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import steering
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import steering
 from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.worker import raise_if_cancelled
@@ -25,15 +24,6 @@ from gsparc.processes.worker import raise_if_cancelled
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
 CANDIDATES, EXACT, POLISHED = 150_000, 1_500, 40  # points drawn in the box, scored exactly, moved by ascent
 STEPS, STEP_M = 25, 0.02  # of the ascent
-
-
-@dataclass(frozen=True)
-class Detections:
-    """New sources, best first: position (m, 3) float64 [m], score (m,), amplitude (m,)."""
-
-    position: Tensor
-    score: Tensor
-    amplitude: Tensor
 
 
 # Positions (m, 3) of sources to those of their antennas (E, m, 3) [m].
@@ -96,10 +86,11 @@ def search_box(
     min_distance: float,
     limit: int,
     generator: torch.Generator,
-    spread: Spread = lambda points: points,
-) -> Detections:
+    spread: Spread,
+) -> list[tuple[Tensor, Tensor, Tensor]]:
     """The best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
 
+    Each is its place (3,) float64 [m], score () and amplitude (), the best first.
     `spread` gives the images of the static end's antennas, as `score` takes them.
     """
     drawn = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
@@ -112,7 +103,7 @@ def search_box(
     (polished,) = ascend([best], lambda position: score(rows, spread(position), conditioned)[0], rates)
     scores, amplitude = score(rows, spread(polished), conditioned)
     chosen = pick_apart(polished, scores, min_distance, limit)
-    return Detections(polished[chosen], scores[chosen], amplitude[chosen])
+    return list(zip(polished[chosen], scores[chosen], amplitude[chosen], strict=True))
 
 
 def ascend(values: list[Tensor], scores: Callable[..., Tensor], rates: list[float]) -> list[Tensor]:

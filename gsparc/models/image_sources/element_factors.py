@@ -15,45 +15,40 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.run_factors import run_factors
+from gsparc.models.image_sources.scene import Scene
 
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 
 
-def aligned(rows: Rows, factors: Tensor) -> Rows:
-    """Rows of a static array times what their antennas' channels must be multiplied by, (E,) complex64."""
-    assert rows.element is not None
-    return replace(rows, target=rows.target * factors[rows.element, None])
-
-
-def direct_path(rows: Rows, static: Tensor) -> Scene:
+def direct_path(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
     """The static end (3,) [m] alone, with its share of the power of unit rows."""
     scene = Scene(static, torch.zeros(0, 4).double(), ((),), torch.zeros(1), math.log(UNEXPLAINED))
     power = (1 - UNEXPLAINED) / scene.waves(rows).abs().square().mean()
-    return replace(scene, log_amplitude=power.sqrt().log().reshape(1))
+    return replace(scene, log_amplitude=power.sqrt().log().reshape(1), noise_floor=noise_floor)
 
 
-def element_factors(rows: Rows, scene: Scene, noise_floor: float) -> Tensor | None:
+def element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     """What channels of each antenna must be multiplied by, (E,) complex64, the first by 1; None: nothing.
 
     Args:
         rows: of a static array of E antennas, one output; those without a row are multiplied by 1.
         scene: sources known so far.
-        noise_floor: known variance of the noise, in units of the rows' power.
     """
     assert rows.array is not None and rows.element is not None
-    conditioned = Posterior(rows, scene, noise_floor).conditioned
+    scene = replace(scene, phase=None)
+    conditioned = Posterior(rows, scene).conditioned
     known, run = np.unique(rows.element.numpy(), return_inverse=True)
     inverse = conditioned.factor.inverse.to(torch.complex128).numpy()
     found = run_factors(inverse, rows.target.to(torch.complex128).numpy(), run)
     each = np.ones(len(rows.array), np.complex128)
     each[known] = found / found[0]
     factors = torch.from_numpy(each.astype(np.complex64))
-    turned = aligned(rows, factors)
-    scale = turned.target.abs().square().mean().sqrt()  # a common factor is the sources' to have
-    nll = Posterior(replace(turned, target=turned.target / scale), scene, noise_floor).nll
+    target = rows.target * factors[rows.element, None]
+    scale = target.abs().square().mean().sqrt()  # a common factor is the sources' to have
+    nll = Posterior(replace(rows, target=target / scale), scene).nll
     jacobian = 2 * float((factors.abs().log()[rows.element] - scale.log()).double().sum())
     gain = conditioned.nll - (nll - jacobian)
     cost = (len(known) - 1) * math.log(len(rows))

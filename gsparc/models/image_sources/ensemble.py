@@ -13,17 +13,18 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.search import find_clutter
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.processes.worker import Cancelled, cancelled_by
+from gsparc.processes.worker import Cancelled, cancelled_by, late_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
-QUADRATURE = 0.4  # initial `PhasedScene.quadrature`
+QUADRATURE = 0.4  # initial `Scene.quadrature`
 SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
 # Of the budget: no search starts, none adds sources, none goes on after; the rest is for the final process.
@@ -73,32 +74,30 @@ def search_many(
 
     def made(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
-        rows, over = row_sets[number], partial(budget.over, SEARCH_END)
-        rounds_over = partial(budget.over, ROUNDS_END)
-        scene = Search(rows, transmitter, settings, seed + number, rounds_over, over).run()
-        phased = PhasedScene.of(rows, scene, QUADRATURE)
-        phased = learn_visibility(rows, phased, 10, settings.visibility, noise_floor, over)
-        phased = refine(rows, phased, 20, noise_floor, late=over)
-        error = left_out_error(rows, phased, noise_floor)
-        hidden = phased.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
+        rows, last_round = row_sets[number], partial(budget.over, ROUNDS_END)
+        scene = Search(rows, transmitter, settings, seed + number, last_round).run()
+        scene = with_phases(rows, scene, QUADRATURE, noise_floor)
+        scene = refine(rows, learn_visibility(rows, scene, 10, settings.visibility), 20)
+        error = left_out_error(rows, scene)
+        hidden = scene.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
         if clutter and not hidden and compact(rows):
             generator = torch.Generator().manual_seed(seed + number)
-            phased = find_clutter(rows, phased, generator, late=over, noise_floor=noise_floor)
-            error = left_out_error(rows, phased, noise_floor)
-        return Member(phased, error, number)
+            scene = find_clutter(rows, scene, generator)
+            error = left_out_error(rows, scene)
+        return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if done := cache.find(number):
+        if done := cache.find(number, noise_floor):
             errors.append(done.left_out)
             return done
         if unwanted() or (number > 0 and budget.over(LAST_START)):
             return None
         try:
-            with cancelled_by(unwanted):
+            with cancelled_by(unwanted), late_when(partial(budget.over, SEARCH_END)):
                 member = made(number)
         except Cancelled:
             return None
-        scene = member.phased.scene
+        scene = member.scene
         log.info(
             "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
             number + 1, len(row_sets), len(scene.sequences), len(scene.planes), member.left_out,
@@ -139,15 +138,15 @@ def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
             )  # fmt: skip
 
 
-def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
+def refined(rows: Rows, member: Member) -> Member:
     """A search's result on rows that have changed a little."""
-    phased = refine(rows, member.phased, 20, noise_floor)
-    return Member(phased, left_out_error(rows, phased, noise_floor), member.number)
+    scene = refine(rows, member.scene, 20)
+    return Member(scene, left_out_error(rows, scene), member.number)
 
 
-def left_out_error(rows: Rows, phased: PhasedScene, noise_floor: float) -> float:
+def left_out_error(rows: Rows, scene: Scene) -> float:
     """NMSE of the rows, each receiver predicted from the others."""
-    error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
+    error = rows.target - Posterior(rows, scene).left_out()
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
 
@@ -166,13 +165,13 @@ def beaten(error: float, rival: float) -> bool:
     return error > BEATEN * rival
 
 
-def affordable_rows(rows: Rows, found: list[Member], noise_floor: float, budget: TimeBudget) -> int:
+def affordable_rows(rows: Rows, found: list[Member], budget: TimeBudget) -> int:
     """Rows of final processes that fit into the rest of the budget; all of one search at least.
 
     A covariance of n rows takes n^3; that of a search's rows is timed.
     """
     started = budget.spent
-    assert PhasedPosterior(rows, found[0].phased, noise_floor).conditioned
+    assert Posterior(rows, found[0].scene).conditioned
     each = max(budget.spent - started, 1e-6)
     rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
     return max(int(len(rows) * (rest / (each * len(found))) ** (1 / 3)), len(rows))

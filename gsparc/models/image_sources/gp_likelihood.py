@@ -1,129 +1,38 @@
-"""The image-source Gaussian process: likelihood of measured rows given a scene of sources.
+"""The image-source Gaussian process: likelihood of measured rows given a scene, and posterior of its gains.
 
     h(x, f) = sum_k g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,   g_k ~ GP(0, s_k^2 visibility_k(x, x'))
 
 so two rows have covariance `sum_k s_k^2 a_k a_k'* C_k + noise`, with regression as in C. E. Rasmussen
 and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), chapters 2 and 5.
+
+Once the sources are known, gains have phases: the phase of a reflection is the same at all places; what
+varies is the visible share of a source. So `g_k(x) = exp(j phi_k) (u_k(x) + j v_k(x))` with real Gaussian
+processes u_k and v_k, and nearly all the variance in u_k: a share `quadrature / 2` is in v_k (1 / 2 would be
+the circular process above). In real and imaginary parts, n complex rows are 2 n real numbers of covariance
+    sum_k s_k^2 C_k * [(1 - quadrature / 2) p p^T + quadrature / 2 q q^T] + noise / 2
+
+with p = (Re w_k, Im w_k), q = (-Im w_k, Re w_k), w_k = a_k exp(j phi_k). It halves what must be learned of
+each source's visibility; the phases must be known first, so the search itself stays circular.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import final
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
-from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Reflections, images
-from gsparc.physics.waves import ranges, wave
+from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.processes.conditioned import Conditioned
 
-JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
 
-
-@final
-@dataclass(frozen=True)
-class Scene:
-    """Image sources as sequences over mirror planes, with amplitudes, visibility, clutter and noise.
-
-    Attributes:
-        transmitter: (3,) float64 [m], the sequence ().
-        planes: (P, 4) float64, see `gsparc.physics.mirror_planes`.
-        sequences: K of them, the transmitter first.
-        log_amplitude: (K,) float32, log s_k.
-        log_noise: log of the noise variance, in units of the rows' power.
-        visibility: kernel of all sources' gains, beside the occlusion by clutter.
-        clutter: occluding boxes and finite mirrors.
-    """
-
-    transmitter: Tensor
-    planes: Tensor
-    sequences: tuple[Reflections, ...]
-    log_amplitude: Tensor
-    log_noise: float
-    visibility: KernelVisibility = KernelVisibility()  # noqa: RUF009 frozen
-    clutter: Clutter = field(default_factory=Clutter.none)
-
-    @cached_property
-    def sources(self) -> Tensor:
-        """Positions (K, 3) float64 [m]."""
-        return images(self.transmitter, self.planes, self.sequences)
-
-    @cached_property
-    def unfolding(self) -> Unfolding:
-        """The legs of every sequence's path."""
-        return Unfolding.of(self.transmitter, self.planes, self.sequences)
-
-    def visible_share(self, places: Tensor) -> Tensor:
-        """Share of each source that clutter lets through to places (n, 3) [m]: (n, K), or (1, 1)."""
-        if not len(self.clutter):
-            return torch.ones(1, 1)
-        return visible_share(self.unfolding.paths(places), self.clutter, self.planes).T
-
-    def images(self, rows: Rows) -> Tensor:
-        """Images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
-        return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
-
-    def unobstructed(self, rows: Rows) -> Tensor:
-        """Waves (n, K) complex64 of the sources at every row, without clutter."""
-        return steering(rows, self.images(rows))
-
-    def waves(self, rows: Rows) -> Tensor:
-        """The same, attenuated by clutter."""
-        return self.unobstructed(rows) * self.visible_share(rows.position)
-
-    def with_sequences(self, sequences: list[Reflections], amplitude: Tensor) -> Scene:
-        """More sources, with amplitudes (k,)."""
-        log_amplitude = torch.cat([self.log_amplitude, amplitude.log().float()])
-        return replace(self, sequences=(*self.sequences, *sequences), log_amplitude=log_amplitude)
-
-    def only(self, kept: list[int], planes: Iterable[int] = ()) -> Scene:
-        """The sources of these indices, and the planes that they use, or that are named."""
-        sequences = [self.sequences[i] for i in kept]
-        used = sorted({index for sequence in sequences for index in sequence}.union(planes))
-        new = {old: i for i, old in enumerate(used)}
-        renamed = tuple(tuple(new[index] for index in sequence) for sequence in sequences)
-        return replace(
-            self,
-            planes=self.planes[used],
-            sequences=renamed,
-            log_amplitude=self.log_amplitude[kept],
-            clutter=self.clutter.renamed(new),
-        )
-
-
-def steering(rows: Rows, sources: Tensor) -> Tensor:
-    """Spherical waves (n, K) complex64 of sources at every row.
-
-    Args:
-        rows: n of them.
-        sources: (K, 3) float64 [m], or (E, K, 3) when the rows are of E antennas of the static end.
-
-    Raises:
-        ValueError: the images of the antennas are missing.
-    """
-    if rows.element is not None:
-        if sources.dim() != 3:
-            raise ValueError("rows of several static antennas need the images of each, (E, K, 3)")
-        sources = sources.index_select(0, rows.element)  # (n, K, 3)
-    return wave(ranges(rows.position, sources), rows.frequency[:, None])
-
-
-def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
-    """Amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
-    waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
-    return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
-
-
-def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
-    """Visibility correlations (K, n, n) float32."""
-    return torch.stack([kernel.correlation(rows.places, source) for source in sources])
+def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
+    """Targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
+    level = max(1.0, float(covariance.diagonal().real.mean()))
+    covariance.diagonal().add_(noise + JITTER * level)
+    return Conditioned.of(covariance, target)
 
 
 class CircularGains:
@@ -169,27 +78,77 @@ class CircularGains:
         return (slope.conj() * scaled[:, None] * scaled.conj()).real
 
 
-def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
-    """Targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
-    level = max(1.0, float(covariance.diagonal().real.mean()))
-    covariance.diagonal().add_(noise + JITTER * level)
-    return Conditioned.of(covariance, target)
+def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
+    """p and q, each (2 n, ...) float32, of complex (n, ...)."""
+    return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
+
+
+def shares(quadrature: Tensor | float) -> Tensor:
+    """Variance along and across a gain's phase, (2,)."""
+    return torch.tensor([1 - quadrature / 2, quadrature / 2])
+
+
+class PhasedGains(CircularGains):
+    """The same of gains of fixed phases, of 2 n real numbers; waves are turned by these."""
+
+    def __init__(self, rows: Rows, quadrature: Tensor | float) -> None:
+        self.target, n = rows.target, len(rows)
+        self.quadrature, self._sum = quadrature, torch.zeros(2, n, 2, n)
+
+    @property
+    def matrix(self) -> Tensor:
+        """(2 n, 2 n) float32."""
+        return self._sum.view(2 * len(self.target), -1)
+
+    def add(self, scaled: Tensor, correlation: Tensor) -> None:
+        """Add one source, with waves s_k w_k."""
+        pair = torch.stack(stacked(scaled), 1)
+        product = (pair * shares(self.quadrature)) @ pair.T
+        self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
+
+    def given(self, noise: Tensor | float) -> Conditioned:
+        """The rows' targets, half of the noise in either part."""
+        self.matrix.diagonal().add_(noise / 2)
+        return Conditioned.of(self.matrix, stacked(self.target)[0])
+
+    def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
+        """See `CircularGains`."""
+        n, found = len(scaled), torch.empty_like(scaled)
+        blocks = slope.view(2, n, 2, n)
+        for k, one in enumerate(correlation):
+            pair = torch.stack(stacked(scaled[:, k]), 1) * shares(self.quadrature)
+            by = (blocks * one[None, :, None, :]).view(2 * n, 2 * n) @ pair
+            # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
+            found[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
+        return found
+
+    def by_noise(self, slope: Tensor) -> Tensor:
+        """See `CircularGains`."""
+        return slope.diagonal().sum() / 4
+
+    def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
+        """See `CircularGains`; differentiable in `quadrature`."""
+        n, share = len(scaled), torch.as_tensor(self.quadrature) / 2
+        along, across = ((slope * z[:, None] * z).view(2, n, 2, n).sum((0, 2)) for z in stacked(scaled))
+        return ((1 - share) * along + share * across) / 2
 
 
 class Posterior:
-    """Posterior of a scene's gains given rows."""
+    """Posterior of a scene's gains given rows, circular or of fixed phases (`Scene.phase`)."""
 
-    def __init__(self, rows: Rows, scene: Scene, noise_floor: float = JITTER) -> None:
-        self.rows, self.scene, self.noise_floor = rows, scene, noise_floor
+    def __init__(self, rows: Rows, scene: Scene) -> None:
+        self.rows, self.scene = rows, scene
 
     @cached_property
     def waves(self) -> Tensor:
-        """(n, K) complex64."""
+        """(n, K) complex64, turned by the phases."""
         return self.scene.waves(self.rows)
 
     def gains(self) -> CircularGains:
         """Of no source yet."""
-        return CircularGains(self.rows)
+        if self.scene.phase is None:
+            return CircularGains(self.rows)
+        return PhasedGains(self.rows, self.scene.quadrature)
 
     @cached_property
     def _summed(self) -> CircularGains:
@@ -201,7 +160,7 @@ class Posterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        return self._summed.given(torch.tensor(self.scene.log_noise).exp() + self.noise_floor)
+        return self._summed.given(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
 
     @property
     def covariance(self) -> Tensor:
@@ -215,8 +174,44 @@ class Posterior:
         return self.conditioned.nll
 
     def without(self, k: int) -> float:
-        """`nll` of the scene without source k."""
+        """`nll` of the scene without source k, of circular gains."""
         one, source = CircularGains(self.rows), self.scene.sources[k]
         correlation = self.scene.visibility.correlation(self.rows.places, source)
         one.add(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
         return Conditioned.of(self.covariance - one.matrix, self.rows.target).nll
+
+    # ---- of gains of fixed phases ----
+    @property
+    def dual_weights(self) -> Tensor:
+        """Dual weights of u_k + j v_k (K, n, R) complex64, before the correlation over places."""
+        n, (along, across) = len(self.rows), shares(self.scene.quadrature)
+        alpha = torch.complex(*self.conditioned.weights.split(n))
+        power = self.scene.log_amplitude.mul(2).exp()
+        circular = (self.waves.conj() * power).T[:, :, None] * alpha
+        return torch.complex(along * circular.real, across * circular.imag)
+
+    @property
+    def mean_gains(self) -> Tensor:
+        """Constant part of each source's gain (K, R) complex64."""
+        constant = float(self.scene.visibility.constant)
+        return constant * self.dual_weights.sum(1) * self.scene.turns[:, None]
+
+    def left_out(self) -> Tensor:
+        """Leave-one-receiver-out predictions (n, R) complex64.
+
+        Rasmussen and Williams (2006), eq. 5.12, in blocks.
+        """
+        n = len(self.rows)
+        order = torch.argsort(self.rows.receiver, stable=True)
+        counts = torch.unique_consecutive(self.rows.receiver[order], return_counts=True)[1]
+        groups = (torch.cat([group, group + n]) for group in order.split(counts.tolist()))
+        error, _ = self.conditioned.left_out(groups)
+        return self.rows.target - torch.complex(error[:n], error[n:])
+
+
+def with_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
+    """The scene with the phases of each source's mean gain under the circular process, and a noise floor."""
+    posterior = Posterior(rows, replace(scene, noise_floor=JITTER))
+    gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
+    one = rows.target.shape[1] == 1
+    return replace(scene, phase=gain.angle(), quadrature=quadrature if one else 1.0, noise_floor=noise_floor)

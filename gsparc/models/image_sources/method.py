@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections import Counter
 from dataclasses import replace
 from hashlib import sha256
 from typing import Any
@@ -27,19 +26,19 @@ from gsparc.models.image_sources.ensemble import (
     search_many,
 )
 from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse, refuse_turning
-from gsparc.models.image_sources.gp_likelihood import Scene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import KINDS, Offsets, estimate
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
-from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.query import VARIANCE_ROWS, Query
 from gsparc.models.image_sources.rows import (
     Rows,
-    SourceKind,
     box_of,
     gather,
-    kinds,
     measured_places,
     ranges_at,
+    scatterers,
+    static_array,
 )
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.method import LeftOut, Method, Prediction
@@ -110,7 +109,7 @@ class ImageSourceGP(FramedMethod):
         self.offsets, self.clutter = offsets, clutter
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
-        self.members: list[PhasedPosterior] = []
+        self.members: list[Posterior] = []
 
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -135,43 +134,44 @@ class ImageSourceGP(FramedMethod):
     ) -> FitReport:
         budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
         self.site, self.antennas = data.site, data.target.shape[1]
-        everything = gather(data, known, self.row_limit, self.seed)
-        self.frame = frame_of(data.site, everything)
+        self.frame = frame_of(data.site, gather(data, known, self.row_limit, self.seed))
         noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
         self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
-        held = self.frame.inside(everything)
         notes: list[str] = []
         self.factors = torch.ones(self.antennas, dtype=torch.complex64)
-        if held.array is not None and self.offsets == "none":
+        calibrated = static_array(data.site, self.antennas) is not None and self.offsets == "none"
+        if calibrated:
             start = self._row_sets(data, known, 1)[0]
-            data = self._calibrated(data, start, direct_path(start, self._transmitter()))
-            held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+            data = self._calibrated(data, start, direct_path(start, self._transmitter(), self.noise_floor))
         if self.offsets != "none":
             data = self._without_offsets(data, known, budget)
-            held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
             notes.append(
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
         row_sets = self._row_sets(data, known, self.searches)
         found = self._search(row_sets, self.settings, budget, self.clutter, cache)
-        if held.array is not None and self.offsets == "none":
-            again = self._calibrated(data, row_sets[found[0].number], found[0].phased.scene)
+        if calibrated:
+            again = self._calibrated(data, row_sets[found[0].number], found[0].scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known, self.searches)
-                held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-                found = [refined(row_sets[one.number], one, self.noise_floor) for one in found]
+                found = [refined(row_sets[one.number], one) for one in found]
         self.weights = ensemble_weights(found)
-        affordable = affordable_rows(row_sets[0], found, self.noise_floor, budget)
-        if affordable < len(held):
+        rows = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+        affordable = affordable_rows(row_sets[0], found, budget)
+        if affordable < len(rows):
             budget.limited = True
-            notes.append(f"{self.name}: {affordable} of {len(held)} rows in the final process: time is short")
-            held = held.take(torch.linspace(0, len(held) - 1, affordable).long())
-        self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
-        self.query = Query(self.members)
-        self.held = self._held(data, known, found, len(held))
+            notes.append(f"{self.name}: {affordable} of {len(rows)} rows in the final process: time is short")
+            rows = rows.take(torch.linspace(0, len(rows) - 1, affordable).long())
+        self._conditioned(rows, [member.scene for member in found])
+        self.held = self._left_out_rows(data, known, found, len(rows))
         notes += self._described(found, budget)
         limited = less_repeatable(budget.limited_by, cache.limited_by)
         return FitReport(budget.counted.wall, tuple(notes), limited)
+
+    def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
+        """Set the processes, and what answers queries, from rows in the frame."""
+        self.members = [Posterior(rows, scene) for scene in scenes]
+        self.query = Query(self.members)
 
     def _described(self, found: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
@@ -183,8 +183,8 @@ class ImageSourceGP(FramedMethod):
             ended = "far behind another solution"
         ended += ", ended by the time budget" if budget.limited else ""
         notes.append(f"{len(found)} of {self.searches} searches ({ended}), {counts} sources")
-        counted = Counter(kinds(scene.sources, box_of(self.members[0].rows, scene.transmitter)))
-        notes.append("the best search has " + ", ".join(f"{counted[k]} {k}s" for k in SourceKind))
+        inside = int(scatterers(scene.sources, box_of(self.members[0].rows, scene.transmitter)).sum())
+        notes.append(f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers")
         clutter = scene.clutter
         if len(clutter):
             these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
@@ -199,7 +199,7 @@ class ImageSourceGP(FramedMethod):
 
     def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
         """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
-        factors = element_factors(rows, scene, self.noise_floor)
+        factors = element_factors(rows, scene)
         if factors is None:
             return data
         self.factors = self.factors * factors
@@ -237,7 +237,7 @@ class ImageSourceGP(FramedMethod):
         groups = self._groups
         return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
 
-    def _held(
+    def _left_out_rows(
         self, data: Measurements, known: np.ndarray, found: list[Member], most: int
     ) -> LeftOutRows | None:
         """Rows of every group predicted by the searches that left it out, from at most `most` others."""
@@ -250,8 +250,8 @@ class ImageSourceGP(FramedMethod):
                 continue
             apart = self.frame.inside(gather(data, self._seen(known, turn), most, self.seed))
             twin = copy.copy(self)
-            twin.members = [PhasedPosterior(apart, member.phased, self.noise_floor) for member in members]
-            twin.weights, twin.query = ensemble_weights(members), Query(twin.members)
+            twin._conditioned(apart, [member.scene for member in members])
+            twin.weights = ensemble_weights(members)
             batch = data.batch(group)
             rows.append(group)
             means.append(twin.predict(batch.tx, batch.rx).mean)
@@ -270,12 +270,12 @@ class ImageSourceGP(FramedMethod):
             few = replace(self.settings, max_sources=sources, final_steps=20)
             now = TimeBudget(ALIGNMENT_SHARE * budget.seconds, budget.clock)
             rows = self._row_sets(aligned, known, 1)
-            phased = self._search(rows, few, now, False, SearchCache())[0].phased
+            scene = self._search(rows, few, now, False, SearchCache())[0].scene
             budget.limited |= now.limited
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)
-                gains = PhasedPosterior(rows[0], phased, self.noise_floor).mean_gains
-                aligned = self._remove_offsets(data, known, phased.scene, gains)
+                gains = Posterior(rows[0], scene).mean_gains
+                aligned = self._remove_offsets(data, known, scene, gains)
         return aligned
 
     def _remove_offsets(
@@ -371,11 +371,9 @@ class ImageSourceGP(FramedMethod):
                 _loudest(member, share, measured[f"contribution{i}"])
                 for member, i in zip(twin.members, chosen, strict=True)
             ]
-        if settings.get("confidence", True):
-            twin.query = Query(twin.members)
-            return twin
-        twin.query = Query(twin.members, variance_rows=0)
-        return MeanOnly(twin)
+        whole = settings.get("confidence", True)
+        twin.query = Query(twin.members, VARIANCE_ROWS if whole else 0)
+        return twin if whole else MeanOnly(twin)
 
     # ---- state ----
     def state(self) -> dict[str, Any]:
@@ -386,7 +384,7 @@ class ImageSourceGP(FramedMethod):
             "weights": self.weights,
             "noise_floor": self.noise_floor,
             "factors": self.factors,
-            "scenes": [member.phased.state() for member in self.members],
+            "scenes": [member.scene.state() for member in self.members],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -394,19 +392,15 @@ class ImageSourceGP(FramedMethod):
         rows = self._restore_frame(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
         self.factors = state["factors"]
-        scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
-        self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]
-        self.query = Query(self.members)
+        self._conditioned(rows, [Scene.from_state(stored, self.noise_floor) for stored in state["scenes"]])
 
     def size(self) -> int:
         """Sources of the largest scene."""
         return max((len(member.scene.sequences) for member in self.members), default=0)
 
 
-def _loudest(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:
+def _loudest(member: Posterior, share: float, contribution: Tensor) -> Posterior:
     """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
     count = max(1, math.ceil(share * len(contribution)))
     kept = sorted({0, *contribution.topk(count).indices.tolist()})
-    phased = member.phased
-    scene = PhasedScene(phased.scene.only(kept), phased.phase[kept], phased.quadrature)
-    return PhasedPosterior(member.rows, scene, member.noise_floor)
+    return Posterior(member.rows, member.scene.only(kept))

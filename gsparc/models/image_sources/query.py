@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gsparc.models.image_sources.clutter.blocking import Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.gp_likelihood import Scene
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, shares
+from gsparc.models.image_sources.gp_likelihood import Posterior, shares
 from gsparc.models.image_sources.rows import ranges_at
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_kernel import directions
 from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
@@ -100,15 +100,14 @@ class Query:
         variance_rows: rows that the variance is computed from; with 0 it is not.
     """
 
-    def __init__(self, members: list[PhasedPosterior], variance_rows: int = VARIANCE_ROWS) -> None:
+    def __init__(self, members: list[Posterior], variance_rows: int = VARIANCE_ROWS) -> None:
         rows, scenes = members[0].rows, [member.scene for member in members]
         places, place_of = torch.unique(rows.places, dim=0, return_inverse=True)
         self.pack = PackedSources.of(scenes, places)
         self.counts = [len(scene.sequences) for scene in scenes]
-        phases = torch.cat([member.phased.phase for member in members])
         dual = torch.cat([member.dual_weights for member in members])
-        dual = dual * torch.polar(torch.ones(()), phases)[:, None, None]
-        weight = torch.zeros(len(phases), len(places), rows.target.shape[1], dtype=dual.dtype)
+        dual = dual * torch.cat([scene.turns for scene in scenes])[:, None, None]
+        weight = torch.zeros(len(dual), len(places), rows.target.shape[1], dtype=dual.dtype)
         real = torch.view_as_real(weight.index_add_(1, place_of, dual)).flatten(2)  # (K, n, 2 R)
         self.weights = (real * (1 - self.pack.constant)).contiguous()
         self.level = real.sum(1, keepdim=True) * self.pack.constant
@@ -165,19 +164,18 @@ class RowVariance:
         count: of the rows used.
     """
 
-    def __init__(self, member: PhasedPosterior, place_of: Tensor, count: int) -> None:
+    def __init__(self, member: Posterior, place_of: Tensor, count: int) -> None:
         few = torch.linspace(0, len(member.rows) - 1, min(count, len(member.rows))).long()
         if len(few) < len(member.rows):
-            member = PhasedPosterior(member.rows.take(few), member.phased, member.noise_floor)
-        phased, kernel = member.phased, member.scene.visibility
+            member = Posterior(member.rows.take(few), member.scene)
+        scene, kernel = member.scene, member.scene.visibility
         self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.contiguous()
-        self.phasor = torch.polar(torch.ones(()), phased.phase)
-        self.power = phased.scene.log_amplitude.mul(2).exp()
-        self.noise = math.exp(phased.scene.log_noise)
+        self.phasor, self.power = scene.turns, scene.log_amplitude.mul(2).exp()
+        self.noise = math.exp(scene.log_noise)
         there = torch.stack([member.waves.real.T, member.waves.imag.T], 1)[:, None]  # (K, 1, 2, n)
         there = there * self.power[:, None, None, None]
         self.level, self.there = there * float(kernel.constant), there * (1 - float(kernel.constant))
-        self.along, across = shares(phased.quadrature).tolist()
+        self.along, across = shares(scene.quadrature).tolist()
         self.across = across * torch.tensor([[1.0, -1.0], [-1.0, 1.0]])[..., None]
 
     def __call__(self, arriving: Tensor, varying: Tensor) -> tuple[Tensor, Tensor]:

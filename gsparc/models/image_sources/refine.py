@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import JITTER, Posterior, Scene, correlations, steering
-from gsparc.models.image_sources.phased_gp import PhasedGains, PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene, correlations, steering
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
+from gsparc.processes.worker import late
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
@@ -25,34 +25,21 @@ PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and al
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
-S = TypeVar("S", Scene, PhasedScene)
-Late = Callable[[], bool]
 # Negative log prior [nats] of transmitter, planes (P, 4), log amplitudes (K,), log noise and phases (K,).
 Cost = Callable[[list[Tensor]], Tensor]
 
 
-def no_deadline() -> bool:
-    """Of work without an end in time."""
-    return False
-
-
-def refine(
-    rows: Rows, start: S, steps: int, noise_floor: float = JITTER, late: Late = no_deadline,
-    cost: Cost | None = None,
-) -> S:  # fmt: skip
+def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
     """The best scene of `steps` steps of Adam (D. P. Kingma and J. Ba, ICLR 2015), or of those until `late`.
 
     Args:
         rows: measurements.
-        start: the start; a phased scene's phases move, too.
+        scene: the start; its phases move where gains have them.
         steps: at least 0.
-        noise_floor: known variance of the noise, in units of the rows' power.
-        late: asked after every step; none follows when it says so.
         cost: a negative log prior, added to the negative log likelihood.
     """
-    scene = _scene_of(start)
-    phases: list[Tensor] = [start.phase] if isinstance(start, PhasedScene) else []
-    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), *phases]
+    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
+    values += [] if scene.phase is None else [scene.phase]
     rates = [torch.tensor(step, dtype=torch.float64) for step in (TRANSMITTER_STEP, PLANE_STEP)]
     rates += [torch.tensor(STEP)] * (len(values) - 2)
     first, second = [torch.zeros_like(v) for v in values], [torch.zeros_like(v) for v in values]
@@ -60,7 +47,7 @@ def refine(
     for step in range(steps + 1):
         if step % REFRESH == 0:
             correlation = correlations(rows, images(values[0], values[1], scene.sequences), scene.visibility)
-        value, gradient = _likelihood(rows, start, values, correlation, noise_floor)
+        value, gradient = _likelihood(rows, scene, values, correlation)
         if cost is not None:
             leaves = [v.detach().requires_grad_() for v in values]
             with torch.enable_grad():
@@ -80,37 +67,27 @@ def refine(
             size = (second[i] / (1 - BETA2 ** (step + 1))).sqrt() + 1e-9
             moved.append(values[i] - decay * rates[i] * mean / size)
         values = moved
-    found = replace(
-        scene, transmitter=best[0], planes=best[1], log_amplitude=best[2], log_noise=float(best[3])
-    )
-    return replace(start, scene=found, phase=best[4]) if isinstance(start, PhasedScene) else found
-
-
-def _scene_of(start: Scene | PhasedScene) -> Scene:
-    return start.scene if isinstance(start, PhasedScene) else start
-
-
-def _posterior(rows: Rows, start: Scene | PhasedScene, noise_floor: float) -> Posterior:
-    if isinstance(start, PhasedScene):
-        return PhasedPosterior(rows, start, noise_floor)
-    return Posterior(rows, start, noise_floor)
+    transmitter, planes, log_amplitude, log_noise, *phase = best
+    return replace(
+        scene, transmitter=transmitter, planes=planes, log_amplitude=log_amplitude,
+        log_noise=float(log_noise), phase=phase[0] if phase else None,
+    )  # fmt: skip
 
 
 def _likelihood(
-    rows: Rows, start: Scene | PhasedScene, values: list[Tensor], correlation: Tensor, noise_floor: float
+    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its derivatives by the values: `d nll = trace(G dK)`."""
-    scene = _scene_of(start)
     transmitter, planes, *phases = (v.detach().requires_grad_() for v in (*values[:2], *values[4:]))
     waves = steering(rows, images(rows.static_ends(transmitter), planes, scene.sequences))
     for phase in phases:
         waves = waves * torch.polar(torch.ones(()), phase)
     waves = waves * scene.visible_share(rows.position)
     scaled, noise = waves.detach() * values[2].exp(), values[3].exp()
-    gains = _posterior(rows, start, noise_floor).gains()
+    gains = Posterior(rows, scene).gains()
     for k, one in enumerate(correlation):
         gains.add(scaled[:, k], one)
-    conditioned = gains.given(noise + noise_floor)
+    conditioned = gains.given(noise + scene.noise_floor)
     by_waves = gains.by_waves(conditioned.slope, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
     leaves = [transmitter, planes, *phases]
@@ -121,40 +98,33 @@ def _likelihood(
     return conditioned.nll, [by_place, by_plane, by_amplitude, by_noise, *by_phase]
 
 
-def learn_visibility(
-    rows: Rows, start: S, steps: int, centre: KernelVisibility, noise_floor: float = JITTER,
-    late: Late = no_deadline,
-) -> S:  # fmt: skip
-    """Parameters of the visibility kernel by likelihood, with a log-normal prior about `centre`.
+def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibility) -> Scene:
+    """Parameters of the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
 
-    Without the prior the lengths collapse to explain the power of sources not found yet. Of a phased scene
+    Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
     `quadrature` is learned as well, unless it is 1: its prior is about the present one.
 
     Args:
         rows: a few hundred are enough.
-        start: the start.
+        scene: the start.
         steps: of Adam.
         centre: of the prior.
-        noise_floor: known variance of the noise, in units of the rows' power.
-        late: asked before every step; none follows when it says so.
     """
-    scene, phased = _scene_of(start), isinstance(start, PhasedScene)
-    shares, least = ((start.quadrature,), 0.005) if isinstance(start, PhasedScene) else ((), 0.02)
+    shares, least, wide = ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
     about, value = (kernel.parameters(least, *shares) for kernel in (centre, scene.visibility))
-    width = SPREAD * torch.tensor([1.0, 1.0, 1.0, 2.0])[: len(value)] * (2**0.5 if phased else 1)
+    width = SPREAD * torch.tensor([1.0, 1.0, 1.0, 2.0])[: len(value)] * wide
     optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=(0.8, 0.95))
 
-    def current() -> S:
-        bare = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
-        if not isinstance(start, PhasedScene):
-            return bare
-        kept = float(torch.sigmoid(value.detach()[3])) if start.quadrature < 1 else 1.0
-        return replace(start, scene=bare, quadrature=kept)
+    def current() -> Scene:
+        found = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
+        if scene.quadrature == 1:
+            return found
+        return replace(found, quadrature=float(torch.sigmoid(value.detach()[3])))
 
     for _ in range(steps):
         if late():
             break
-        posterior = _posterior(rows, current(), noise_floor)
+        posterior = Posterior(rows, current())
         slope, gains = posterior.conditioned.slope, posterior.gains()
         if isinstance(gains, PhasedGains) and gains.quadrature < 1:
             gains.quadrature = torch.sigmoid(value[3])

@@ -12,10 +12,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene
-from gsparc.models.image_sources.refine import Late, no_deadline, refine
+from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
+from gsparc.processes.worker import late
 
 LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
 MIN_IMAGE_SHIFT_M = 0.2  # [m], half the least distance of a source from its mirror image
@@ -26,7 +28,7 @@ MOST_WALLS, MOST_ORTHOGONAL = 10, 8
 MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
-def drop_planes(rows: Rows, scene: Scene, tolerance: float, late: Late = no_deadline) -> Scene:
+def drop_planes(rows: Rows, scene: Scene, tolerance: float) -> Scene:
     """Try to remove planes until `late`: their sequences become the nearest over others [tolerance: m]."""
     index = 0
     while index < len(scene.planes) and not late():
@@ -184,7 +186,7 @@ def reassign(scene: Scene, walls: Tensor) -> Scene:
     return explained.only(list(range(len(kept))))
 
 
-def prune(rows: Rows, scene: Scene, least: float, late: Late = no_deadline) -> Scene:
+def prune(rows: Rows, scene: Scene, least: float) -> Scene:
     """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
     posterior = Posterior(rows, scene)
     weakest_first: list[Reflections] = sorted(

@@ -7,7 +7,6 @@ the static end is the same for every receiver and folds into the complex gain. T
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 import torch
@@ -16,6 +15,8 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.ops import Pose
 from gsparc.physics.waves import ranges
+
+BEHIND_M = 0.05  # by which the box of places is smaller, so that images just behind a wall stay images
 
 
 @dataclass(frozen=True)
@@ -157,27 +158,14 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
     return ranges(places[:, :3], sources)
 
 
-class SourceKind(StrEnum):
-    """Propagation mechanism of a source."""
-
-    IMAGE = "image"
-    SCATTERER = "scatterer"
-
-
-def kinds(points: Tensor, box: Tensor, margin: float = 0.05) -> list[SourceKind]:
-    """Kinds of fixed points (K, 3) [m], the transmitter first.
+def scatterers(points: Tensor, box: Tensor) -> Tensor:
+    """Which sources (K, 3) [m], the transmitter first, are scatterers (K,) bool; others are images.
 
     A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands inside
     the box (2, 3) [m] of receivers and transmitter, the transmitter itself apart, is a scatterer.
-
-    Args:
-        points: sources of one scene.
-        box: lower and upper corner of all places measured.
-        margin: by which the box is made smaller: images just behind a wall stay images [m].
     """
-    inside = ((points > box[0] + margin) & (points < box[1] - margin)).all(1)
-    apart = torch.linalg.vector_norm(points - points[0], dim=1) > 0.1
-    return [SourceKind.SCATTERER if s else SourceKind.IMAGE for s in (inside & apart).tolist()]
+    inside = ((points > box[0] + BEHIND_M) & (points < box[1] - BEHIND_M)).all(1)
+    return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
 
 
 def box_of(rows: Rows, transmitter: Tensor) -> Tensor:

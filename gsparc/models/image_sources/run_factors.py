@@ -8,6 +8,7 @@ logarithm of its size, so that each factor has a closed form given the others.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +16,9 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Prediction
+from gsparc.training.conditional import Posterior
+
+P = TypeVar("P", Prediction, Posterior)
 
 SWEEPS = 200
 SETTLED = 1e-9
@@ -52,13 +56,17 @@ class RunFactors:
         same = run.cpu()[:, None] == torch.from_numpy(self.runs)
         return torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
 
-    def restored(self, found: Prediction, run: Tensor | None) -> Prediction:
+    def factor(self, mean: Tensor, run: Tensor | None) -> Tensor:
+        """The same (B, 1, 1) in the dtype and on the device of channels."""
+        return self.of(run).to(mean.device)[:, None, None].to(mean.dtype)
+
+    def restored(self, found: P, run: Tensor | None) -> P:
         """A prediction for the largest run in the phase and level of rows of runs (B,)."""
         if run is None or len(self) == 1:
             return found
-        factor = self.of(run).to(found.mean.device)
-        variance = None if found.variance is None else found.variance * factor.abs().square().float()
-        return replace(found, mean=found.mean * factor.to(found.mean.dtype)[:, None, None], variance=variance)
+        level = self.of(run).to(found.mean.device).abs().square().float()
+        variance = None if found.variance is None else found.variance * level
+        return replace(found, mean=found.mean * self.factor(found.mean, run), variance=variance)
 
     def aligned(self, data: Measurements) -> Measurements:
         """The channels in the phase and level of the largest run, as of one run."""

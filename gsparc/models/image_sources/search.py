@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -11,8 +12,8 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
-from gsparc.models.image_sources.gp_likelihood import Posterior, Scene, direct_amplitude
-from gsparc.models.image_sources.refine import Late, learn_visibility, no_deadline, refine
+from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.reflection_orders import (
     drop_planes,
     find_walls,
@@ -21,9 +22,11 @@ from gsparc.models.image_sources.reflection_orders import (
     reassign,
 )
 from gsparc.models.image_sources.rows import Rows, box_of
+from gsparc.models.image_sources.scene import Scene, direct_amplitude
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.worker import late
 
 log = logging.getLogger(__name__)
 
@@ -58,22 +61,21 @@ class SearchSettings:
 
 
 class Search:
-    """One search over one set of normalised rows (`Frame`).
+    """One search over one set of normalised rows (`Frame`); when it is `late`, with what was found so far.
 
     Args:
         rows: a few hundred.
         transmitter: (3,) float64 [m].
         settings: how.
         seed: of the candidates.
-        late: asked after every round; no other starts when it says so.
-        over: asked after every step; what was found so far is the result when it says so.
+        last_round: asked after every round; no other starts when it says so.
     """
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
-        late: Late = no_deadline, over: Late = no_deadline,
+        last_round: Callable[[], bool],
     ) -> None:  # fmt: skip
-        self.rows, self.settings, self.late, self.over = rows, settings, late, over
+        self.rows, self.settings, self.last_round = rows, settings, last_round
         self.generator = torch.Generator().manual_seed(seed)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
@@ -92,15 +94,15 @@ class Search:
             free = not added
             if free:
                 added = self._add_free()
-            if not added or self.late():
+            if not added or self.last_round():
                 break
             self._refine(STEPS)
             if free or number % 2:
-                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength, late=self.over)
+                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength)
             if number >= 4 and number % 3 == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = prune(self.rows, self.scene, PRUNE, self.over)
+                self.scene = prune(self.rows, self.scene, PRUNE)
             if number % 3 == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
@@ -119,21 +121,21 @@ class Search:
         self._refine(20)
         self._find_walls()
         self._reassign(orthogonal_walls(self.scene))
-        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength, late=self.over)
+        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength)
         self._add_sequences()
         self._refine(STEPS)
-        self.scene = prune(self.rows, self.scene, PRUNE, self.over)
+        self.scene = prune(self.rows, self.scene, PRUNE)
         self._learn_visibility(10)
         self._refine(self.settings.final_steps)
         return self.scene
 
     def _refine(self, steps: int) -> None:
-        self.scene = refine(self.rows, self.scene, steps, late=self.over)
+        self.scene = refine(self.rows, self.scene, steps)
 
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, late=self.over)
+            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility)
 
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
@@ -147,7 +149,7 @@ class Search:
         if not sequences:
             return 0
         position = images(scene.transmitter, scene.planes, sequences)
-        candidates = replace(scene, sequences=tuple(sequences)).images(self.rows)
+        candidates = scene.over(sequences).images(self.rows)
         scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).conditioned)
         clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(
@@ -165,7 +167,7 @@ class Search:
         posterior = Posterior(self.rows, self.scene)
         parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
         for number, parent in enumerate(parents):
-            if number and self.over():
+            if number and late():
                 break
             spread = partial(self._spread, parent)
             found = search_box(
@@ -173,7 +175,7 @@ class Search:
                 self.generator, spread,
             )  # fmt: skip
             added = 0
-            for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
+            for position, gained, amplitude in found:
                 if gained < FREE_SCORE:
                     continue
                 sequence, plane = self._parent(position, posterior)
@@ -200,7 +202,7 @@ class Search:
         """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
         if parent is None:
             return points
-        scene = replace(self.scene, sequences=(parent,))
+        scene = self.scene.over((parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
     def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
@@ -228,7 +230,7 @@ class Search:
 
     def _reassign(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
-        if walls is None or self.over():
+        if walls is None or late():
             return
         before = self.scene
         self.scene = reassign(before, walls)

@@ -14,7 +14,7 @@ import torch
 from gsparc.data.files import whole_file
 from gsparc.data.raw import stored_archive
 from gsparc.models.checkpoint import SEARCHES
-from gsparc.models.image_sources.phased_gp import PhasedScene
+from gsparc.models.image_sources.scene import Scene
 from gsparc.training.time_budget import NOTHING, Clock, Spent, TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
@@ -27,12 +27,12 @@ class Member:
     """Result of one search.
 
     Attributes:
-        phased: the scene.
+        scene: with phases.
         left_out: NMSE of its own rows, each receiver predicted from the others.
         number: of the search, from 0.
     """
 
-    phased: PhasedScene
+    scene: Scene
     left_out: float
     number: int = 0
 
@@ -82,20 +82,20 @@ class SearchCache:
         self._kept, self.spent, self.limited_by = kept, spent, stored.get("limited_by")
         log.info("reusing %d cached searches (%.0f s of training time)", len(kept), wall)
 
-    def find(self, number: int) -> Member | None:
+    def find(self, number: int, noise_floor: float) -> Member | None:
         """The finished search of this number, or None."""
         with self._lock:
             kept = self._kept.get(f"search {number}")
-        return (
-            None if kept is None else Member(PhasedScene.from_state(kept["scene"]), kept["left_out"], number)
-        )
+        if kept is None:
+            return None
+        return Member(Scene.from_state(kept["scene"], noise_floor), kept["left_out"], number)
 
     def put(self, member: Member, limited_by: Clock | None) -> None:
         """Store a finished search, and what has ended one so far; the file is written atomically."""
         with self._lock:
             self.limited_by = less_repeatable(self.limited_by, limited_by)
             self._kept[f"search {member.number}"] = {
-                "scene": member.phased.state(),
+                "scene": member.scene.state(),
                 "left_out": member.left_out,
             }
             self._write()

@@ -2,13 +2,13 @@
 
 A Gaussian here is a virtual source, the image of the static end in a sequence of mirror planes; what steps of
 gradient move are the planes, of which many sources share each, and the sources' powers. The gains given the
-rows are those of `phased_gp`.
+rows are those of `gp_likelihood`.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,11 +17,9 @@ from torch import Tensor, nn
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.directional.method import DirectionalGP
-from gsparc.models.image_sources.gp_likelihood import correlations
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.phased_gp import PhasedPosterior
-from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows, gather
+from gsparc.models.image_sources.scene import correlations
 from gsparc.models.method_field import MethodField
 from gsparc.training.conditional import LeftOutRows, leave_one_out_density
 
@@ -76,21 +74,21 @@ class SourceField(FramedField):
         rows = rows_of(self.method, batch)
         each = []
         for number, member in enumerate(self.method.members):
-            scene = self._scene(number)
+            scene = replace(
+                member.scene,
+                planes=self.planes[number],
+                log_amplitude=self.log_amplitudes[number],
+                phase=None,
+            )
             seen = scene.visible_share(rows.position).detach()
             waves = scene.unobstructed(rows) * seen * scene.log_amplitude.exp()
             correlation = correlations(rows, scene.sources.detach(), scene.visibility)
             covariance = torch.einsum("nk,mk,knm->nm", waves, waves.conj(), correlation.to(waves.dtype))
-            noise = float(np.exp(member.scene.log_noise)) + self.method.noise_floor
+            noise = float(np.exp(scene.log_noise)) + scene.noise_floor
             density = leave_one_out_density(covariance + noise * torch.eye(len(rows)), rows.target)
             each.append(density * self.method.weights[number])
         summed = torch.stack(each).sum(0)
         return summed.view(len(batch), -1).mean(1)
-
-    def _scene(self, number: int) -> Any:
-        """The scene of a search with the parameters as they are."""
-        scene = self.method.members[number].scene
-        return replace(scene, planes=self.planes[number], log_amplitude=self.log_amplitudes[number])
 
     @torch.no_grad()
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
@@ -99,13 +97,13 @@ class SourceField(FramedField):
         if method.offsets != "none":
             return
         scenes = [
-            replace(member.phased, scene=_detached(self._scene(number)))
-            for number, member in enumerate(method.members)
+            replace(member.scene, planes=planes.detach().clone(), log_amplitude=amplitude.detach())
+            for member, planes, amplitude in zip(
+                method.members, self.planes, self.log_amplitudes, strict=True
+            )
         ]
         data = replace(data, target=data.target * method.factors.numpy()[:, None])
-        held = method.frame.inside(gather(data, rows, method.row_limit, method.seed))
-        method.members = [PhasedPosterior(held, scene, method.noise_floor) for scene in scenes]
-        method.query = Query(method.members)
+        method._conditioned(method.frame.inside(gather(data, rows, method.row_limit, method.seed)), scenes)
 
 
 class RayField(FramedField):
@@ -132,7 +130,3 @@ def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:
     if places.shape[1] > 3:
         rows = replace(rows, array=places[:per, 3:], element=torch.arange(per).repeat(count))
     return method.frame.inside(rows)
-
-
-def _detached(scene: Any) -> Any:
-    return replace(scene, planes=scene.planes.detach().clone(), log_amplitude=scene.log_amplitude.detach())

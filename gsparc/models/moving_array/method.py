@@ -149,16 +149,16 @@ class MovingArrayField(Differentiable):
         begin, budget, longest = time.perf_counter(), self._budget, 0.0
         self.exponent = self._exponent(targets)
         self.basis = separable(self._blocks(targets), UNRESOLVED)
-        held = self._held(positions, targets)
+        spectra = self._spectra(positions, targets)
         self.trends, self.left_powers, errors = [], [], []
-        modelled = torch.zeros_like(held.values)  # sum over searches of left-out images
+        modelled = torch.zeros_like(spectra.values)  # sum over searches of left-out images
         while True:
             start = time.perf_counter()
-            sources = self._find(held)
-            power = self._powers(held, sources)
-            modelled += self._add(held, sources, power, self._choose_kernel(held, sources, power))
+            sources = self._find(spectra)
+            power = self._powers(spectra, sources)
+            modelled += self._add(spectra, sources, power, self._choose_kernel(spectra, sources, power))
             rows = _spread(len(positions), self.trend.rows)
-            left = held.values[rows] - modelled[rows] / len(self.trends)
+            left = spectra.values[rows] - modelled[rows] / len(self.trends)
             errors.append(left_out_error(positions[rows], left)[0] / targets[0].size)
             now = time.perf_counter()
             longest = max(longest, now - start)
@@ -176,8 +176,8 @@ class MovingArrayField(Differentiable):
                 break
         modelled /= len(self.trends)
         rows = _spread(len(positions), self.rest_rows)
-        kernel = left_out_error(positions[rows], held.values[rows] - modelled[rows])[1]
-        self._complete(held, modelled, kernel, targets)
+        kernel = left_out_error(positions[rows], spectra.values[rows] - modelled[rows])[1]
+        self._complete(spectra, modelled, kernel, targets)
         note = f"{self.name}: {len(self.trends)} searches, {self.size()} sources, leave-one-out error "
         note += " ".join(f"{error:.4g}" for error in errors)
         fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
@@ -199,12 +199,12 @@ class MovingArrayField(Differentiable):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
-        held, kernels = self._held(data.moving[rows], targets), [trend.kernel for trend in self.trends]
+        spectra, kernels = self._spectra(data.moving[rows], targets), [trend.kernel for trend in self.trends]
         self.trends, self.left_powers = [], []
-        modelled = torch.zeros_like(held.values)
+        modelled = torch.zeros_like(spectra.values)
         for place, kernel in zip(sources, kernels, strict=True):
-            modelled += self._add(held, place, self._powers(held, place), kernel)
-        self._complete(held, modelled / len(self.trends), self.residual.kernel, targets)
+            modelled += self._add(spectra, place, self._powers(spectra, place), kernel)
+        self._complete(spectra, modelled / len(self.trends), self.residual.kernel, targets)
         return rows
 
     def _exponent(self, targets: np.ndarray) -> int:
@@ -221,15 +221,15 @@ class MovingArrayField(Differentiable):
             )
         return exponent
 
-    def _held(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
+    def _spectra(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
         parts = [(self.lags().of(b**self.exponent), self.basis.of(b)) for b in self._blocks(targets)]
         lags, values = (torch.cat(part) for part in zip(*parts, strict=True))
         return Spectra(places, lags, values)
 
-    def _find(self, held: Spectra) -> Tensor:
+    def _find(self, spectra: Spectra) -> Tensor:
         """Sources (K, 3) [m] of the next search."""
         assert self.site is not None and self.site.grid is not None
-        some, static = held.at(_spread(len(held.places), self.search.rows)), self.site.static_position
+        some, static = spectra.at(_spread(len(spectra.places), self.search.rows)), self.site.static_position
         first = None if static is None else torch.from_numpy(np.asarray(static)).float()
         return find_sources(
             some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
@@ -241,33 +241,33 @@ class MovingArrayField(Differentiable):
         self._budget.over(SEARCH_SHARE)
         return SEARCH_SHARE * self._budget.seconds - self._budget.spent
 
-    def _powers(self, held: Spectra, sources: Tensor) -> np.ndarray:
+    def _powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:
         """Powers (n, K) float64 that explain each row best."""
         array = self.array()
         return torch.cat([
             powers(part, array.atoms(sources, places), self.search.ridge)
-            for part, places in zip(held.lags.split(BLOCK), held.receivers.split(BLOCK), strict=True)
+            for part, places in zip(spectra.lags.split(BLOCK), spectra.receivers.split(BLOCK), strict=True)
         ]).double().numpy()  # fmt: skip
 
-    def _add(self, held: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
+    def _add(self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
         """Append the trend of powers (n, K); its left-out images (n, R)."""
-        trend, left = fit_trend(sources, kernel, held.places, power)
+        trend, left = fit_trend(sources, kernel, spectra.places, power)
         self.trends.append(trend)
         self.left_powers.append(torch.from_numpy(left).float())
-        return self._modelled(held, sources, self.left_powers[-1])
+        return self._modelled(spectra, sources, self.left_powers[-1])
 
-    def _modelled(self, held: Spectra, sources: Tensor, power: Tensor) -> Tensor:
+    def _modelled(self, spectra: Spectra, sources: Tensor, power: Tensor) -> Tensor:
         """Images (n, R) of sources of powers (n, K)."""
         array = self.array()
         return torch.cat([
             self.basis.of(array.render(sources, places, part))
-            for places, part in zip(held.receivers.split(BLOCK), power.split(BLOCK), strict=True)
+            for places, part in zip(spectra.receivers.split(BLOCK), power.split(BLOCK), strict=True)
         ])  # fmt: skip
 
-    def _choose_kernel(self, held: Spectra, sources: Tensor, power: np.ndarray) -> Kernel:
+    def _choose_kernel(self, spectra: Spectra, sources: Tensor, power: np.ndarray) -> Kernel:
         """Kernel of a trend, by leave-one-out error."""
-        rows = _spread(len(held.places), self.trend.rows)
-        some, diagonal = held.at(rows), float(np.linalg.norm(np.ptp(held.places, axis=0))) or 1.0
+        rows = _spread(len(spectra.places), self.trend.rows)
+        some, diagonal = spectra.at(rows), float(np.linalg.norm(np.ptp(spectra.places, axis=0))) or 1.0
         errors = {}
         for length in self.trend.lengths:
             kernel = Kernel.of_one(length * diagonal, self.trend.noise)
@@ -276,10 +276,10 @@ class MovingArrayField(Differentiable):
             errors[kernel] = left_out_error(some.places, missed)[0]
         return min(errors, key=lambda kernel: errors[kernel])
 
-    def _complete(self, held: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray) -> None:
+    def _complete(self, spectra: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray) -> None:
         """The process on what left-out trends (n, R) miss, and the error model of the sum."""
-        self.positions, missed = held.places, held.values - modelled
-        self.residual, added = fit_residual(kernel, held.places, missed, self.components)
+        self.positions, missed = spectra.places, spectra.values - modelled
+        self.residual, added = fit_residual(kernel, spectra.places, missed, self.components)
         self._left, self._query = modelled + added, None
         self.trend_error = max(float(missed.square().mean(0).sum()) / targets[0].size, 1e-12)
         energy = added.square().sum(1) / targets[0].size
@@ -292,9 +292,9 @@ class MovingArrayField(Differentiable):
             errors.append(error)
             features.append(image_features(found, energy[part]))
         # two images drawn at random differ by twice the variance
-        prior = 2 * float((held.values - held.values.mean(0)).square().mean(0).sum()) / targets[0].size
+        prior = 2 * float((spectra.values - spectra.values.mean(0)).square().mean(0).sum()) / targets[0].size
         self.error_model = fit_error_model(
-            held.places, torch.cat(relative), torch.cat(features), kernel,
+            spectra.places, torch.cat(relative), torch.cat(features), kernel,
             float(np.mean([trend.kernel.length for trend in self.trends])), prior,
         )  # fmt: skip
         self._left_error = torch.cat(errors)

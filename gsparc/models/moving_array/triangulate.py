@@ -19,11 +19,6 @@ SWEEPS = 20  # of coordinate descent: powers are then within 1 % of the optimum
 REFINED = 0.6  # of a search's seconds are for the refinement
 
 
-def unlimited() -> float:
-    """Seconds that are left where nobody counts them."""
-    return math.inf
-
-
 @dataclass(frozen=True)
 class SearchSettings:
     """Source search.
@@ -94,7 +89,7 @@ def find_sources(
     grid: SphereGrid,
     settings: SearchSettings,
     seed: int,
-    seconds: Callable[[], float] = unlimited,
+    seconds: Callable[[], float],
 ) -> Tensor:
     """Positions (K, 3) float32 [m] of sources.
 

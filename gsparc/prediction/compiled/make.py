@@ -15,8 +15,6 @@ from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.phased_gp import PhasedPosterior
-from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
 from gsparc.models.mixture.mixture import Mixture
@@ -177,11 +175,10 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     member = method.members[int(torch.as_tensor(method.weights).argmax())]
     data = replace(data, target=data.target * method.factors.numpy()[:, None])
     rows = method.frame.inside(gather(data, np.arange(len(data)), len(data), method.seed))
-    phased = replace(member.phased, scene=replace(member.scene, clutter=Clutter.none()))
+    scene = replace(member.scene, clutter=Clutter.none())
     alone = ImageSourceGP.__new__(ImageSourceGP)
     alone.__dict__.update(method.__dict__, weights=torch.ones(1))
-    alone.members = [PhasedPosterior(rows, phased, method.noise_floor)]
-    alone.query = Query(alone.members)
+    alone._conditioned(rows, [scene])
     form = sources_form(alone, data.site, alone.query)
     return replace(form, predictor=Predictor(alone, data.site))
 

@@ -79,7 +79,7 @@ def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
     assert (said.mean - batch.target).square().mean() < 0.01 * batch.target.square().mean()
 
 
-def test_far_away_all_is_unknown_and_at_data_little(trained):
+def test_all_is_unknown_far_away_and_little_at_data(trained):
     method, data, fold = trained
     tx, rx = _ends(data, fold.train)
     far = method.predict(tx[:10] + torch.tensor([9.0, -8.0, 3.0]), rx)

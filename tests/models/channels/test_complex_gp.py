@@ -5,17 +5,15 @@ import pytest
 import torch
 from releases import REAL
 from rooms import nmse, shoebox
+from scenes import error
 
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.models.channels import complex_gp
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.image_sources.run_factors import run_factors
-from gsparc.models.registry import method_class
 from gsparc.physics.waves import LIGHT
 from gsparc.prediction.predictor import Predictor
-from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.factor import Factor
 from gsparc.training.context import FitContext
 
 CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
@@ -23,49 +21,60 @@ CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
 
 def _dense():
     """Receivers a third of a wavelength apart: close enough to interpolate without sources."""
-    return shoebox(260, size=(0.7, 0.6, 0.6), max_order=1)
+    _, data, fold = shoebox(260, size=(0.7, 0.6, 0.6), max_order=1)
+    return data, fold
 
 
-def test_between_dense_receivers_and_back_from_disk(tmp_path):
-    _, data, fold = _dense()
+def _fit(data, fold):
     method = ComplexGP()
-    report = method.fit(data, fold, FitContext(tmp_path))
+    return method, method.fit(data, fold, FitContext()).notes
+
+
+def _restored(method, site, folder):
+    torch.save(method.state(), folder / "state.pt")
+    again = ComplexGP()
+    again.restore(site, torch.load(folder / "state.pt", weights_only=True))
+    return again
+
+
+def test_dense_receivers_tell_and_far_away_nothing_is_said(tmp_path):
+    data, fold = _dense()
+    method, notes = _fit(data, fold)
     batch = data.batch(fold.test)
     prediction = method.predict(batch.tx, batch.rx)
     assert nmse(prediction.mean.numpy(), batch.target.numpy()) < 0.3
-    error = (prediction.mean - batch.target).abs().square().mean()
-    assert 0.2 < prediction.variance.mean() / error < 5
-    assert report.notes[0].startswith("complex_gp: envelope")
-    torch.save(method.state(), tmp_path / "state.pt")
-    again = ComplexGP()
-    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    missed = (prediction.mean - batch.target).abs().square().mean()
+    assert 0.2 < prediction.variance.mean() / missed < 5
+    assert len(notes) == 1 and notes[0].startswith("complex_gp: envelope")
+    again = _restored(method, data.site, tmp_path)
     torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, prediction.mean)
+    one_run, _ = _fit(replace(data, run=np.full(len(data), 3)), fold)
+    assert torch.equal(one_run.predict(batch.tx, batch.rx).mean, prediction.mean)
+    far = method.predict(batch.tx, replace(batch.rx, position=batch.rx.position + 1000))
+    assert far.mean.abs().max() < 1e-3 and far.confidence.max() < 1e-3
 
 
 def test_many_rows_are_told_by_the_nearest(tmp_path, monkeypatch):
-    _, data, fold = _dense()
-    whole, near = ComplexGP(), ComplexGP()
-    whole.fit(data, fold, FitContext(tmp_path))
+    data, fold = _dense()
+    whole, _ = _fit(data, fold)
     monkeypatch.setattr(complex_gp, "MOST_ROWS", 100)
-    notes = near.fit(data, fold, FitContext(tmp_path)).notes
+    near, notes = _fit(data, fold)
     assert near.label == "complex_gp (Vecchia 100)" and whole.label == "complex_gp"
     assert any("predicted from the 100 nearest" in note for note in notes), notes
     batch = data.batch(fold.test)
     said, exactly = (method.predict(batch.tx, batch.rx) for method in (near, whole))
     errors = [nmse(found.mean.numpy(), batch.target.numpy()) for found in (said, exactly)]
     assert errors[0] < 1.5 * errors[1] < 0.4, errors
-    error = (said.mean - batch.target).abs().square().mean()
-    assert 0.2 < said.variance.mean() / error < 5
+    missed = (said.mean - batch.target).abs().square().mean()
+    assert 0.2 < said.variance.mean() / missed < 5
     left, all_left = near.leave_one_out(), whole.leave_one_out()
     assert left.residual.shape == all_left.residual.shape
     assert 0.7 < float(left.residual.abs().square().mean() / all_left.residual.abs().square().mean()) < 1.7
-    torch.save(near.state(), tmp_path / "state.pt")
-    again = ComplexGP()
-    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    again = _restored(near, data.site, tmp_path)
     assert torch.equal(again.predict(batch.tx, batch.rx).mean, said.mean)
 
 
-def test_places_visited_again_hid_all_others_from_the_nearest_rows(tmp_path, monkeypatch):
+def test_places_visited_again_hid_all_others_from_the_nearest_rows(monkeypatch):
     """From 6,001 rows on the nearest hundred were visits of one place: NMSE .31 for .07 with fewer."""
     monkeypatch.setattr(complex_gp, "NEAREST", 24)
     rng = np.random.default_rng(0)
@@ -81,8 +90,8 @@ def test_places_visited_again_hid_all_others_from_the_nearest_rows(tmp_path, mon
         monkeypatch.setattr(complex_gp, "MOST_ROWS", most)
         csi = np.exp(1j * place[visits] @ waves.T) @ power + noise
         data = from_arrays({**arrays, "rx_position": place[visits], "csi": csi})
-        method, rows = ComplexGP(), np.arange(400)
-        notes = method.fit(data, Fold(rows, rows[:0], rows[:5]), FitContext(tmp_path)).notes
+        rows = np.arange(400)
+        method, notes = _fit(data, Fold(rows, rows[:0], rows[:5]))
         found = Predictor(method, data.site).csi(rx=asked)[:, 0, 0]
         errors.append(nmse(found, np.exp(1j * asked @ waves.T) @ power))
     assert any("nearest of 50 places, of 400 rows" in note for note in notes)
@@ -91,24 +100,9 @@ def test_places_visited_again_hid_all_others_from_the_nearest_rows(tmp_path, mon
     assert len(left.rows) == len(left.residual) == 50 and (np.diff(left.rows) > 0).all()
 
 
-def test_far_from_all_measurements_it_says_nothing(tmp_path):
-    _, data, fold = _dense()
-    method = ComplexGP()
-    method.fit(data, fold, FitContext(tmp_path))
-    batch = data.batch(fold.test[:1])
-    far = method.predict(batch.tx, type(batch.rx)(batch.rx.position + 1000, batch.rx.rotation))
-    assert far.mean.abs().max() < 1e-3
-    assert far.confidence.item() < 1e-3
-
-
-def test_it_has_its_name():
-    assert method_class("complex_gp") is ComplexGP
-    assert np.isclose(ComplexGP().size(), 0)
-
-
 def _in_runs(factors, seed=0):
     """Dense receivers, each in one of several runs that share a factor; the largest run's is 1."""
-    _, data, fold = _dense()
+    data, fold = _dense()
     odds = np.array([0.5, *[0.5 / (len(factors) - 1)] * (len(factors) - 1)])
     run = np.random.default_rng(seed).choice(len(factors), len(data), p=odds)
     target = data.target * np.asarray(factors, np.complex64)[run][:, None, None]
@@ -121,8 +115,7 @@ def test_runs_are_brought_together(tmp_path):
     truth = clean.batch(fold.test).target.numpy()
     errors = {}
     for name, data in (("one", clean), ("known", spread), ("ignored", replace(spread, run=None))):
-        method = ComplexGP()
-        notes = method.fit(data, fold, FitContext(tmp_path)).notes
+        method, notes = _fit(data, fold)
         batch = data.batch(fold.test)
         errors[name] = nmse(method.predict(batch.tx, batch.rx).mean.numpy(), truth)
         if name == "known":
@@ -133,9 +126,7 @@ def test_runs_are_brought_together(tmp_path):
             found = [method.turned.numpy()[spread.run[known] == number][0] for number in (5, 6, 7)]
             ratio = np.array(found) / factors
             assert np.abs(np.angle(ratio)).max() < 0.1 and np.abs(np.log(np.abs(ratio))).max() < 0.3
-            torch.save(method.state(), tmp_path / "state.pt")
-            again = ComplexGP()
-            again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+            again = _restored(method, data.site, tmp_path)
             torch.testing.assert_close(again.leave_one_out().residual, method.leave_one_out().residual)
     assert errors["known"] < 1.5 * errors["one"] < 0.5 * errors["ignored"], errors
 
@@ -143,14 +134,11 @@ def test_runs_are_brought_together(tmp_path):
 def test_rows_of_other_runs_were_scored_in_the_phase_of_the_largest(tmp_path):
     """A right prediction of a row in another run's phase was an error of up to four times its power."""
     _, spread, fold = _in_runs([1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)])
-    method = ComplexGP()
-    method.fit(spread, fold, FitContext(tmp_path))
+    method, _ = _fit(spread, fold)
     batch = spread.batch(fold.test)
-    truth, here = batch.target.numpy(), method.answer(batch)
-    assert nmse(here.mean.numpy(), truth) < 0.2 * nmse(method.predict(batch.tx, batch.rx).mean.numpy(), truth)
-    again = ComplexGP()
-    again.restore(spread.site, method.state())
-    assert torch.equal(again.answer(batch).mean, here.mean)
+    here = method.answer(batch).mean
+    assert nmse(here.numpy(), batch.target.numpy()) < 0.2 * error(method, spread, fold.test)
+    assert torch.equal(_restored(method, spread.site, tmp_path).answer(batch).mean, here)
     strange = replace(batch, run=torch.full((len(batch),), 99))
     assert torch.equal(method.answer(strange).mean, method.predict(batch.tx, batch.rx).mean)
 
@@ -168,46 +156,15 @@ def test_factors_of_many_runs():
     assert np.allclose(found / wanted, (found / wanted).mean(), rtol=0.02)
 
 
-def test_one_run_is_no_run(tmp_path):
-    _, data, fold = _dense()
-    batch, said = data.batch(fold.test), []
-    for run in (None, np.full(len(data), 3)):
-        method = ComplexGP()
-        assert len(method.fit(replace(data, run=run), fold, FitContext(tmp_path)).notes) == 1
-        said.append(method.predict(batch.tx, batch.rx).mean)
-    assert torch.equal(*said)
-
-
-def test_settings_of_many_rows_are_chosen_on_some(tmp_path, monkeypatch):
+def test_settings_of_many_rows_are_chosen_on_some(monkeypatch):
     monkeypatch.setattr(complex_gp, "CHOSEN_ON", 100)
-    _, data, fold = _dense()
-    method = ComplexGP()
-    known = len(fold.train) + len(fold.val)
-    assert f"on 100 of {known} rows, drawn evenly" in method.fit(data, fold, FitContext(tmp_path)).notes[1]
-    batch = data.batch(fold.test)
-    assert nmse(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()) < 0.3
+    data, fold = _dense()
+    method, notes = _fit(data, fold)
+    assert f"on 100 of {len(fold.train) + len(fold.val)} rows, drawn evenly" in notes[1]
+    assert error(method, data, fold.test) < 0.3
 
 
-def _alike(count=300):
-    """Rows that see one source alike to the last digit, float32: a covariance that has no factor as it is."""
-    wave = torch.exp(1j * torch.linspace(0, 60, count)).to(torch.complex64)[:, None]
-    return 50 * (wave @ wave.mH)
-
-
-def test_a_ridge_mends_what_rounding_broke():
-    covariance = _alike()
-    assert torch.linalg.cholesky_ex(covariance)[1] > 0
-    lower = Factor.of(covariance).lower
-    assert torch.allclose(lower @ lower.mH, covariance, atol=0.05 * 50)
-    assert np.isfinite(Conditioned.of(covariance, covariance[:, :1]).nll)
-    sound = covariance + 10 * torch.eye(len(covariance))
-    lower = Factor.of(sound).lower
-    torch.testing.assert_close(lower @ lower.mH, sound)
-    with pytest.raises(ValueError, match="no Cholesky factor"):
-        Factor.of(-torch.eye(3))
-
-
-def test_channels_without_noise(tmp_path):
+def test_channels_without_noise():
     """4 antennas x 52 tones at 5.18 GHz, two receivers a hair apart: nearly the same row twice."""
     rng = np.random.default_rng(1)
     place = rng.uniform([0.2, 0.2, 0.5], [7.8, 5.8, 2.0], (120, 3))
@@ -220,14 +177,12 @@ def test_channels_without_noise(tmp_path):
         {**arrays, "csi": np.exp(-2j * np.pi * tones * far / 299792458.0) / far}, {"name": "ofdm"}
     )
     rows = np.arange(120)
-    method = ComplexGP()
-    method.fit(data, Fold(rows[:-1], rows[:0], rows[-1:]), FitContext(tmp_path))
-    batch = data.batch(rows[-1:])
-    assert nmse(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()) < 0.1
+    method, _ = _fit(data, Fold(rows[:-1], rows[:0], rows[-1:]))
+    assert error(method, data, rows[-1:]) < 0.1
 
 
 @pytest.mark.skipif(not CHANNELS.is_file(), reason="measured channels are not beside this checkout")
-def test_two_measured_runs_differ_by_one_phase(tmp_path):
+def test_two_measured_runs_differ_by_one_phase():
     """Antenna 0: with its own factor the other run helps; without, it harms."""
     with np.load(CHANNELS) as stored:
         used = np.flatnonzero(stored["mask"][:, 0])
@@ -238,9 +193,5 @@ def test_two_measured_runs_differ_by_one_phase(tmp_path):
     data = from_arrays(arrays, {"name": "ceiling"})
     drawn = np.random.default_rng(0).permutation(np.flatnonzero(run == 0))
     fold = Fold(np.setdiff1d(np.arange(len(run)), drawn[:150]), drawn[:0], drawn[:150])
-    batch, errors = data.batch(fold.test), []
-    for known in (run, None):
-        method = ComplexGP()
-        method.fit(replace(data, run=known), fold, FitContext(tmp_path))
-        errors.append(nmse(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()))
+    errors = [error(_fit(replace(data, run=known), fold)[0], data, fold.test) for known in (run, None)]
     assert errors[0] < 0.35 and errors[0] < 0.95 * errors[1], errors

@@ -7,6 +7,7 @@ import pytest
 import torch
 from releases import REAL
 from rooms import WAVELENGTH, nmse
+from scenes import answer_error
 
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
@@ -55,12 +56,9 @@ def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), run
     return from_arrays({**arrays, **run, "frequency_hz": np.array([2.4e9])})
 
 
-def _fold(data):
-    return make_split(data.moving, SplitSettings(name="random"), place=data.place).folds[0]
-
-
-def _known(fold):
-    return np.concatenate([fold.train, fold.val])
+def _fold(data, **split):
+    settings = SplitSettings(**{"name": "random", **split})
+    return make_split(data.moving, settings, place=data.place).folds[0]
 
 
 def _tied(data, rows):
@@ -68,10 +66,11 @@ def _tied(data, rows):
     angles = sphere(16)[:8]
     shape = Shape(angles, 5.0, True, True, False, middle, 20.0)
     power = torch.rand(len(shape.names), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
-    lengths = torch.tensor([0.6, 0.4], dtype=torch.float64)
-    tilt = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
-    values = Values(power, lengths[0], lengths[1], torch.tensor([0.01, -0.02, 0.0]).double(), tilt)
-    field = ChannelField(data.site, shape, values, (1, 1))
+    envelope, gain = torch.tensor([0.6, 0.4], dtype=torch.float64)
+    learned = {"power": power, "envelope": envelope, "gain": gain}
+    learned["towards"] = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
+    learned["offset"] = torch.tensor([0.01, -0.02, 0.0]).double()
+    field = ChannelField(data.site, Values(**shape.state(), **learned), (1, 1))
     field.condition(data, rows)
     return field
 
@@ -90,14 +89,14 @@ def test_knots_add_up_and_mirrored_directions_count_alike():
 def test_each_end_has_the_covariance_of_its_own_powers():
     data = _ceiling()
     field = _tied(data, np.arange(len(data)))
-    shape, values, slots = field.shape, field._held, [one.group.slot for one in field.weights]
+    values, slots = field._constants, [one.group.slot for one in field.weights]
     places = field.weights[0].group.places[:10]
-    powers = directional(shape, values, slots)
-    together = diffuse_of(shape, values, K, powers, places, places)
+    powers = directional(values, slots)
+    together = diffuse_of(values, K, powers, places, places)
     for number in (0, 3):
-        alone = diffuse_of(shape, values, K, powers[number : number + 1], places, places)[0]
+        alone = diffuse_of(values, K, powers[number : number + 1], places, places)[0]
         torch.testing.assert_close(together[number], alone)
-        level = prior(replace(shape, direct=False, constant=False), values, slots[number], places)
+        level = prior(replace(values, direct=False, constant=False), slots[number], places)
         torch.testing.assert_close(alone.diagonal().real, level)
     assert not torch.allclose(powers[0], powers[1])
 
@@ -105,14 +104,12 @@ def test_each_end_has_the_covariance_of_its_own_powers():
 def test_one_field_of_all_ends_is_better_than_plain_processes():
     data = _ceiling(shift=(0.03, -0.02, 0.0))
     fold = _fold(data)
-    field, notes = initialise(data, _known(fold), QUICK)
+    field, notes = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
     assert len(field.stations) == 6 and any("angles to ends" in note for note in notes)
     assert not learns(field)  # the likelihood of all rows has found its parameters
-    batch, plain = data.batch(fold.test), for_links(ComplexGP, data)
+    plain = for_links(ComplexGP, data)
     plain.fit(data, fold, FitContext())
-    with torch.no_grad():
-        own = nmse(field.answer(batch).mean.numpy(), batch.target.numpy())
-    assert own < 0.7 * nmse(plain.answer(batch).mean.numpy(), batch.target.numpy())
+    assert answer_error(field, data, fold.test) < 0.7 * answer_error(plain, data, fold.test)
 
 
 def test_an_end_that_was_never_heard_has_the_direct_wave():
@@ -148,15 +145,15 @@ def test_runs_of_all_ends_differ_by_one_phase():
     runs = np.arange(80) % 2
     data = _ceiling(runs=runs)
     fold = _fold(data)
-    field, _ = initialise(data, _known(fold), QUICK)
+    field, _ = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
     found = field.runs.factors[1] / field.runs.factors[0]
     torch.testing.assert_close(found.abs(), torch.ones(()).double())
     assert abs(abs(float(found.angle())) - 0.9) < 0.1
     batch = data.batch(fold.test)
     with torch.no_grad():
-        right, turned = field.answer(batch).mean, field(batch.tx, batch.rx, batch.station).mean
-    target = batch.target.numpy()
-    assert nmse(right.numpy(), target) < 0.5 * nmse(turned.numpy(), target)
+        turned = field(batch.tx, batch.rx, batch.station).mean
+    right = answer_error(field, data, fold.test)
+    assert right < 0.5 * nmse(turned.numpy(), batch.target.numpy())
 
 
 def test_there_and_back_with_angles_to_ends(tmp_path):
@@ -193,10 +190,9 @@ def test_stations_together_are_asked_for_any_pair():
 def test_methods_of_one_end_are_refused_as_before():
     data = _ceiling(ends=3, count=30)
     rows = np.arange(len(data))
+    fold, method = Fold(rows, rows[:0], rows[:0]), for_links(ImageSourceGP, data)
     with pytest.raises(ValueError, match="stations=each"):
-        for_links(ImageSourceGP, data).fit(
-            data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together")
-        )
+        method.fit(data, fold, FitContext(stations="together"))
 
 
 CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
@@ -208,14 +204,11 @@ def test_measured_ceiling_in_squares():
     from gsparc.data.datasets.techtile import Techtile
 
     data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
-    split = make_split(data.moving, SplitSettings(name="blocks", side_m=0.6), place=data.place)
-    fold = split.folds[0]
-    field, _ = initialise(data, _known(fold), ChannelSettings())
-    plain, batch = for_links(ComplexGP, data), data.batch(fold.test)
+    fold = _fold(data, name="blocks", side_m=0.6)
+    field, _ = initialise(data, np.concatenate([fold.train, fold.val]), ChannelSettings())
+    plain = for_links(ComplexGP, data)
     plain.fit(data, fold, FitContext())
-    with torch.no_grad():
-        own = nmse(field.answer(batch).mean.numpy(), batch.target.numpy())
-    assert own < 0.55 * nmse(plain.answer(batch).mean.numpy(), batch.target.numpy())
+    assert answer_error(field, data, fold.test) < 0.55 * answer_error(plain, data, fold.test)
 
 
 @pytest.mark.slow

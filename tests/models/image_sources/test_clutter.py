@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gains import gains
+from gains import gains, phased
 from rooms import PILLAR, WAVELENGTH, shoebox
 
 from gsparc.models.image_sources.clutter import finite_mirrors, search
@@ -18,13 +18,13 @@ from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.clutter.residual import Residual
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.gp_likelihood import Scene
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import Query
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import all_sequences
-from gsparc.processes.worker import Cancelled, cancelled_by
+from gsparc.processes.worker import Cancelled, cancelled_by, late_when
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
@@ -97,9 +97,6 @@ def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
     straight = torch.cdist(scene.sources, places)
     length = (paths.end - paths.start).norm(dim=-1).sum(-1)
     torch.testing.assert_close(length.double(), straight, rtol=1e-4, atol=1e-4)
-
-
-def test_a_sequence_beyond_its_mirror_is_not_valid():
     behind = torch.tensor([[-1.0, 1.0, 1.0]], dtype=torch.float64)
     assert not Unfolding.of(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
 
@@ -132,15 +129,14 @@ def test_concatenated_scenes_do_not_interact():
 
 def test_batched_queries_and_variance_include_clutter():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
-    phased = [PhasedScene(_scene(_boxed(_box())), torch.arange(7.0), 0.2)]
-    phased.append(PhasedScene(_scene(Clutter.none()), torch.arange(7.0), 0.2))
-    members = [PhasedPosterior(rows, each) for each in phased]
+    scenes = [_scene(_boxed(_box())), _scene(Clutter.none())]
+    members = [Posterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
     queries = _rows(6, seed=5).position
     tone = torch.tensor([2.4e9], dtype=torch.float64)
     means, variance, _ = Query(members).means(queries, tone)
     for member, mean in zip(members, means, strict=True):
         asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
-        waves = member.phased.unobstructed(asked) * torch.polar(torch.ones(()), -member.phased.phase)
+        waves = member.scene.over(member.scene.sequences).unobstructed(asked)
         expected = (waves[:, :, None] * gains(member, queries)).sum(1)
         torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
     bare = Query(members[1:]).means(queries, tone)[1]
@@ -149,10 +145,10 @@ def test_batched_queries_and_variance_include_clutter():
 
 def test_residual_is_the_same_likelihood():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
-    residual = Residual(rows, PhasedScene(_scene(_boxed(_box())), torch.arange(7.0), 0.2))
-    scene = residual.phased.scene
+    residual = Residual(rows, phased(_scene(_boxed(_box())), torch.arange(7.0)))
+    scene = residual.scene
     seen = scene.visible_share(rows.position).T
-    expected = PhasedPosterior(rows, residual.phased).conditioned.nll
+    expected = Posterior(rows, residual.scene).nll
     assert residual.nll(seen, scene.log_amplitude).item() == pytest.approx(expected, rel=1e-4)
     gains = residual.nats_per_source(seen, scene.log_amplitude)
     quiet = scene.log_amplitude.clone()
@@ -163,19 +159,13 @@ def test_residual_is_the_same_likelihood():
 
 def test_score_is_what_the_best_multiple_gains():
     rows = replace(_rows(20), target=torch.randn(20, 1, dtype=torch.complex64))
-    phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
-    residual = Residual(rows, phased)
-    seen, log_amplitude = torch.ones(7, 20), residual.phased.scene.log_amplitude
-    scorer = residual.scorer(seen, log_amplitude)
+    scene, scorer = _unexplained(rows, _bare())
     change = torch.randn(20, 8, dtype=torch.complex64)
     score, multiple = scorer.score_positive(change)
     best = int(score.argmax())
-    moved = rows.target[:, 0] - multiple[best] * change[:, best]
-    posterior = [
-        PhasedPosterior(replace(rows, target=target[:, None]), residual.phased).conditioned.nll
-        for target in (rows.target[:, 0], moved)
-    ]
-    assert score[best].item() == pytest.approx(posterior[0] - posterior[1], rel=0.02)
+    moved = replace(rows, target=rows.target - (multiple[best] * change[:, best])[:, None])
+    gain = Posterior(rows, scene).nll - Posterior(moved, scene).nll
+    assert score[best].item() == pytest.approx(gain, rel=0.02)
 
 
 def _truth(scene: Scene, rows: Rows, noise: float = 0.02) -> Rows:
@@ -188,17 +178,27 @@ def _truth(scene: Scene, rows: Rows, noise: float = 0.02) -> Rows:
 
 def test_the_pillar_is_found_by_its_shadow():
     rows = _truth(_scene(_boxed(_box())), _rows(150))
-    phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
-    residual = Residual(rows, phased)
-    scene = residual.phased.scene
-    scorer = residual.scorer(torch.ones(7, 150), scene.log_amplitude)
+    start = _bare()
+    scene, scorer = _unexplained(rows, start)
     box, score = find_box(
-        scorer, scene.unfolding.paths(rows.position), phased.unobstructed(rows), _room(),
+        scorer, scene.unfolding.paths(rows.position), start.unobstructed(rows), _room(),
         torch.Generator().manual_seed(0), draws=500,
     )  # fmt: skip
     assert score > 20
     middle = (box[:2] + box[3:5]) / 2
     torch.testing.assert_close(middle, torch.tensor([1.8, 1.4]), atol=0.25, rtol=0)
+
+
+def _bare(sources: int = 7) -> Scene:
+    """A shoebox of known phases without clutter."""
+    return phased(_scene(Clutter.none()), torch.zeros(sources))
+
+
+def _unexplained(rows: Rows, start: Scene) -> tuple:
+    """The scene with its noise, and the scorer of what it leaves."""
+    residual = Residual(rows, start)
+    seen = torch.ones(len(start.sequences), len(rows))
+    return residual.scene, residual.scorer(seen, residual.scene.log_amplitude)
 
 
 def _beside_a_table(count: int) -> tuple:
@@ -207,23 +207,17 @@ def _beside_a_table(count: int) -> tuple:
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
     true = Scene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
     rows = _truth(true, _rows(count))
-    residual = Residual(rows, PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2))
-    scene = residual.phased.scene
-    scorer = residual.scorer(torch.ones(7, count), scene.log_amplitude)
+    scene, scorer = _unexplained(rows, _bare())
     return rows, scorer, clutter, walls(scene.planes, scene.sequences)
 
 
 def test_a_table_top_is_found_by_its_reflections():
     rows, scorer, clutter, numbers = _beside_a_table(200)
     best = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)[0]
-    assert best.plane[2].abs() == 1
+    assert best.plane[2].abs() == 1 and best.score > 15
     assert (best.plane[3] * best.plane[2] - 0.75).abs() < WAVELENGTH
-    assert best.score > 15
-    lower, upper = best.patch.view(2, 2)
-    middle = (lower + upper) / 2
-    torch.testing.assert_close(
-        middle, (clutter.patches[0, :2] + clutter.patches[0, 2:]) / 2, atol=0.4, rtol=0
-    )
+    found, true = (patch.view(2, 2).mean(0) for patch in (best.patch, clutter.patches[0]))
+    torch.testing.assert_close(found, true, atol=0.4, rtol=0)
 
 
 def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
@@ -251,10 +245,13 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 4 * _room(), 3)
     assert max(np.diff([*spent, time.thread_time()])) < 0.5
     room, cells = 20 * _room(), []
+
+    def nothing(*args) -> tuple:
+        cells.append((len(args[4]), args[7]))
+        return torch.zeros(len(args[4])), torch.zeros(len(args[4]), 4)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            finite_mirrors, "_raster", lambda *a: cells.append((len(a[4]), a[7])) or _nothing(len(a[4]))
-        )
+        patch.setattr(finite_mirrors, "_raster", nothing)
         patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
         find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers[:1], room, 3)
     count = sum(planes for planes, _ in cells) * math.prod(
@@ -263,20 +260,16 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
     assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
 
 
-def _nothing(count: int) -> tuple:
-    return torch.zeros(count), torch.zeros(count, 4)
-
-
-def test_clutter_found_before_the_clock_is_kept_and_an_unwanted_search_ends():
+def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
     """A round of everything went on after the clock; now each step is left in the middle."""
     rows, *_ = _beside_a_table(60)
-    phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
-    looks: list[int] = []
+    start, looks = _bare(), []
     late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
-    found = find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
-    assert isinstance(found, PhasedScene) and len(looks) < 60
+    with late_when(late):
+        found = find_clutter(rows, start, torch.Generator().manual_seed(0))
+    assert isinstance(found, Scene) and len(looks) < 60
     with cancelled_by(lambda: True), pytest.raises(Cancelled):
-        find_clutter(rows, phased, torch.Generator().manual_seed(0), late)
+        find_clutter(rows, start, torch.Generator().manual_seed(0))
 
 
 def test_an_infinite_mirror_becomes_finite():
@@ -284,13 +277,11 @@ def test_an_infinite_mirror_becomes_finite():
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
     true = Scene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
     rows = _truth(true, _rows(250))
-    phased = PhasedScene(replace(true, clutter=Clutter.none()), torch.zeros(10), 0.2)
-    residual = Residual(rows, phased)
-    scene, paths = residual.phased.scene, true.unfolding.paths(rows.position)
-    scorer = residual.scorer(torch.ones(10, 250), scene.log_amplitude)
-    generator = torch.Generator().manual_seed(0)
+    start = phased(replace(true, clutter=Clutter.none()), torch.zeros(10))
+    paths, generator = true.unfolding.paths(rows.position), torch.Generator().manual_seed(0)
+    _, scorer = _unexplained(rows, start)
     patch, score = find_patch(
-        scorer, paths, sequences, 6, TABLE, phased.unobstructed(rows), _room(), generator
+        scorer, paths, sequences, 6, TABLE, start.unobstructed(rows), _room(), generator
     )  # fmt: skip
     assert score > 10
     learned, told = (
@@ -300,27 +291,27 @@ def test_an_infinite_mirror_becomes_finite():
     assert (learned == told).float().mean() > 0.85
 
 
-def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room(monkeypatch):
+def test_a_pillar_is_clutter_and_an_empty_room_has_none(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     for name, value in {"EPOCHS": 1, "BOXES": 2, "MIRRORS": 1}.items():
         monkeypatch.setattr(search, name, value)
     for clutter, boxes in ((_boxed(_box()), True), (Clutter.none(), False)):
         rows = _truth(_scene(clutter), _rows(150))
-        start = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
+        start = _bare()
         found = find_clutter(rows, start, generator)
-        assert bool(len(found.scene.clutter.boxes)) == boxes
-        bare, learned = (PhasedPosterior(rows, each).conditioned.nll for each in (start, found))
+        assert bool(len(found.clutter.boxes)) == boxes
+        bare, learned = (Posterior(rows, each).nll for each in (start, found))
         assert learned <= bare
-    assert not len(found.scene.clutter)
+    assert not len(found.clutter)
 
 
 def test_walls_of_equal_phase_shift_give_a_phase_prior():
     scene = _scene(Clutter.none())
     phase = torch.tensor([0.3, *[0.3 + np.pi] * 6]) + 0.1 * torch.tensor([0.0, 1, -1, 1, -1, 1, -1])
-    phase_prior = ReflectionPhasePrior.of(PhasedScene(scene, phase, 0.2))
+    phase_prior = ReflectionPhasePrior.of(phased(scene, phase))
     assert phase_prior.turn == pytest.approx(np.pi)
     assert phase_prior.concentration > 3
     expected = phase_prior.expected(phase[0], ((0, 1),))
     assert torch.cos(expected - 0.3).item() == pytest.approx(1.0, abs=1e-5)
-    scattered = PhasedScene(scene, torch.arange(7.0) * 2.1, 0.2)
+    scattered = phased(scene, torch.arange(7.0) * 2.1)
     assert ReflectionPhasePrior.of(scattered).concentration < phase_prior.concentration

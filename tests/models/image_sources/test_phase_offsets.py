@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gains import fitted
 from rooms import nmse, shoebox
 
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.phase_offsets import estimate
-from gsparc.training.context import FitContext
 
 FREQUENCY = 2.4e9 + np.arange(16) * 5e6
 SMALL = (3.0, 2.5, 2.2)
@@ -42,35 +42,20 @@ def test_tones_not_measured_do_not_count():
     assert np.abs(np.angle(np.exp(1j * (found.phase - phase)))).max() < 1e-4
 
 
-def _fit(data, fold, tmp_path, offsets):
-    method = ImageSourceGP(searches=1, search_rows=300, margin=4.0, offsets=offsets)
-    method.fit(data, fold, FitContext(tmp_path))
-    return method
-
-
-def _scalar_nmse(predicted, true):
-    """After one free complex number per sample: unseen snapshots have unknown phases too."""
-    scalar = (predicted.conj() * true).sum((1, 2)) / (np.abs(predicted) ** 2).sum((1, 2))
-    return nmse(predicted * scalar[:, None, None], true)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("offsets", ["phase", "phase_timing"])
-def test_sources_are_found_through_unknown_offsets(offsets, tmp_path):
+@pytest.mark.parametrize("offsets", ["none", "phase", "phase_timing"])
+def test_sources_are_found_through_unknown_offsets_that_are_estimated(offsets, tmp_path):
+    """After one free complex number per sample: unseen snapshots have unknown phases too."""
     _, data, fold = shoebox(150, size=SMALL, max_order=1, frequency_hz=FREQUENCY, reflection=-0.5)
     _, _, seen = _offset(data, offsets == "phase_timing")
+    method, _ = fitted(seen, fold, tmp_path, search_rows=300, offsets=offsets)
     batch = data.batch(fold.test)
-    predicted = _fit(seen, fold, tmp_path, offsets).predict(batch.tx, batch.rx).mean.numpy()
-    assert _scalar_nmse(predicted, batch.target.numpy()) < 0.01
-
-
-@pytest.mark.slow
-def test_without_estimating_offsets_nothing_is_learned(tmp_path):
-    _, data, fold = shoebox(150, size=SMALL, max_order=1, frequency_hz=FREQUENCY, reflection=-0.5)
-    _, _, seen = _offset(data, False)
-    batch = data.batch(fold.test)
-    predicted = _fit(seen, fold, tmp_path, "none").predict(batch.tx, batch.rx).mean.numpy()
-    assert nmse(predicted, batch.target.numpy()) > 0.5
+    found, true = method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()
+    scalar = (found.conj() * true).sum((1, 2)) / (np.abs(found) ** 2).sum((1, 2))
+    if offsets == "none":
+        assert nmse(found, true) > 0.5
+    else:
+        assert nmse(found * scalar[:, None, None], true) < 0.01
 
 
 def test_unknown_kind_of_offset_is_refused():

@@ -76,7 +76,7 @@ def test_seconds_of_the_wall_are_not_taken_off_a_budget_of_the_processor(tmp_pat
 def test_what_a_hurried_search_found_is_the_machines_also_when_it_is_reused(tmp_path, monkeypatch):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
     run = ensemble.Search.run
-    monkeypatch.setattr(ensemble.Search, "run", lambda self: (self.late(), run(self))[1])
+    monkeypatch.setattr(ensemble.Search, "run", lambda self: (self.last_round(), run(self))[1])
     _fit(data, fold, tmp_path, searches=1, budget_s=1e-3)
     assert _fit(data, fold, tmp_path / "b", tmp_path / "last.ckpt", searches=1)[1].limited_by == "wall"
 

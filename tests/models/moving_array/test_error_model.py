@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from distances import far
 
 from gsparc.models.moving_array.error_model import ErrorModel, _variance, fit_error_model
 from gsparc.processes.kernel import Kernel
@@ -15,12 +16,9 @@ def fit(places, errors, observed):
     return fit_error_model(places, errors, observed, KERNEL, REACH, PRIOR)
 
 
-def far(queries, places):
-    return torch.cdist(*(torch.from_numpy(value) for value in (queries, places))).float()
-
-
 def said_of(model, places, queries, observed):
-    return model.relative_error(far(queries, places), torch.from_numpy(observed).float())[0].numpy()
+    distances = far(queries, places)
+    return model.relative_error(distances, torch.from_numpy(observed).float())[0].numpy()
 
 
 def features(count, seed=0):
@@ -53,14 +51,11 @@ def test_a_feature_correlated_with_the_error_is_used():
     assert np.corrcoef(np.log(said), features(100, 2)[:, 1])[0, 1] > 0.95
 
 
-def test_the_error_grows_far_away_and_stays_finite(half_bad):
+def test_the_error_grows_far_away_to_that_of_an_image_drawn_at_random(half_bad):
+    """Near rows it is the relative one."""
     away = np.array([[10.0, 4, 1.3], [13.0, 4, 1.3], [1e4, 4, 1.3]])
     near, off, lost = said_of(*half_bad, away, features(3))
     assert near < off < lost and np.isfinite(lost)
-
-
-def test_nothing_is_known_far_away(half_bad):
-    """The error there is that of an image drawn at random; near rows it is the relative one."""
     away = np.array([[5.0, 4, 1.3], [1e2, 4, 1.3]])
     model, places = half_bad
     observed = torch.from_numpy(features(2)).float()

@@ -1,5 +1,6 @@
 import numpy as np
 import torch
+from distances import far
 
 from gsparc.models.moving_array.residual import fit_residual, left_out_error, principal
 from gsparc.processes.kernel import Kernel
@@ -14,10 +15,6 @@ def rows(count=40, seed=0):
     waves = np.sin(places @ rng.normal(size=(3, 6)) + rng.uniform(0, 6, 6))
     values = waves @ rng.normal(size=(6, 30)) + 0.01 * rng.normal(size=(count, 30)) + 1
     return places, torch.from_numpy(values).float()
-
-
-def far(a, b):
-    return torch.cdist(torch.from_numpy(a).float(), torch.from_numpy(b).float())
 
 
 def test_left_out_predictions_are_those_of_the_others(monkeypatch):
@@ -43,15 +40,11 @@ def test_axes_are_spared_that_predictions_do_not_need():
     assert fewer.axes.shape == (2, 30) and fewer.weights.shape == (40, 2)
 
 
-def test_without_axes_the_mean_remains():
+def test_without_axes_the_mean_remains_and_the_kernel_of_smooth_rows_is_found():
     places, values = rows()
     residual, predicted = fit_residual(KERNEL, places, values, 0)
     torch.testing.assert_close(residual.coefficients(far(places[:2], places)), values.mean(0).expand(2, 30))
     assert predicted.shape == values.shape
-
-
-def test_the_kernel_of_smooth_rows_is_found():
-    places, values = rows()
     error, kernel = left_out_error(places, values)
     assert error < 0.2 * float((values - values.mean(0)).square().sum(1).mean()) and kernel.noise < 0.1
 

@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 SMALLEST, LARGEST = 0.2, 3.0  # [m] sides of random patches
 MIN_SIDE = 0.05  # [m]
+DRAWS = 300  # random patches, of which the best evolve
 PARALLEL = 0.999  # cosine of normals that are taken as equal
 CELL = 0.35  # [m], of the raster that small mirrors are searched on; larger where it has more than MOST_CELLS
 STEP = 0.08  # of a wavelength, between candidate planes
@@ -47,7 +48,6 @@ def find_patch(
     visible_waves: Tensor,
     room: Tensor,
     generator: torch.Generator,
-    draws: int = 300,
 ) -> tuple[Tensor, float]:
     """The patch (4,) on plane `number` that, were its sequences seen only in it, explains most; and its nats.
 
@@ -59,7 +59,6 @@ def find_patch(
         visible_waves: (n, K) complex, waves of the sources as they are seen now.
         room: (2, 3) [m].
         generator: of the candidates.
-        draws: random patches, of which the best evolve.
     """
     mine = [k for k, sequence in enumerate(sequences) if number in sequence]
     few, waves = paths.take(mine), visible_waves[:, mine]
@@ -77,8 +76,8 @@ def find_patch(
         lower = torch.minimum(patches[:, :2], patches[:, 2:] - MIN_SIDE)
         return torch.cat([torch.maximum(lower, low), torch.minimum(patches[:, 2:], high)], 1)
 
-    middle = low + (high - low) * torch.rand(draws, 2, generator=generator)
-    side = SMALLEST * torch.exp(torch.rand(draws, 2, generator=generator) * math.log(LARGEST / SMALLEST))
+    middle = low + (high - low) * torch.rand(DRAWS, 2, generator=generator)
+    side = SMALLEST * torch.exp(torch.rand(DRAWS, 2, generator=generator) * math.log(LARGEST / SMALLEST))
     drawn = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
     drawn = drawn[score(drawn).topk(8).indices]
     return evolve(drawn, score, repaired, generator, rounds=10)

@@ -15,8 +15,7 @@ from torch import Tensor
 from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
 from gsparc.models.image_sources.clutter.residual import Residual
 from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.gp_likelihood import steering
-from gsparc.models.image_sources.phased_gp import PhasedScene
+from gsparc.models.image_sources.scene import Scene, steering
 from gsparc.physics.mirror_planes import Reflections, images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
@@ -43,14 +42,15 @@ class ReflectionPhasePrior:
     concentration: float
 
     @staticmethod
-    def of(phased: PhasedScene) -> ReflectionPhasePrior:
+    def of(scene: Scene) -> ReflectionPhasePrior:
         """From a scene's phases, weighted by power."""
-        order = torch.tensor([len(sequence) for sequence in phased.scene.sequences])
+        assert scene.phase is not None
+        order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase
         if len(order) < 4:
             return ReflectionPhasePrior(0.0, 0.0)
-        power = phased.scene.log_amplitude.mul(2).exp() * (order > 0)
+        power = scene.log_amplitude.mul(2).exp() * (order > 0)
         share, turn = max(
-            (float((power * (phased.phase - phased.phase[0] - order * t).cos()).sum() / power.sum()), t)
+            (float((power * (phase - phase[0] - order * t).cos()).sum() / power.sum()), t)
             for t in (0.0, math.pi)
         )
         share = min(max(share, 0.0), 0.97)
@@ -67,16 +67,16 @@ class ReflectionPhasePrior:
 
 def descend(
     residual: Residual,
-    phased: PhasedScene,
+    scene: Scene,
     paths: Paths,
     steps: int,
     soft: float,
     phase_prior: ReflectionPhasePrior,
-) -> PhasedScene:
+) -> Scene:
     """The most likely scene of `steps` steps; paths are those of the start."""
-    scene, rows = phased.scene, residual.rows
-    old = scene.clutter
-    start = (old.boxes, old.patches, scene.planes, phased.phase, scene.log_amplitude)
+    assert scene.phase is not None
+    rows, old = residual.rows, scene.clutter
+    start = (old.boxes, old.patches, scene.planes, scene.phase, scene.log_amplitude)
     values = [v.clone().requires_grad_() for v in start]
     groups = [{"params": [v], "lr": rate} for v, rate in zip(values, STEPS, strict=True)]
     optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
@@ -95,13 +95,12 @@ def descend(
             break
         optimizer.zero_grad()
         cost.backward()
-        held = residual.phased.scene
-        for value, count in ((planes, len(held.planes)), (phase, len(held.sequences))):
+        factored = residual.scene
+        for value, count in ((planes, len(factored.planes)), (phase, len(factored.sequences))):
             if value.grad is not None:
                 value.grad[:count] = 0
         optimizer.step()
         for group in optimizer.param_groups:
             group["lr"] *= STEP_DECAY
     clutter = Clutter(best[0], best[1], old.plane)
-    moved = replace(scene, planes=best[2], log_amplitude=best[4], clutter=clutter)
-    return replace(phased, scene=moved, phase=best[3])
+    return replace(scene, planes=best[2], phase=best[3], log_amplitude=best[4], clutter=clutter)

@@ -1,6 +1,6 @@
 """Residual of a scene, and the gain of another box, patch or source.
 
-The process of `phased_gp` with its covariance in two parts: varying gains and noise,
+The process of gains of fixed phases with its covariance in two parts: varying gains and noise,
 factored once and held, and the sources' constant gains, a low-rank part that changes with every move of a box
 and is added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
 """
@@ -14,9 +14,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import JITTER
-from gsparc.models.image_sources.phased_gp import PhasedGains, PhasedScene, shares, stacked
+from gsparc.models.image_sources.gp_likelihood import PhasedGains, shares, stacked
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.processes.factor import Factor
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -27,50 +27,48 @@ CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # candidates
 
 
 class Residual:
-    """Rows of one output against a phased scene; n rows are 2 n real numbers.
+    """Rows of one output against a scene with phases; n rows are 2 n real numbers.
 
     Args:
         rows: R = 1.
-        phased: its clutter attenuates the varying part; callers pass the visible shares of the constant part.
-        noise_floor: known variance of the noise, in units of the rows' power.
+        scene: its clutter attenuates the varying part; callers pass the visible shares of the constant part.
 
     Attributes:
-        phased: as given, constant share and noise chosen by likelihood.
+        scene: as given, constant share and noise chosen by likelihood.
     """
 
-    def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
-        self.rows, self.noise_floor = rows, noise_floor
+    def __init__(self, rows: Rows, scene: Scene) -> None:
+        self.rows, self.noise_floor = rows, scene.noise_floor
         self.target = stacked(rows.target)[0][:, 0]
-        self.waves = phased.unobstructed(rows)
-        self._cached = self._parts(phased)
-        self.phased = self._tuned(phased)
-        constant = float(self.phased.scene.visibility.constant)
-        self._factor(constant, self.phased.scene.log_noise, phased.quadrature)
-        self.share = self._constant(constant, phased.quadrature)
+        self.waves = scene.unobstructed(rows)
+        self._cached = self._parts(scene)
+        self.scene = self._tuned(scene)
+        constant = float(self.scene.visibility.constant)
+        self._factor(constant, self.scene.log_noise, scene.quadrature)
+        self.share = self._constant(constant, scene.quadrature)
         self.root = self._own.root
         self.white = self.root @ self.target
         del self._cached, self._own
 
-    def _parts(self, phased: PhasedScene) -> tuple[Tensor, Tensor]:
+    def _parts(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
-        scene = phased.scene
-        scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
-        varying = PhasedGains(self.rows, phased.quadrature)
+        scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
+        varying = PhasedGains(self.rows, scene.quadrature)
         kernel = replace(scene.visibility, constant=0.0)
         for k, source in enumerate(scene.sources):
             varying.add(scaled[:, k], kernel.correlation(self.rows.places, source))
         across = stacked(scaled)[1]
-        return varying.matrix, shares(phased.quadrature)[1] * (across @ across.T)
+        return varying.matrix, shares(scene.quadrature)[1] * (across @ across.T)
 
-    def _tuned(self, phased: PhasedScene) -> PhasedScene:
+    def _tuned(self, scene: Scene) -> Scene:
         """Constant share and noise by likelihood, in turn on a grid."""
-        columns = stacked(phased.waves(self.rows) * phased.scene.log_amplitude.exp())[0]
-        kernel, noise = phased.scene.visibility, phased.scene.log_noise
+        columns = stacked(scene.waves(self.rows) * scene.log_amplitude.exp())[0]
+        kernel, noise = scene.visibility, scene.log_noise
         constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
 
         def cost(constant: float, noise: float) -> float:
-            self._factor(constant, noise, phased.quadrature)
-            whitened = self._own.whitened(columns * self._constant(constant, phased.quadrature))
+            self._factor(constant, noise, scene.quadrature)
+            whitened = self._own.whitened(columns * self._constant(constant, scene.quadrature))
             white = self._own.whitened(self.target[:, None])[:, 0]
             return _cost(whitened, white, self._determinant).item()
 
@@ -84,8 +82,7 @@ class Residual:
             for step in (-math.log(TRIED), math.log(TRIED)):
                 while noise + step > math.log(LEAST_NOISE) and (new := cost(constant, noise + step)) < best:
                     best, noise = new, noise + step
-        scene = replace(phased.scene, visibility=replace(kernel, constant=constant), log_noise=noise)
-        return replace(phased, scene=scene)
+        return replace(scene, visibility=replace(kernel, constant=constant), log_noise=noise)
 
     def _factor(self, constant: float, noise: float, quadrature: float) -> None:
         varying, across = self._cached

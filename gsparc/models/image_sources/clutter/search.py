@@ -23,14 +23,14 @@ from gsparc.models.image_sources.clutter.finite_mirrors import (
 )
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
 from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual
-from gsparc.models.image_sources.gp_likelihood import JITTER, Scene
-from gsparc.models.image_sources.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections, all_sequences
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import Cancelled, cancelled_by, raise_if_cancelled
+from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
@@ -49,90 +49,72 @@ BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
 
 
-def find_clutter(
-    rows: Rows,
-    phased: PhasedScene,
-    generator: torch.Generator,
-    late: Callable[[], bool] = lambda: False,
-    noise_floor: float = JITTER,
-) -> PhasedScene:
-    """The phased scene with clutter, or unchanged when the likelihood gains too little.
+def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
+    """The scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:
-    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `late`, what was
+    found so far is the result.
 
     Args:
         rows: of one output, as many as in a search.
-        phased: from the final refinement of a search.
+        scene: from the final refinement of a search.
         generator: of the candidates.
-        late: asked again and again; what was found so far is the result when it says so.
-        noise_floor: known variance of the noise, in units of the rows' power.
     """
     # The kernel learned without clutter explains it: reset
-    bare, quadrature = replace(phased.scene, visibility=INITIAL_KERNEL), min(phased.quadrature, QUADRATURE)
-    fresh = replace(phased, scene=bare, quadrature=quadrature)
-    found = _ClutterSearcher(rows, fresh, generator, noise_floor).run(late)
-    before, after = (PhasedPosterior(rows, each, noise_floor).conditioned.nll for each in (phased, found))
-    return found if after < before - PROGRESS else phased
+    fresh = replace(scene, visibility=INITIAL_KERNEL, quadrature=min(scene.quadrature, QUADRATURE))
+    found = _ClutterSearcher(rows, fresh, generator).run()
+    before, after = (Posterior(rows, each).nll for each in (scene, found))
+    return found if after < before - PROGRESS else scene
 
 
 class _ClutterSearcher:
-    def __init__(
-        self,
-        rows: Rows,
-        phased: PhasedScene,
-        generator: torch.Generator,
-        noise_floor: float,
-    ) -> None:
+    def __init__(self, rows: Rows, scene: Scene, generator: torch.Generator) -> None:
         self.rows, self.generator = rows, generator
-        self.noise_floor, self.wavelength = noise_floor, LIGHT / float(rows.frequency.mean())
+        self.wavelength = LIGHT / float(rows.frequency.mean())
         self.parameter_cost = math.log(2 * len(rows)) / 2  # cost of a parameter [nats]
         self.tried: list[SmallMirror] = []
         ends = torch.stack([rows.position.amin(0) - BEYOND, rows.position.amax(0) + BEYOND])
         self.room = ends.float()
-        self._refactor(phased)
+        self._refactor(scene)
 
     # ---- state ----
-    def _refactor(self, phased: PhasedScene) -> None:
+    def _refactor(self, scene: Scene) -> None:
         """Factor the residual's covariance at a scene."""
-        self.residual = Residual(self.rows, phased, self.noise_floor)
-        self.phase_prior = ReflectionPhasePrior.of(phased)
-        self._set_scene(self.residual.phased)
+        self.residual = Residual(self.rows, scene)
+        self.phase_prior = ReflectionPhasePrior.of(scene)
+        self._set_scene(self.residual.scene)
 
-    def _set_scene(self, phased: PhasedScene) -> None:
+    def _set_scene(self, scene: Scene) -> None:
         """Set the scene, with the varying part still that of the residual."""
-        self.phased, self.paths = phased, phased.scene.unfolding.paths(self.rows.position)
-        self.waves = phased.unobstructed(self.rows)
-        self.visible = visible_share(self.paths, phased.scene.clutter, phased.scene.planes)
+        self.scene, self.paths = scene, scene.unfolding.paths(self.rows.position)
+        self.waves = scene.unobstructed(self.rows)
+        self.visible = visible_share(self.paths, scene.clutter, scene.planes)
         self.residual.waves = self.waves
-        self.nll = self.residual.nll(self.visible, phased.scene.log_amplitude).item()
-
-    @property
-    def scene(self) -> Scene:
-        return self.phased.scene
+        self.nll = self.residual.nll(self.visible, scene.log_amplitude).item()
 
     def _scorer(self) -> CandidateScorer:
         return self.residual.scorer(self.visible, self.scene.log_amplitude)
 
-    def _try(self, scene: Scene, least: float, phase: Tensor | None = None, exact: bool = False) -> bool:
+    def _try(self, scene: Scene, least: float, exact: bool = False) -> bool:
         """Accept a scene after a few steps of descent, when it gains at least `least` nats.
 
         Varying part and noise are those last factored; with `exact` they are the new scene's own, since the
         old ones would explain what the new scene occludes.
         """
-        nll, moved = self.nll, replace(self.phased, scene=scene)
+        nll = self.nll
 
         def change() -> None:
-            self._set_scene(moved if phase is None else replace(moved, phase=phase))
+            self._set_scene(scene)
             self._descend(6)
             if exact and self.nll < nll - least:
-                self._refactor(self.phased)
+                self._refactor(self.scene)
 
         return self._changed(change, least)
 
     def _changed(self, change: Callable[[], None], least: float) -> bool:
         """Change something, and undo it where that gains fewer than `least` nats."""
-        residual, before, nll = self.residual, self.phased, self.nll
+        residual, before, nll = self.residual, self.scene, self.nll
         change()
         if self.nll < nll - least:
             return True
@@ -141,15 +123,14 @@ class _ClutterSearcher:
         return False
 
     def _descend(self, steps: int, soft: float = SOFT) -> None:
-        found = descend(self.residual, self.phased, self.paths, steps, soft, self.phase_prior)
-        clutter = found.scene.clutter
-        tidy = replace(clutter, boxes=inside_out(clutter.boxes, self.room))
-        self._set_scene(replace(found, scene=replace(found.scene, clutter=tidy)))
+        found = descend(self.residual, self.scene, self.paths, steps, soft, self.phase_prior)
+        boxes = inside_out(found.clutter.boxes, self.room)
+        self._set_scene(replace(found, clutter=replace(found.clutter, boxes=boxes)))
 
     # ---- the loop ----
-    def run(self, late: Callable[[], bool]) -> PhasedScene:
+    def run(self) -> Scene:
         start = self.nll
-        best = self.whole = start, self.phased
+        best = self.whole = start, self.scene
         try:
             with cancelled_by(late):  # within a step, too
                 for epoch in range(EPOCHS):
@@ -177,24 +158,21 @@ class _ClutterSearcher:
         )  # fmt: skip
         for step in steps:
             step()
-            self.whole = self.nll, self.phased
+            self.whole = self.nll, self.scene
 
     def _settle(self, soft: float) -> None:
         self._descend_soft(soft)
         self._drop()
-        self._refactor(self.phased)
+        self._refactor(self.scene)
 
     def _settle_boxes(self) -> None:
         self._relocate_boxes()
         self._descend(10)
         self._drop()
-        self._refactor(self.phased)
+        self._refactor(self.scene)
         self._drop_sequences()
         prior, sequences = self.phase_prior, self.scene.sequences
-        moved = refine(
-            self.rows, self.phased, STEPS, self.noise_floor, cost=lambda v: prior.cost(v[4], sequences)
-        )
-        self._refactor(moved)
+        self._refactor(refine(self.rows, self.scene, STEPS, lambda v: prior.cost(v[4], sequences)))
 
     def _descend_soft(self, soft: float) -> None:
         """Descend with softer edges, whose gradients reach farther, then with sharp ones."""
@@ -252,13 +230,12 @@ class _ClutterSearcher:
         scene, known = self.scene, walls(self.scene.planes, self.scene.sequences)
         first = len(scene.planes)
         sequences = [sequence for i in range(len(moves)) for sequence in _sequences_over(first + i, known)]
-        trial = replace(scene, planes=torch.cat([scene.planes, planes]), sequences=tuple(sequences))
+        trial = replace(scene, planes=torch.cat([scene.planes, planes])).over(sequences)
         paths = trial.unfolding.paths(self.rows.position)
         inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
         inside = torch.where(paths.plane >= first, inside, 1.0).prod(-1)
         seen = visible_share(paths, scene.clutter, trial.planes) * inside * paths.valid
-        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], trial.sequences))
-        scores = scorer.score(trial.unobstructed(self.rows) * seen.T * turn)
+        scores = scorer.score(trial.unobstructed(self.rows) * seen.T * self._turns(trial))
         total = scores.view(len(moves), -1).sum(1)
         best = int(total.argmax())
         return SmallMirror(planes[best], mirror.patch, float(total[best]))
@@ -284,17 +261,21 @@ class _ClutterSearcher:
         self, scene: Scene, sequences: list[Reflections], scorer: CandidateScorer
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Of sequences over planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
-        candidates = replace(scene, sequences=tuple(sequences))
+        candidates = scene.over(sequences)
         paths = candidates.unfolding.paths(self.rows.position)
         seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
         waves = candidates.unobstructed(self.rows) * seen.T
         if self.phase_prior.concentration < MIN_CONCENTRATION:
             return *scorer.score_waves(waves), candidates.sources
-        turn = torch.polar(
-            torch.ones(()), self.phase_prior.expected(self.phased.phase[0], candidates.sequences)
-        )
+        turn = self._turns(candidates)
         scores, gains = scorer.score_positive(waves * turn)
         return scores, gains * turn, candidates.sources
+
+    def _turns(self, candidates: Scene) -> Tensor:
+        """(W,) complex of size 1, the phases that new sequences are expected to have."""
+        assert self.scene.phase is not None
+        expected = self.phase_prior.expected(self.scene.phase[0], candidates.sequences)
+        return torch.polar(torch.ones(()), expected)
 
     def _add(
         self, scene: Scene, sequences: list[Reflections], min_score: float, least: float, most: int
@@ -309,8 +290,8 @@ class _ClutterSearcher:
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
-        phase = torch.cat([self.phased.phase, gains[chosen].angle()])
-        return self._try(scene.with_sequences([sequences[i] for i in chosen], strong), least, phase)
+        more = [sequences[i] for i in chosen]
+        return self._try(scene.with_sequences(more, strong, gains[chosen].angle()), least)
 
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
@@ -351,9 +332,7 @@ class _ClutterSearcher:
         sequences = [w for w in dict.fromkeys(all_sequences(indices, 2) + longer) if w not in known]
         if not sequences:
             return
-        scores, _ = self._scorer().score_waves(
-            replace(scene, sequences=tuple(sequences)).unobstructed(self.rows)
-        )
+        scores, _ = self._scorer().score_waves(scene.over(sequences).unobstructed(self.rows))
         best = scores.topk(min(60, len(sequences))).indices.tolist()
         self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, SEQUENCES)
 
@@ -373,7 +352,7 @@ class _ClutterSearcher:
         self._set_clutter(self.scene.clutter.with_box(box, number))
 
     def _set_clutter(self, clutter: Clutter) -> None:
-        self._set_scene(replace(self.phased, scene=replace(self.scene, clutter=clutter)))
+        self._set_scene(replace(self.scene, clutter=clutter))
 
     def _drop(self) -> None:
         """Remove clutter that the likelihood no longer supports."""
@@ -389,8 +368,8 @@ class _ClutterSearcher:
         kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
         dropped = len(gains) - len(kept)
         if dropped:
-            fewer = replace(self.phased, scene=self.scene.only(kept), phase=self.phased.phase[kept])
-            self._changed(partial(self._refactor, fewer), -dropped * self.parameter_cost)
+            fewer = partial(self._refactor, self.scene.only(kept))
+            self._changed(fewer, -dropped * self.parameter_cost)
 
 
 def _sequences_over(number: int, known: list[int]) -> list[Reflections]:

@@ -8,6 +8,8 @@ from itertools import groupby
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.data.walls import SceneWalls, area, box_faces, normal_of
@@ -117,18 +119,12 @@ def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray
 
 def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
     """Corners (C, 3) of each group of faces that share corners."""
-    groups: list[tuple[set[tuple[int, ...]], list[np.ndarray]]] = []
-    for face in faces:
-        corners = {tuple(c) for c in np.round(face / SAME_CORNER_M).astype(np.int64).tolist()}
-        parts = [face]
-        apart = []
-        for known, members in groups:
-            if known & corners:
-                corners, parts = corners | known, parts + members
-            else:
-                apart.append((known, members))
-        groups = [*apart, (corners, parts)]
-    return [np.concatenate(parts) for _, parts in groups]
+    face = np.repeat(np.arange(len(faces)), [len(corners) for corners in faces])
+    corners = np.concatenate(faces)
+    corner = np.unique(np.round(corners / SAME_CORNER_M).astype(np.int64), axis=0, return_inverse=True)[1]
+    shared = coo_array((np.ones(len(face)), (face, corner.reshape(-1)))).tocsr()
+    count, group = connected_components(shared @ shared.T, directed=False)
+    return [corners[group[face] == number] for number in range(count)]
 
 
 def affordable(mirrors: int, length: int) -> int:
@@ -169,20 +165,22 @@ def visible_sequences(
     sequences = _distinct(candidates, transmitter, mirrors.planes)
     if not sequences or most < 2:
         return ((),)
+    every = torch.arange(len(sequences))
     scores = torch.cat(
         [
-            _power(mirrors, sequences[i : i + SEQUENCES_AT_ONCE], transmitter, places, hidden)
-            for i in range(0, len(sequences), SEQUENCES_AT_ONCE)
+            _power(mirrors, [sequences[i] for i in part.tolist()], transmitter, places, hidden)
+            for part in every.split(SEQUENCES_AT_ONCE)
         ]
     )
     kept = scores.topk(min(SHORTLIST * most, len(sequences))).indices
     kept = kept[scores[kept] > 0]
     if hidden and len(kept):
-        parts = [
-            _seen(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
-            for part in kept.split(50)
-        ]
-        seen = torch.cat(parts)
+        seen = torch.cat(
+            [
+                _seen(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
+                for part in kept.split(50)
+            ]
+        )
         kept, power = kept[seen > SEEN], (scores[kept] * seen)[seen > SEEN]
         kept = kept[power.argsort(descending=True)]
     return ((), *(sequences[i] for i in kept[: most - 1].tolist()))

@@ -15,7 +15,7 @@ from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.ensemble import SEARCH_END, compact, left_out_error
-from gsparc.models.image_sources.gp_likelihood import Scene, direct_amplitude
+from gsparc.models.image_sources.gp_likelihood import with_phases
 from gsparc.models.image_sources.known.images import (
     MOST_PATCHES,
     Mirrors,
@@ -25,14 +25,15 @@ from gsparc.models.image_sources.known.images import (
     visible_sequences,
 )
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.phased_gp import PhasedScene
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import Scene, direct_amplitude
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ class KnownWallsGP(ImageSourceGP):
         cache: SearchCache,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search."""
-        rows, floor, over = row_sets[0], self.noise_floor, partial(budget.over, SEARCH_END)
+        rows = row_sets[0]
         start = self._scene(rows, settings, clutter)
 
         def near(values: list[Tensor]) -> Tensor:
@@ -77,17 +78,17 @@ class KnownWallsGP(ImageSourceGP):
         def both(values: list[Tensor]) -> Tensor:
             return near(values) + prior.cost(values[4], start.sequences)
 
-        scene = refine(rows, start, STEPS[0], floor, over, near)
-        phased = PhasedScene.of(rows, scene, QUADRATURE)
-        phased = learn_visibility(rows, phased, STEPS[1], settings.visibility, floor, over)
-        prior = ReflectionPhasePrior.of(phased)
-        phased = refine(rows, phased, STEPS[2], floor, over, both)
-        error = left_out_error(rows, phased, floor)
+        with late_when(partial(budget.over, SEARCH_END)):
+            scene = with_phases(rows, refine(rows, start, STEPS[0], near), QUADRATURE, self.noise_floor)
+            scene = learn_visibility(rows, scene, STEPS[1], settings.visibility)
+            prior = ReflectionPhasePrior.of(scene)
+            scene = refine(rows, scene, STEPS[2], both)
+        error = left_out_error(rows, scene)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
             len(scene.sequences), len(scene.planes), error,
         )  # fmt: skip
-        return [Member(phased, error)]
+        return [Member(scene, error)]
 
     def _scene(self, rows: Rows, settings: SearchSettings, clutter: bool) -> Scene:
         """The static end and its images that some receiver sees, with amplitudes to start from."""
@@ -111,7 +112,7 @@ class KnownWallsGP(ImageSourceGP):
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
             transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
-            math.log(settings.noise), settings.visibility,
+            math.log(settings.noise), settings.visibility, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide
         return replace(bare, clutter=held).only([*range(len(sequences))], held.plane)
