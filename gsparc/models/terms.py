@@ -24,7 +24,7 @@ class EffectSettings(Checked):
         phase: carrier phase from places of sources, for channels.
         power: distance law in decibels and known walls along the path, for received powers.
         visibility: what hides: occluding boxes and finite mirrors of sources, known walls of powers and, of
-            several stations, Gaussians in the way; rasterized Gaussians always occlude each other.
+            several stations, shadowing of a place; rasterized Gaussians always occlude each other.
         residual: a process in the target's own correlation on what Gaussians leave.
     """
 

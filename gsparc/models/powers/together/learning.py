@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import torch
@@ -18,8 +17,7 @@ from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.groups import Gain, compared, folds, groups
-from gsparc.models.powers.together.rows import LinkRows
-from gsparc.models.powers.together.terms import Terms
+from gsparc.models.powers.together.terms import LinkRows, Terms
 from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart, bounds_of
 from gsparc.processes.posterior import Exact
@@ -41,7 +39,7 @@ LEAST_STATIONS = 3  # to leave some out
 TRIED_ON, TRIED_EACH = 3_600, 300  # rows of all stations, and of each, for the strength of shared terms
 TRIED_PLACES = 300  # that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
-PLACE, SHADOW = (0.0, 0.03, 0.1, 0.2), (0.0, 0.02, 0.06, 0.15)  # variances, of a station's own
+PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
 WIDEST = 4.0  # factor that variances are corrected by at most
 COMPARED_EACH, FOLDS = 400, 5  # rows of each station and folds of left-out places
 
@@ -79,11 +77,8 @@ class Own:
         found = {}
         for number in rows.stations:
             prior, part = self.prior(number), rows.of(number)
-            places, values, extra = (
-                torch.from_numpy(part.places),
-                torch.from_numpy(part.decibels)[:, None],
-                None,
-            )
+            places, extra = torch.from_numpy(part.places), None
+            values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
                 wide = WithTerms(**vars(_trend(prior)), shared=terms.columns, unit=deviation_of(prior))
                 known = conditioned(part, wide, _kernel(prior), seed)[0].posterior
@@ -179,71 +174,51 @@ def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
     return apart(places, places), trend.terms(places), values[:, None]
 
 
-@dataclass(frozen=True)
-class Strength:
-    """Shared terms for stations that were never heard.
-
-    Attributes:
-        terms: as strong as left-out stations want them; possibly of the law alone.
-        inflation: of variances, as left-out stations ask for.
-        gain: of shared terms at left-out stations, each after one constant; None if not tried.
-    """
-
-    terms: Terms
-    inflation: float = 1.0
-    gain: Gain | None = None
-
-
 def learn_strength(
-    rows: LinkRows, own: Own, sure: float, seed: int, budget: TimeBudget | None = None
-) -> Strength:
-    """The strengths of least squared error at left-out stations, each after one constant.
+    rows: LinkRows, own: Own, errors: float, seed: int, budget: TimeBudget | None = None
+) -> tuple[Terms, float, Gain | None]:
+    """Shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
         rows: of all stations.
         own: of the stations' own processes.
-        sure: standard errors that the gain over none must exceed.
+        errors: standard errors that the gain over the law alone must exceed.
         seed: of rows and places drawn.
         budget: no further length is tried when it is over.
+
+    Returns:
+        The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
+        g gains at these, each after one constant, None if not tried.
     """
-    loud = rows if rows.silent.all() else rows.loud
-    few = loud.thinned(min(TRIED_EACH, max(TRIED_ON // len(loud.stations), 1)), seed)
+    heard = rows if rows.silent.all() else rows.loud
+    few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(_kernel(own.never).lengths)
-    terms = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
+    bare = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
     if len(few.stations) < LEAST_STATIONS:
-        return Strength(terms)
-    processes = own.given(few, terms, seed).processes
-    bare, none, best = terms, _left_out(_blocks(processes, terms), terms), None
+        return bare, 1.0, None
+    processes = own.given(few, bare, seed).processes
+    best = plain = bare, *_left_out(processes, bare)
     for length in LENGTHS:
-        if best is not None and budget is not None and budget.over():
+        if length != LENGTHS[0] and budget is not None and budget.over():
             break
-        terms = replace(bare, length=length * short)
-        blocks = _blocks(processes, terms)
-        for place, shadow in product(PLACE, SHADOW):
-            if best is not None and not place and length != LENGTHS[0]:
-                continue  # without the shared process its length means nothing
-            deviations = [math.sqrt(share * own.variance) for share in (place, shadow)]
-            strong = replace(terms, place_db=deviations[0], shadow_db=deviations[1])
-            found = _left_out(blocks, strong)
-            if best is None or (found[0] ** 2).mean() < (best[1][0] ** 2).mean():
-                best = strong, found
-    assert best is not None
-    gain = compared(best[1][0] ** 2, none[0] ** 2, none[2])
-    terms, found = best if gain.exceeds(sure) else (bare, none)
-    return Strength(terms, min(max(found[1], 1 / WIDEST), WIDEST), gain)
+        for share in PLACE:
+            terms = replace(bare, length=length * short, place_db=math.sqrt(share * own.variance))
+            found = _left_out(processes, terms)
+            if (found[0] ** 2).mean() < (best[1] ** 2).mean():
+                best = terms, *found
+    gain = compared(best[1] ** 2, plain[1] ** 2, plain[3])
+    terms, _, ratio, _ = best if gain.exceeds(errors) else plain
+    return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
 
 
-def _blocks(processes: Mapping[int, Exact], terms: Terms) -> list[Block]:
-    return [Block.of(process, terms.units(process.rows)) for process in processes.values()]
-
-
-def _left_out(blocks: list[Block], terms: Terms) -> tuple[np.ndarray, float, np.ndarray]:
+def _left_out(processes: Mapping[int, Exact], terms: Terms) -> tuple[np.ndarray, float, np.ndarray]:
     """Errors (n,) [dB] of what was heard of stations left out, after a constant of each, and their stations.
 
     Between them the mean square of errors without that constant over their predicted variances.
     """
-    scale, errors, ratios = terms.scale(), [], []
-    for error, variance in left_out_whole([block.scaled(scale) for block in blocks]):
+    errors, ratios = [], []
+    blocks = [Block.of(process, terms.columns(process.rows)) for process in processes.values()]
+    for error, variance in left_out_whole(blocks):
         ratios.append(float((error.square() / variance).mean()))
         errors.append((error - error.mean()).numpy())
     station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])
@@ -255,20 +230,20 @@ def gain_of_places(rows: LinkRows, own: Own, plain: Terms, strong: Terms, seed: 
     few = rows.thinned(COMPARED_EACH, seed)
     group = groups(few.places)
     errors: list[list[np.ndarray]] = [[], []]
-    told = []
+    tested = []
     for part in folds(group, FOLDS, seed):
         rest, part = few.at(np.setdiff1d(np.arange(len(group)), part)), part[~few.silent[part]]
         if not len(part) or rest.silent.all():
             continue
         part = part[np.argsort(few.station[part], kind="stable")]
-        told.append(group[part])
+        tested.append(group[part])
         for terms, found in zip((plain, strong), errors, strict=True):
             posterior = own.given(rest, terms, seed)
             for number in few.at(part).stations:
-                asked = few.at(part).of(number)
-                said, _, _ = posterior.answer(torch.from_numpy(asked.places), number)
-                found.append(said.numpy() - asked.decibels)
-    if not told:
+                query = few.at(part).of(number)
+                mean, _ = posterior.answer(torch.from_numpy(query.places), number)
+                found.append(mean.numpy() - query.decibels)
+    if not tested:
         return None
     other, one = (np.concatenate(part) ** 2 for part in errors)
-    return compared(one, other, np.concatenate(told))
+    return compared(one, other, np.concatenate(tested))
