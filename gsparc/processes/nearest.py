@@ -23,13 +23,11 @@ from torch import Tensor
 
 from gsparc.ops.queries import nearest_weights, served
 from gsparc.ops.transforms import numbers
-from gsparc.processes.answer import Answer, Posterior
-from gsparc.processes.covering import covering
 from gsparc.processes.density import walked
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, WaveKernel, apart, bounds_of, matern_sum, unpacked
-from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, nearest_distance
-from gsparc.processes.prior import Prior
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance
+from gsparc.processes.prior import Answer, Posterior, Prior
 
 COVER = 20_000  # rows that weigh the mean law
 WHITENED = 1_024  # rows at a time that are whitened by their neighbours

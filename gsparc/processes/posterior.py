@@ -13,14 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.processes.answer import Answer, Posterior
 from gsparc.processes.conditioned import weighted
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.left_out import left_out
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
-from gsparc.processes.prior import Prior
+from gsparc.processes.prior import Answer, Posterior, Prior
 
 MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many of the nearest
 
@@ -56,20 +55,6 @@ class Exact(Posterior):
         found = cls(prior, places, factor.solved(values - prior.mean(places)), extra)
         found.__dict__["factor"] = factor  # as `cached_property` would keep it
         return found
-
-    def given(self, places: Tensor, values: Tensor) -> Exact:
-        """The same given more rows (m, D), (m, P), in m n^2 instead of (n + m)^3 operations."""
-        cross = self.prior.between(self.rows, places)
-        own = self.prior.between(places, places)
-        own.diagonal().add_(self.prior.kernel.noise)
-        extra = torch.cat([self.extra, torch.zeros(len(places), dtype=torch.float64)])
-        every, rows = torch.cat([self.values(), values]), torch.cat([self.rows, places])
-        return Exact.of(self.prior, rows, every, extra, self.factor.bordered(cross, own))
-
-    def without(self, rows: Tensor) -> Exact:
-        """The same without rows (m,) by their numbers."""
-        kept = torch.ones(len(self.rows), dtype=torch.bool).index_fill(0, rows, False)
-        return Exact.of(self.prior, self.rows[kept], self.values()[kept], self.extra[kept])
 
     @property
     def places(self) -> Tensor:

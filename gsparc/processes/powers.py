@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.censored import ConditionalGaussian, propagate
-from gsparc.processes.covering import covering
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values, given
-from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering
 from gsparc.processes.posterior import Exact, Posterior
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend

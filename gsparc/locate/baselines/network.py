@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from gsparc.locate.baselines.interface import Estimate, filled, floor_of
-from gsparc.processes.covering import covering
+from gsparc.processes.neighbourhood import covering
 
 BATCH, RATE = 64, 1e-3
 HIDDEN = 256  # units of each of two layers

@@ -23,11 +23,10 @@ from gsparc.models.powers.settings import MEANS, MeanName, fit_powers
 from gsparc.models.reduced import Filled, MeanOnly, View
 from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
 from gsparc.ops import Pose
-from gsparc.processes.covering import covering
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Nearest, Sample, Values, given, most_likely
-from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering
 from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior

@@ -32,8 +32,7 @@ from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
-from gsparc.processes.trend import Trend, trend_of
-from gsparc.processes.wall_count import Walls
+from gsparc.processes.trend import Trend, Walls, trend_of
 from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.training.time_budget import TimeBudget
 

@@ -1,8 +1,8 @@
 """The field of powers of many ends: a law and a place term of the site, a process of each end.
 
-Stations that were heard answer by their own process about what the site shares: its law, and further terms
-where groups of places that were left out say so. A station that was never heard is answered by the shared
-terms, as strong as stations that were left out want them. Either end may be the station.
+Stations that were heard answer by their own process about the law of the site. A station that was never
+heard is answered by the law and a process of place that all stations share, as strong as stations that were
+left out want it. Either end may be the station.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.models.per_station import SAME_PLACE_M
-from gsparc.models.powers.groups import Gain
-from gsparc.models.powers.together.learning import Own, gain_of_places, learn_own, learn_strength
+from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.ops import Pose
@@ -37,8 +36,6 @@ MOST_EACH = 6_000  # rows of a station
 MEMORY = 3e9  # bytes of all stations' factors
 PLACES = 600  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
-ERRORS = 1.0  # standard errors that the gain of shared terms must exceed at left-out stations
-ERRORS_OF_PLACES = 2.0  # and at left-out places: few rows of a station gain more from the others than all do
 
 
 class JointPowerField(ConditionalField):
@@ -251,32 +248,18 @@ def initialise(
     field = JointPowerField(data.site, places, own, plain, plain, 1.0, seed)
     if not shared:
         return field, (*notes, *said)
-    terms, field.inflation, gain = learn_strength(every, own, ERRORS, seed, budget)
+    terms, field.inflation, gain = learn_strength(every, own, seed, budget)
     if gain is None:
         said.append("no shared terms: too few stations to leave some out")
         return field, (*notes, *said)
-    said.append("stations left out, after one constant: " + _gain_text(gain))
-    if not terms.place_db:
-        return field, (*notes, *said)
-    field.unheard = terms.known_at(every, PLACES, seed)
-    at_places = None
-    if budget is None or not budget.over(0.8):
-        at_places = gain_of_places(every, own, plain, terms, seed)
-    if at_places is None:
-        said.append("no time to try shared terms on groups of places that are left out")
-    else:
-        said.append("groups of places left out: " + _gain_text(at_places))
-        if at_places.exceeds(ERRORS_OF_PLACES):
-            field.heard = field.unheard
-    return field, (*notes, *said)
-
-
-def _gain_text(gain: Gain) -> str:
     before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
-    return (
-        f"rmse {before:.3g} dB without shared terms, {after:.3g} dB with them "
-        f"(gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
+    said.append(
+        f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, {after:.3g} dB "
+        f"with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
     )
+    if terms.place_db:
+        field.unheard = terms.known_at(every, PLACES, seed)
+    return field, (*notes, *said)
 
 
 def restored(site: Site, state: dict[str, Any]) -> JointPowerField:

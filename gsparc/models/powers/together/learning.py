@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.groups import Gain, compared, folds, groups
+from gsparc.models.powers.groups import Gain, compared
 from gsparc.models.powers.together.terms import LinkRows, Terms
 from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart, bounds_of
@@ -40,8 +40,8 @@ TRIED_ON, TRIED_EACH = 3_600, 300  # rows of all stations, and of each, for the 
 TRIED_PLACES = 300  # that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
 PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
+ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
 WIDEST = 4.0  # factor that variances are corrected by at most
-COMPARED_EACH, FOLDS = 400, 5  # rows of each station and folds of left-out places
 
 
 @dataclass(frozen=True)
@@ -175,14 +175,13 @@ def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def learn_strength(
-    rows: LinkRows, own: Own, errors: float, seed: int, budget: TimeBudget | None = None
+    rows: LinkRows, own: Own, seed: int, budget: TimeBudget | None = None
 ) -> tuple[Terms, float, Gain | None]:
     """Shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
         rows: of all stations.
         own: of the stations' own processes.
-        errors: standard errors that the gain over the law alone must exceed.
         seed: of rows and places drawn.
         budget: no further length is tried when it is over.
 
@@ -207,7 +206,7 @@ def learn_strength(
             if (found[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *found
     gain = compared(best[1] ** 2, plain[1] ** 2, plain[3])
-    terms, _, ratio, _ = best if gain.exceeds(errors) else plain
+    terms, _, ratio, _ = best if gain.exceeds(ERRORS) else plain
     return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
 
 
@@ -223,27 +222,3 @@ def _left_out(processes: Mapping[int, Exact], terms: Terms) -> tuple[np.ndarray,
         errors.append((error - error.mean()).numpy())
     station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])
     return np.concatenate(errors), float(np.mean(ratios)), station
-
-
-def gain_of_places(rows: LinkRows, own: Own, plain: Terms, strong: Terms, seed: int) -> Gain | None:
-    """What shared terms gain at squares of floor that are left out for all stations."""
-    few = rows.thinned(COMPARED_EACH, seed)
-    group = groups(few.places)
-    errors: list[list[np.ndarray]] = [[], []]
-    tested = []
-    for part in folds(group, FOLDS, seed):
-        rest, part = few.at(np.setdiff1d(np.arange(len(group)), part)), part[~few.silent[part]]
-        if not len(part) or rest.silent.all():
-            continue
-        part = part[np.argsort(few.station[part], kind="stable")]
-        tested.append(group[part])
-        for terms, found in zip((plain, strong), errors, strict=True):
-            posterior = own.given(rest, terms, seed)
-            for number in few.at(part).stations:
-                query = few.at(part).of(number)
-                mean, _ = posterior.answer(torch.from_numpy(query.places), number)
-                found.append(mean.numpy() - query.decibels)
-    if not tested:
-        return None
-    other, one = (np.concatenate(part) ** 2 for part in errors)
-    return compared(one, other, np.concatenate(tested))

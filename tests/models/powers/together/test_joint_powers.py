@@ -20,7 +20,7 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc, plan
 from gsparc.models.per_station import for_links
 from gsparc.models.powers.together import field as together
-from gsparc.models.powers.together.field import JointPowerField, initialise, most_each, restored
+from gsparc.models.powers.together.field import JointPowerField, initialise, most_each
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.registry import method_class
@@ -165,16 +165,11 @@ def learned():
 
 def test_what_all_hear_alike_is_found(learned):
     data, fold, field, notes = learned
-    assert field.unheard.place_db, notes
+    assert field.unheard.place_db and not field.heard.place_db, notes
     batch = data.batch(fold.test)
-    error = db(field(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
     found = field(batch.tx, batch.rx, batch.station)
+    error = db(found.mean) - db(batch.target)
     assert np.mean(np.abs(error) < 1.645 * spread_db(found)) > 0.8
-    plain = replace(field.heard, place_db=0.0)
-    bare = JointPowerField(data.site, field.places, field.own, plain, plain)
-    bare.condition(data, fold.train)
-    plain = db(bare(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
-    assert np.mean(error**2) < 1.02 * np.mean(plain**2), notes
 
 
 def test_a_station_never_heard_gains_from_the_others():
@@ -200,18 +195,6 @@ def test_either_end_may_be_the_station(learned):
     there, back = field(batch.tx, batch.rx), field(batch.rx.position, turned)
     assert torch.allclose(there.mean, back.mean, rtol=1e-4)
     assert torch.allclose(there.mean, field(batch.tx, batch.rx, batch.station).mean, rtol=1e-4)
-
-
-def test_it_is_restored(learned):
-    data, fold, field, _ = learned
-    twin = restored(data.site, field.state())
-    batch = data.batch(fold.test)
-    for station in (batch.station, torch.full((len(batch),), -1)):
-        one, other = (each(batch.tx, batch.rx, station) for each in (field, twin))
-        for name in ("mean", "variance", "unknown"):
-            assert torch.allclose(getattr(one, name), getattr(other, name), rtol=1e-5), name
-    ours, theirs = field.left_out(), twin.left_out()
-    assert np.array_equal(ours.rows, theirs.rows) and torch.allclose(ours.mean, theirs.mean)
 
 
 def test_silent_rows_say_that_powers_are_low():
@@ -320,7 +303,7 @@ def test_the_error_of_a_gain_is_that_of_stations():
     every = rows_of(town())
     own, _ = learn_own(every, 0)
     turned = every.at(np.argsort(every.station, kind="stable"))
-    one, other = (learn_strength(rows, own, 1.0, 0)[2] for rows in (every, turned))
+    one, other = (learn_strength(rows, own, 0)[2] for rows in (every, turned))
     assert one is not None and other is not None
     assert np.isclose(one.squares, other.squares, rtol=0.3) and np.isclose(one.error, other.error, rtol=0.5)
     assert one.error > 0.05 * one.squares
