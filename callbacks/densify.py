@@ -72,10 +72,10 @@ class Densify(Checked, L.Callback):
                 if not module.batch.share:  # another process has these rows
                     visible = torch.zeros_like(visible)
                 own = torch.stack([(gradient.norm(dim=-1) * visible).sum(0), visible.sum(0)])
-                found, seen = total(own)
+                result, seen = total(own)
             else:  # of one pose the gradient is the sum over rows, and every process sees the same
-                found, seen = (total(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
-            self.statistics["gradient"] += found
+                result, seen = (total(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
+            self.statistics["gradient"] += result
             self.statistics["seen"] += seen
             radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
             self.statistics["radius"] = largest(torch.maximum(self.statistics["radius"], radius.float()))

@@ -103,8 +103,8 @@ def called_for(
             raise ValueError(f"model.effects.{name}=true is not possible: {obstacle}")
         on[name] = switch is not False and obstacle is None
         if obstacle is None:
-            said = "" if switch == "auto" else ": as configured"
-            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{said}")
+            suffix = "" if switch == "auto" else ": as configured"
+            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{suffix}")
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = drawn is not None or switches.image is True

@@ -41,9 +41,9 @@ def covering(places: np.ndarray, most: int, seed: int) -> np.ndarray:
         side = fine + (coarse - fine) / 2
         cells = np.floor((places[order] - low) / side).astype(np.int64)
         number = cells @ mixing  # of each cell its own, but for collisions of no weight
-        found = order[np.unique(number, return_index=True)[1]]
-        if len(found) <= most:
-            coarse, first = side, found
+        result = order[np.unique(number, return_index=True)[1]]
+        if len(result) <= most:
+            coarse, first = side, result
         else:
             fine = side
         if len(first) >= ENOUGH * most or coarse - fine < 1e-3 * coarse:
@@ -106,15 +106,15 @@ class Neighbourhood:
                 alone there is then no neighbour.
             most: neighbours.
         """
-        found: list[np.ndarray] = []
+        result: list[np.ndarray] = []
         more = 0 if without is None else 1
         for (own, count), (_, tree) in zip(self.shares(most), self._trees[::-1], strict=True):
             row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if without is not None:
                 later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
                 row = np.take_along_axis(row, later, 1)
-            found.append(row)
-        return np.concatenate(found, 1)
+            result.append(row)
+        return np.concatenate(result, 1)
 
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:

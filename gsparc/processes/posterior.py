@@ -52,9 +52,9 @@ class Exact(Posterior):
         """Of values (n, P) at places (n, D) float64 [m]; their covariance's factor where it is known."""
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra) if factor is None else factor
-        found = cls(prior, places, factor.solved(values - prior.mean(places)), extra)
-        found.__dict__["factor"] = factor  # as `cached_property` would keep it
-        return found
+        result = cls(prior, places, factor.solved(values - prior.mean(places)), extra)
+        result.__dict__["factor"] = factor  # as `cached_property` would keep it
+        return result
 
     @property
     def places(self) -> Tensor:
@@ -95,12 +95,12 @@ class Exact(Posterior):
         return apart(queries, self.rows).amin(1)
 
     def _mean(self, queries: Tensor, cross: Tensor) -> Tensor:
-        found = weighted(cross, self.weights)
-        return found if self.prior.trend is None else self.prior.mean(queries) + found
+        result = weighted(cross, self.weights)
+        return result if self.prior.trend is None else self.prior.mean(queries) + result
 
     def _cross(self, queries: Tensor, own: Tensor) -> Tensor:
-        found = self.prior.kernel.between(queries, self.rows)
-        return found if self.prior.trend is None else found.addmm(own, self._columns.T)
+        result = self.prior.kernel.between(queries, self.rows)
+        return result if self.prior.trend is None else result.addmm(own, self._columns.T)
 
     @cached_property
     def _columns(self) -> Tensor:

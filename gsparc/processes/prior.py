@@ -36,8 +36,8 @@ class Prior:
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Covariance (n, m) of values at places (n, D) and (m, D) [m], without noise."""
-        found = self.kernel.between(a, b)
-        return found if self.trend is None else found.addmm(self.columns(a), self.columns(b).T)
+        result = self.kernel.between(a, b)
+        return result if self.trend is None else result.addmm(self.columns(a), self.columns(b).T)
 
     def variance(self, columns: Tensor) -> Tensor:
         """Of a measurement (n,) at places of terms (n, Q)."""

@@ -125,11 +125,11 @@ def left_out_whole(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
     With C the covariance of the weights the inverse of a block is `L^-T (1 - V C V^T) L^-1`.
     """
     factor, mean = weights_of(blocks)
-    found = []
+    result = []
     for block in blocks:
         known = factor.whitened(block.columns.T)
         lower = block.process.factor.lower * deviation_of(block.process.prior)
         inner = Factor.of(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
         error = inner.solved((block.values - block.columns @ mean)[:, None])[:, 0]
-        found.append((lower @ error, inner.whitened(lower.T).square().sum(0)))
-    return found
+        result.append((lower @ error, inner.whitened(lower.T).square().sum(0)))
+    return result

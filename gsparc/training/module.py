@@ -156,8 +156,8 @@ class GaussianModule(L.LightningModule):
         return self.model.site
 
     def _mean(self, batch: Batch) -> Tensor:
-        found = self.model(batch.tx, batch.rx) if self.conditional else self._render(batch)
-        return found.mean
+        result = self.model(batch.tx, batch.rx) if self.conditional else self._render(batch)
+        return result.mean
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Log validation figures."""

@@ -45,7 +45,7 @@ class NGRF(TrainedPeer):
     name: str = "ngrf"
     count: int = 30
 
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`; `ValueError` without a frequency, or for spectra without an array."""
         site = scene.site
         if site.subcarriers_hz is None and site.carrier_hz is None:

@@ -61,11 +61,11 @@ def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) ->
         batch = data.batch(np.array([row]))
         emitted = model.features(batch.tx, batch.rx).abs().sum(-1).mean(0)
         total += emitted * _weights(model, batch.rx)
-    found = {"contribution": total / len(chosen)}
+    result = {"contribution": total / len(chosen)}
     if model.site.static_end == "rx":
         rx = data.batch(chosen[:1]).rx
-        found["receiver"] = torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])
-    return found
+        result["receiver"] = torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])
+    return result
 
 
 def _weights(model: GaussianModel, rx: Pose) -> Tensor:
@@ -181,9 +181,9 @@ def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
     own = _weights_of(few, rx, grid)
     gram = own.mT @ own
     gram.diagonal().add_(RIDGE * gram.diagonal().mean() + 1e-12)
-    found = torch.linalg.solve(gram, own.mT @ wanted)
-    few.emission.weight2.copy_(found[:, :-1, None])
-    few.emission.bias2.copy_(found[:, -1:])
+    result = torch.linalg.solve(gram, own.mT @ wanted)
+    few.emission.weight2.copy_(result[:, :-1, None])
+    few.emission.bias2.copy_(result[:, -1:])
 
 
 def _weights_of(model: GaussianModel, rx: Pose, grid: SphereGrid) -> Tensor:
@@ -213,11 +213,11 @@ def distil_features(model: GaussianModel, share: float) -> None:
     weights = emission.weight2.permute(1, 0, 2).reshape(width, count * channels).double()
     chosen = farthest(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
     features = with_places(places[chosen], places, length, noise, old.kernel)
-    found = features.weigh @ (own @ (old.whitening.double() @ weights))
+    result = features.weigh @ (own @ (old.whitening.double() @ weights))
     prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())
     few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)
     emission.encoding = few.to(old.anchors.device)
     emission.weight2 = torch.nn.Parameter(
-        found.float().view(-1, count, channels).permute(1, 0, 2).contiguous(), emission.weight2.requires_grad
+        result.float().view(-1, count, channels).permute(1, 0, 2).contiguous(), emission.weight2.requires_grad
     )
     model.gaussians.version += 1

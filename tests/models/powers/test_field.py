@@ -156,8 +156,6 @@ def test_what_cannot_be_is_refused():
     data = town(20)
     with pytest.raises(ValueError, match="at least one row"):
         initialise(data, np.arange(0))
-    with pytest.raises(ValueError, match="rssi"):
-        initialise(replace(data, site=replace(data.site, kind="csi")), np.arange(9))
     with pytest.raises(ValueError, match="condition it first"):
         small_field(data).left_out()
 

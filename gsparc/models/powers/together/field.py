@@ -84,13 +84,7 @@ class JointPowerField(ConditionalField):
         return ("power", "residual")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`; silent rows say that powers are below a level.
-
-        Raises:
-            ValueError: no rows.
-        """
-        if not len(rows):
-            raise ValueError("a field of powers needs at least one row")
+        """See `ConditionalField`; silent rows say that powers are below a level."""
         every = link_rows(data, rows, self.places)
         used = every.thinned(most_each(len(every.stations)), self.seed)
         few = used.thinned(UNHEARD_EACH, self.seed)
@@ -229,37 +223,35 @@ def initialise(
         budget: settings are not learned beyond it.
 
     Raises:
-        ValueError: not powers, not several stations, or no rows.
+        ValueError: not several stations, or no rows.
     """
-    if data.site.kind != "rssi":
-        raise ValueError(f"a field of powers needs received powers (rssi), not {data.site.kind}")
     if data.site.stations is None or len(data.site.stations) < 2:
         raise ValueError("a field of powers of many ends needs several stations")
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     places, notes = places_of(data, rows)
     every = link_rows(data, rows, places)
-    own, said = learn_own(every, seed, budget)
+    own, remarks = learn_own(every, seed, budget)
     most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
     if largest > most:
-        said.append(f"at most {most} rows of each station are learned from, of up to {largest}")
+        remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
     assert own.never.trend is not None
     plain = Terms.over(every, own.never.trend, 1.0, 0, seed)
     field = JointPowerField(data.site, places, own, plain, plain, 1.0, seed)
     if not shared:
-        return field, (*notes, *said)
+        return field, (*notes, *remarks)
     terms, field.inflation, gain = learn_strength(every, own, seed, budget)
     if gain is None:
-        said.append("no shared terms: too few stations to leave some out")
-        return field, (*notes, *said)
+        remarks.append("no shared terms: too few stations to leave some out")
+        return field, (*notes, *remarks)
     before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
-    said.append(
+    remarks.append(
         f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, {after:.3g} dB "
         f"with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
     )
     if terms.place_db:
         field.unheard = terms.known_at(every, PLACES, seed)
-    return field, (*notes, *said)
+    return field, (*notes, *remarks)
 
 
 def restored(site: Site, state: dict[str, Any]) -> JointPowerField:

@@ -74,7 +74,7 @@ class Own:
 
     def given(self, rows: LinkRows, terms: Terms, seed: int) -> Shared:
         """What rows say; pseudo-values of silent ones follow from their own station's."""
-        found = {}
+        result = {}
         for number in rows.stations:
             prior, part = self.prior(number), rows.of(number)
             places, extra = torch.from_numpy(part.places), None
@@ -84,8 +84,8 @@ class Own:
                 known = conditioned(part, wide, _kernel(prior), seed)[0].posterior
                 assert isinstance(known, Exact)
                 places, values, extra = known.rows, known.values(), known.extra
-            found[number] = Exact.of(prior, places, values, extra)
-        return Shared(found, self.never, terms.columns)
+            result[number] = Exact.of(prior, places, values, extra)
+        return Shared(result, self.never, terms.columns)
 
     @property
     def variance(self) -> float:
@@ -109,20 +109,20 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
     Searches end with what they have when the budget is over; single stations have no settings of their own
     when half of it is.
     """
-    trend, said = _site_law(rows, seed)
+    trend, notes = _site_law(rows, seed)
     heard = rows if rows.silent.all() else rows.loud
-    alone = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
+    numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else late_when(budget.over):
-        kernel, found = _common_settings(heard, trend, seed)
+        kernel, priors = _common_settings(heard, trend, seed)
         if budget is not None and budget.over(0.5):
-            alone = []
-        for number in alone:
+            numbers = []
+        for number in numbers:
             distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
             bounds = bounds_of(2, distance.numpy())
             _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
-            found[number] = Prior(own, trend)
-    said += [f"settings of their own for {len(alone)} stations"] if alone else []
-    return Own(Prior(kernel, trend), found), said
+            priors[number] = Prior(own, trend)
+    notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
+    return Own(Prior(kernel, trend), priors), notes
 
 
 def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
@@ -202,9 +202,9 @@ def learn_strength(
             break
         for share in PLACE:
             terms = replace(bare, length=length * short, place_db=math.sqrt(share * own.variance))
-            found = _left_out(processes, terms)
-            if (found[0] ** 2).mean() < (best[1] ** 2).mean():
-                best = terms, *found
+            result = _left_out(processes, terms)
+            if (result[0] ** 2).mean() < (best[1] ** 2).mean():
+                best = terms, *result
     gain = compared(best[1] ** 2, plain[1] ** 2, plain[3])
     terms, _, ratio, _ = best if gain.exceeds(ERRORS) else plain
     return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain

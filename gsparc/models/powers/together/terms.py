@@ -56,7 +56,7 @@ class LinkRows(Rows):
         _, place = np.unique(self.places[:, :3], axis=0, return_inverse=True)
         place = place.reshape(-1)
         rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
-        kept = []
+        chosen = []
         for number in self.stations:
             own = np.flatnonzero(self.station == number)
             own = own[np.argsort(rank[own], kind="stable")]
@@ -64,8 +64,8 @@ class LinkRows(Rows):
                 loud, quiet = own[~self.silent[own]], own[self.silent[own]]
                 share = max(round(each * len(loud) / len(own)), min(len(loud), each // 2))
                 own = np.concatenate([loud[:share], quiet[: each - share]])
-            kept.append(own)
-        return self.at(np.sort(np.concatenate(kept)))
+            chosen.append(own)
+        return self.at(np.sort(np.concatenate(chosen)))
 
 
 def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
