@@ -58,7 +58,7 @@ class Densify(Checked, L.Callback):
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
         if module.rendered is None or module.rendered.raster is None:
             return
-        if trainer.global_step >= in_steps(self.stop, module.total_steps):
+        if module.position >= in_steps(self.stop, module.total_steps):
             return
         raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
@@ -82,9 +82,10 @@ class Densify(Checked, L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Edit the field when the schedule says so."""
-        step = trainer.global_step
-        when = (self.start, self.stop, self.interval, module.total_steps)
-        if not due(step, module.global_step, *when) or not self.statistics:
+        step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
+        if step is None or not due(step, module.global_step, *when, module.total_steps):
+            return
+        if not self.statistics:
             return
         model: GaussianModel = module.model
         with torch.no_grad():
@@ -94,7 +95,7 @@ class Densify(Checked, L.Callback):
             before = len(model.gaussians)
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
             self.statistics = self._blank(model)
-        _log_edit(trainer, module, planned, before)
+        _log_edit(trainer, module, planned, before, step)
 
     def plan(self, model: GaussianModel, generator: torch.Generator) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far."""
@@ -150,13 +151,13 @@ class Densify(Checked, L.Callback):
         self.statistics = dict(state["statistics"])
 
 
-def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int) -> None:
+def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int, step: int) -> None:
     """A line in the log and figures for the trackers, where anything was changed."""
     after, gone = len(module.model.gaussians), int((~planned.keep).sum())
     if gone or len(planned.parents):
         log.info(
             "step %d: %d Gaussians removed or split, %d added: %d -> %d",
-            trainer.global_step, gone, len(planned.parents), before, after,
+            step, gone, len(planned.parents), before, after,
         )  # fmt: skip
         noted(trainer, module, {"densify/removed": gone, "densify/added": len(planned.parents)})
 

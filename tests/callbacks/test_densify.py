@@ -29,6 +29,13 @@ def draws() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+def at(model: GaussianModel, step: int, taken: int, total: int) -> SimpleNamespace:
+    """A module at a step of its schedule."""
+    return SimpleNamespace(
+        model=model, total_steps=total, global_step=taken, schedule_step=lambda interval: step
+    )
+
+
 def with_gradient(densify: Densify, wanting: list[int], count: int = 10) -> Densify:
     gradient = torch.zeros(count)
     gradient[wanting] = 1.0
@@ -78,7 +85,7 @@ def test_never_more_than_allowed_and_the_neediest_first(model, share, grown):
 
 def rendering(model, rendered, share=1.0):
     batch = SimpleNamespace(share=share, rx=SimpleNamespace(batched=True))
-    return SimpleNamespace(model=model, total_steps=100, rendered=rendered, batch=batch)
+    return SimpleNamespace(model=model, total_steps=100, rendered=rendered, batch=batch, position=0)
 
 
 def statistics(model, gradient, visible=True, shares=(1.0,)) -> dict[str, torch.Tensor]:
@@ -88,7 +95,7 @@ def statistics(model, gradient, visible=True, shares=(1.0,)) -> dict[str, torch.
     densify = Densify()
     for share in shares:
         module = rendering(model, Rendered(torch.zeros(1), raster), share)
-        densify.on_after_backward(SimpleNamespace(global_step=0), module)
+        densify.on_after_backward(SimpleNamespace(), module)
     return densify.statistics
 
 
@@ -111,14 +118,13 @@ def test_rows_of_another_process_are_not_counted_twice(model):
 
 def test_edits_happen_on_the_schedule_only(model):
     trainer = SimpleNamespace(optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[])
-    module, edited = SimpleNamespace(model=model, total_steps=100, global_step=0), []
+    edited = []
     for step in range(0, 60, 5):
         densify = with_gradient(
             Densify(start=20, stop=40, interval=10, grad_threshold=0.5), [0], len(model.gaussians)
         )
         before = int(model.gaussians.version)
-        trainer.global_step = step
-        densify.on_train_batch_end(trainer, module)
+        densify.on_train_batch_end(trainer, at(model, step, 0, 100))
         edited += [step] if int(model.gaussians.version) > before else []
     assert edited == [20, 30, 40]
 
@@ -132,7 +138,7 @@ def test_a_moving_receiver_gives_gradients_per_pose(campaign):
     rendered = moving(batch.tx, batch.rx)
     rendered.mean.sum().backward()
     densify = Densify()
-    densify.on_after_backward(SimpleNamespace(global_step=0), rendering(moving, rendered))
+    densify.on_after_backward(SimpleNamespace(), rendering(moving, rendered))
     assert rendered.raster.means2d.grad.shape == (4, 30, 2)
     assert densify.statistics["seen"].max() > 1 and densify.statistics["gradient"].any()
 
@@ -150,8 +156,7 @@ def test_an_edit_is_said_and_given_to_the_trackers(model, caplog):
     seen = []
     tracker = SimpleNamespace(log_metrics=lambda figures, step: seen.append((figures, step)))
     optimizer = optimizer_for(model, OptimizerSettings())
-    trainer = SimpleNamespace(optimizers=[optimizer], loggers=[tracker], global_step=200)
-    module = SimpleNamespace(model=model, total_steps=400, global_step=80)
+    trainer, module = SimpleNamespace(optimizers=[optimizer], loggers=[tracker]), at(model, 200, 80, 400)
     densify = with_gradient(Densify(0.25, 0.75, 0.125, grad_threshold=0.5, size_share=1.0), [2, 7])
     densify.on_train_batch_end(trainer, module)
     assert seen == [({"densify/removed": 0, "densify/added": 2}, 80)]
@@ -163,7 +168,5 @@ def test_a_short_training_with_a_schedule_of_shares_keeps_its_gaussians(model):
     densify = Densify(0.1, 0.6, 0.05, grad_threshold=0.5, size_share=1.0)
     for step in range(1, 21):
         with_gradient(densify, [2, 7])
-        trainer.global_step = step
-        module = SimpleNamespace(model=model, total_steps=20, global_step=step)
-        densify.on_train_batch_end(trainer, module)
+        densify.on_train_batch_end(trainer, at(model, step, step, 20))
     assert len(model.gaussians) == 10
