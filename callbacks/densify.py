@@ -58,7 +58,7 @@ class Densify(Checked, L.Callback):
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
         if module.rendered is None or module.rendered.raster is None:
             return
-        if trainer.global_step >= in_steps(self.stop, module.total_steps):
+        if module.position >= in_steps(self.stop, module.total_steps):
             return
         raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
@@ -72,19 +72,20 @@ class Densify(Checked, L.Callback):
                 if not module.batch.share:  # another process has these rows
                     visible = torch.zeros_like(visible)
                 own = torch.stack([(gradient.norm(dim=-1) * visible).sum(0), visible.sum(0)])
-                found, seen = total(own)
+                result, seen = total(own)
             else:  # of one pose the gradient is the sum over rows, and every process sees the same
-                found, seen = (total(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
-            self.statistics["gradient"] += found
+                result, seen = (total(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
+            self.statistics["gradient"] += result
             self.statistics["seen"] += seen
             radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
             self.statistics["radius"] = largest(torch.maximum(self.statistics["radius"], radius.float()))
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Edit the field when the schedule says so."""
-        step = trainer.global_step
-        when = (self.start, self.stop, self.interval, module.total_steps)
-        if not due(step, module.global_step, *when) or not self.statistics:
+        step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
+        if step is None or not due(step, module.global_step, *when, module.total_steps):
+            return
+        if not self.statistics:
             return
         model: GaussianModel = module.model
         with torch.no_grad():
@@ -94,7 +95,7 @@ class Densify(Checked, L.Callback):
             before = len(model.gaussians)
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
             self.statistics = self._blank(model)
-        _log_edit(trainer, module, planned, before)
+        _log_edit(trainer, module, planned, before, step)
 
     def plan(self, model: GaussianModel, generator: torch.Generator) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far."""
@@ -150,13 +151,13 @@ class Densify(Checked, L.Callback):
         self.statistics = dict(state["statistics"])
 
 
-def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int) -> None:
+def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int, step: int) -> None:
     """A line in the log and figures for the trackers, where anything was changed."""
     after, gone = len(module.model.gaussians), int((~planned.keep).sum())
     if gone or len(planned.parents):
         log.info(
             "step %d: %d Gaussians removed or split, %d added: %d -> %d",
-            trainer.global_step, gone, len(planned.parents), before, after,
+            step, gone, len(planned.parents), before, after,
         )  # fmt: skip
         noted(trainer, module, {"densify/removed": gone, "densify/added": len(planned.parents)})
 

@@ -45,6 +45,6 @@ class Pictures(Checked, L.Callback):
             seconds = CostLedger.seconds_in(trainer)
             title = f"validation, step {step}" + ("" if seconds is None else f", {seconds:.0f} s of training")
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
-            true, found = batch.target.cpu().numpy(), predicted.cpu().numpy()
-            draw_spectra(true, found, rows, title, path, edges=module.site.grid.edges())
+            true, result = batch.target.cpu().numpy(), predicted.cpu().numpy()
+            draw_spectra(true, result, rows, title, path, edges=module.site.grid.edges())
             picture(trainer.loggers, "predictions", path, step)

@@ -44,8 +44,8 @@ class StepProgress(L.Callback):
         done, total = _progress(trainer, module)
         self._bar.update(task, completed=done)
         if trainer.global_step % 20 == 0 or done == total:
-            found = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
-            figures = [form.format(float(value)) for form, value in found.items() if value is not None]
+            result = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
+            figures = [form.format(float(value)) for form, value in result.items() if value is not None]
             self._bar.update(task, figures=", ".join([*figures, f"{module.count} Gaussians"]))
 
     def on_train_end(self, *unused: Any, **named: Any) -> None:

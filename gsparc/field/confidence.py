@@ -84,8 +84,8 @@ def fit_errors(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
         level = parameters[0] + np.clip(parameters[1], 0.0, 2.0) * x
         return float((y * np.exp(-level) + level).mean())
 
-    found = minimize(deviance, np.array([np.log(y.mean()), 0.5]), method="Nelder-Mead").x
-    return float(np.exp(found[0])), float(np.clip(found[1], 0.0, 2.0))
+    result = minimize(deviance, np.array([np.log(y.mean()), 0.5]), method="Nelder-Mead").x
+    return float(np.exp(result[0])), float(np.clip(result[1], 0.0, 2.0))
 
 
 class Confidence(nn.Module):

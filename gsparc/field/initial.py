@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from torch import Tensor
@@ -109,14 +109,3 @@ class Start:
     waited_s: tuple[float, float] = (0.0, 0.0)
     time_limited: bool = False
     left_out: Any = None
-
-
-class Initialiser(Protocol):
-    """Finds initial values from training rows."""
-
-    def __call__(self, task: InitTask) -> Start:
-        """The start.
-
-        Raises:
-            ValueError: what the task asks for, its data do not allow.
-        """

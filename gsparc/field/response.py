@@ -77,8 +77,8 @@ class ChannelResponse(nn.Module):
         gains = torch.view_as_real(weighted)
         delays = self.delays.double() / self.subcarriers  # in periods of the mean tone spacing
         if self.even:
-            found = channels(gains, self.steering, delays, self.first, 1.0, self.subcarriers)
-            return torch.view_as_complex(found)
+            result = channels(gains, self.steering, delays, self.first, 1.0, self.subcarriers)
+            return torch.view_as_complex(result)
         phase = -2 * math.pi * torch.outer(delays, self.numbers).float()
         comb = torch.polar(torch.ones_like(phase), phase)
         return torch.einsum("bn,na,nk->bak", weighted, torch.view_as_complex(self.steering), comb)

@@ -266,7 +266,7 @@ def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
     elif isinstance(value, (list, tuple)):
         parts = ((f"{where}[{i}]", one) for i, one in enumerate(value))
     each = (non_finite(one, name, infinite=infinite) for name, one in parts)
-    return next((found for found in each if found is not None), None)
+    return next((result for result in each if result is not None), None)
 
 
 def _plain(value: Any, where: str) -> Any:

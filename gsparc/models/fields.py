@@ -211,8 +211,8 @@ def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
     if "members" in state:
         members = [restored(site, member) for member in state["members"]]
         residual = None if state["residual"] is None else restored(site, state["residual"])
-        found: ConditionalField = Mixture(members, state["weights"], residual, state["share"])
+        result: ConditionalField = Mixture(members, state["weights"], residual, state["share"])
     else:
-        found = RESTORED[str(state["kind"])](site, state)
-    found.site = site
-    return found
+        result = RESTORED[str(state["kind"])](site, state)
+    result.site = site
+    return result

@@ -19,24 +19,24 @@ def in_double(part: T) -> T:
 
     What is of these types already, and arrays of NumPy, are shared and not copied.
     """
-    kept: dict[int, Any] = {}  # alive as long as their numbers are asked for
+    tensors: dict[int, Any] = {}  # alive as long as their numbers are asked for
 
     class Parts(pickle.Pickler):
         def persistent_id(self, value: Any) -> int | None:
             if not isinstance(value, Tensor | np.ndarray):
                 return None
-            kept[id(value)] = value
+            tensors[id(value)] = value
             return id(value)
 
     class Doubled(pickle.Unpickler):
         def persistent_load(self, number: int) -> Any:
-            value = kept[number]
+            value = tensors[number]
             if isinstance(value, Tensor):
-                kept[number] = value = value.detach().to(DOUBLE.get(value.dtype, value.dtype))
+                tensors[number] = value = value.detach().to(DOUBLE.get(value.dtype, value.dtype))
             return value
 
     whole = io.BytesIO()
     Parts(whole, pickle.HIGHEST_PROTOCOL).dump(part)
     whole.seek(0)
-    found: T = Doubled(whole).load()
-    return found
+    result: T = Doubled(whole).load()
+    return result

@@ -101,8 +101,8 @@ def predict_left_out(
         near = distance[centres] <= gap
         near[np.arange(len(centres)), centres] = True
         some = np.flatnonzero(~near.all(1))
-        found = left_out_around(precision, weighted, rows[some], torch.from_numpy(near[some]))
-        mean[g, some], variance[g, some] = values[centres[some]] - found[0].numpy(), found[1].numpy()
+        result = left_out_around(precision, weighted, rows[some], torch.from_numpy(near[some]))
+        mean[g, some], variance[g, some] = values[centres[some]] - result[0].numpy(), result[1].numpy()
     return mean, variance
 
 

@@ -47,8 +47,10 @@ class MethodField(ConditionalField):
 
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
         """See `ConditionalField`."""
-        found = self.method.predict(tx, rx)
-        return Posterior(found.mean, found.variance, found.mean if self.count else None, 1 - found.confidence)
+        result = self.method.predict(tx, rx)
+        return Posterior(
+            result.mean, result.variance, result.mean if self.count else None, 1 - result.confidence
+        )
 
     def left_out(self) -> LeftOutRows:
         """Not known: `ValueError`."""

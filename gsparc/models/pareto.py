@@ -45,10 +45,10 @@ class Point:
 
     def value(self, figure: str) -> float:
         """A figure; `ValueError` when these rows do not define it."""
-        found = self.figures[figure]
-        if found is None:
+        result = self.figures[figure]
+        if result is None:
             raise ValueError(f"{figure} is not defined on these rows")
-        return found
+        return result
 
     @property
     def p50(self) -> float:
@@ -63,8 +63,8 @@ class Point:
 
 def worded(settings: Settings) -> str:
     """`25% kept, 1 of 3 x 3 pixels`; `as trained` when nothing is spared."""
-    said = [WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value) for knob, value in settings.items()]
-    return ", ".join(word for word in said if word) or "as trained"
+    words = [WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value) for knob, value in settings.items()]
+    return ", ".join(word for word in words if word) or "as trained"
 
 
 def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
@@ -77,11 +77,11 @@ def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
         score: (n,) larger is better.
     """
     order = sorted(range(len(latency)), key=lambda i: (latency[i], -score[i]))
-    kept: list[int] = []
+    best: list[int] = []
     for i in order:
-        if not kept or score[i] > score[kept[-1]]:
-            kept.append(i)
-    return kept
+        if not best or score[i] > score[best[-1]]:
+            best.append(i)
+    return best
 
 
 def cost_of_halving(latency: Iterable[float], score: Iterable[float]) -> float | None:

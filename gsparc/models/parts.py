@@ -65,9 +65,9 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
 
 def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
     """For the `extra` of a finished part's checkpoint: what `fit` compares, and the report."""
-    said = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
-    said |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
-    return {**said, **Origin.of(data, fold, context).marks()}
+    report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
+    report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
+    return {**report_fields, **Origin.of(data, fold, context).marks()}
 
 
 def folder_of(path: Path, parts: str) -> Path:
@@ -89,10 +89,10 @@ def _taken(method: Method, data: Measurements, fold: Fold, context: FitContext, 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:
     """Their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
-    found = Counter(method.label for method in methods)
-    if not found:
+    result = Counter(method.label for method in methods)
+    if not result:
         return name
-    label, count = found.most_common(1)[0]
+    label, count = result.most_common(1)[0]
     inner = label.removeprefix(name).strip(" ()")
     return label if count == len(methods) or not inner else f"{name} ({inner} in {count} of {len(methods)})"
 
@@ -136,22 +136,22 @@ class Origin:
             ValueError: it is of other data, rows, seed or settings, which are named.
         """
         before, now = stored.configuration, yaml.safe_load(self.config) or {}
-        own, found = self._hashes(), []
-        kept = stored.extra.get("origin")
-        if kept is None:
+        own, differing = self._hashes(), []
+        origin = stored.extra.get("origin")
+        if origin is None:
             raise ValueError(f"ckpt_path={stored.path}: does not say what it learned from; start without it")
         for name, group, what in _HASHED:
-            if kept[name] != own[name]:
-                found.append(", ".join(_differences(before, now, (group,))) or f"other {what}")
+            if origin[name] != own[name]:
+                differing.append(", ".join(_differences(before, now, (group,))) or f"other {what}")
         if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
             facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}
-            found += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
-        if kept["seed"] != self.seed:
-            found.append(f"seed={kept['seed']} (here {self.seed})")
-        found += _differences(before, now, DECIDING)
-        if found:
+            differing += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
+        if origin["seed"] != self.seed:
+            differing.append(f"seed={origin['seed']} (here {self.seed})")
+        differing += _differences(before, now, DECIDING)
+        if differing:
             raise ValueError(
-                f"ckpt_path={stored.path}: was trained with {'; '.join(found)}: "
+                f"ckpt_path={stored.path}: was trained with {'; '.join(differing)}: "
                 "go on with the same, or start again without ckpt_path"
             )
         changed = _differences(before, now, CHANGEABLE)

@@ -111,8 +111,8 @@ class PerStation(Method):
     @property
     def effects(self) -> str | None:  # type: ignore[override]
         """Those of the copies, each once."""
-        said = [copy.effects for copy in self._copies.values() if copy.effects is not None]
-        return ", ".join(dict.fromkeys(said)) if said else self.wrapped.effects
+        effects = [copy.effects for copy in self._copies.values() if copy.effects is not None]
+        return ", ".join(dict.fromkeys(effects)) if effects else self.wrapped.effects
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit every station that is asked for, or all together; seconds are shared.
@@ -129,21 +129,21 @@ class PerStation(Method):
         numbers = self._numbers(data, fold, replace(context, budget_s=whole))
         self.site, notes = data.site, []
         left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
-        kept = self.wrapped.resumable and context.run_dir != Path()
-        if kept and left is None:  # of an earlier run in this folder
+        resumable = self.wrapped.resumable and context.run_dir != Path()
+        if resumable and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
-        alone = not elsewhere()
+        local = not elsewhere()
 
         def fitted(turn: int) -> tuple[Method, FitReport]:
             number, share = numbers[turn], None
             folder = "unheard" if number == UNHEARD else f"station{number}"
             if whole is not None:  # what earlier ones left, where these are known
-                even = (whole - budget.spent) / (len(numbers) - turn) if alone else whole / len(numbers)
+                even = (whole - budget.spent) / (len(numbers) - turn) if local else whole / len(numbers)
                 share = max(even, LEAST_SHARE * whole / len(numbers))
             resume = None if left is None else left / folder
             own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
-            if alone and self.wrapped.takes_budget and len(numbers) > 1:
+            if local and self.wrapped.takes_budget and len(numbers) > 1:
                 turns = turn + 1, len(numbers), self._name_of(number), _rest(turn, len(numbers), budget)
                 log.info("station %d of %d: %s%s", *turns)
             rows, part = self._part(data, number)
@@ -152,21 +152,21 @@ class PerStation(Method):
             try:
                 report = parts.fit(copy, part, inner, own)
             except KeyboardInterrupt:
-                if not kept or len(numbers) == 1:
+                if not resumable or len(numbers) == 1:
                     raise
                 said = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{said}; go on with ckpt_path={context.run_dir}") from None
-            if kept and len(numbers) > 1:
+            if resumable and len(numbers) > 1:
                 extra = parts.marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
-        found = dict(each(fitted, range(len(numbers)), "" if alone else "stations"))
-        reports = [found[turn][1] for turn in range(len(numbers))]
+        fits = dict(each(fitted, range(len(numbers)), "" if local else "stations"))
+        reports = [fits[turn][1] for turn in range(len(numbers))]
         for turn, number in enumerate(numbers):
-            self._copies[number] = found[turn][0]
+            self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._name_of(number)
             notes += [f"{name}: {note}" for note in reports[turn].notes]
         limited = less_repeatable(*(one.limited_by for one in reports))
@@ -215,8 +215,8 @@ class PerStation(Method):
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; stations without rows among these are then as if never heard."""
-        found = PerStation(self._make)
-        found.site, found._shared = data.site, self._shared
+        result = PerStation(self._make)
+        result.site, result._shared = data.site, self._shared
         for number, copy in self._copies.items():
             own, part = self._part(data, number)
             chosen = np.flatnonzero(np.isin(own, rows))
@@ -225,8 +225,8 @@ class PerStation(Method):
             learned = copy.reconditioned(part, chosen) if isinstance(copy, Reconditions) else None
             if learned is None:
                 return None
-            found._copies[number] = learned
-        return found if found._copies else None
+            result._copies[number] = learned
+        return result if result._copies else None
 
     def answer(self, batch: Batch) -> Prediction:
         """Each row by its station's copy."""
@@ -289,8 +289,8 @@ class PerStation(Method):
         for number in stations.unique().tolist():
             chosen = (stations == number).nonzero()[:, 0]
             answers.append((chosen, ask(self.of(number), chosen)))
-        rows, found = zip(*answers, strict=True)
-        return Prediction.joined(found, torch.argsort(torch.cat(rows)))
+        rows, result = zip(*answers, strict=True)
+        return Prediction.joined(result, torch.argsort(torch.cat(rows)))
 
     def state(self) -> dict[str, Any]:
         """The state of every copy, by its station's number."""
@@ -316,10 +316,10 @@ class PerStation(Method):
 
     def facts(self) -> dict[str, float | int | str | None]:
         """Sums over the copies of what counts or costs, and means of shares; the initialisers of all."""
-        found = [copy.facts() for copy in self._copies.values()]
-        if not found:
+        result = [copy.facts() for copy in self._copies.values()]
+        if not result:
             return self.wrapped.facts()
-        return {name: _over([one[name] for one in found], name) for name in found[0]}
+        return {name: _over([one[name] for one in result], name) for name in result[0]}
 
     def __iter__(self) -> Iterator[tuple[int, Method]]:
         return iter(self._copies.items())

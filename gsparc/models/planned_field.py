@@ -152,15 +152,15 @@ class PlannedField(LearnedField):
         first = replace(context, run_dir=Path(), resume=None, budget_s=MEASURED_SHARE * seconds)
         limited = self._fit_conditional(chosen, data, fold, first).limited_by
         assert self.field is not None
-        rows, by, said = refined(self.field, self.runs.aligned(data), std)
-        log.info("%s", said)
+        rows, by, note = refined(self.field, self.runs.aligned(data), std)
+        log.info("%s", note)
         spent = budget.counted.wall
         rest = replace(context, budget_s=max(seconds - budget.spent, (1 - MEASURED_SHARE) * seconds / 2))
-        found = self._fit_conditional(chosen, displaced(data, rows, by), fold, rest)
-        limited = less_repeatable(limited, found.limited_by)
-        cost = replace(found.cost, stages={"measured places": spent, **found.cost.stages})
-        notes = (said, *found.notes)
-        return replace(found, seconds=spent + found.seconds, notes=notes, limited_by=limited, cost=cost)
+        report = self._fit_conditional(chosen, displaced(data, rows, by), fold, rest)
+        limited = less_repeatable(limited, report.limited_by)
+        cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
+        notes = (note, *report.notes)
+        return replace(report, seconds=spent + report.seconds, notes=notes, limited_by=limited, cost=cost)
 
     def _fit_rasterized(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         assert self.plan is not None
@@ -222,8 +222,8 @@ class PlannedField(LearnedField):
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
         count = 1 if data.site.stations is None else len(data.site.stations)
-        alone = LEAST_FACTORS * count * factor_s(min(len(known) // count, MOST_FACTORED))
-        least = alone if len(chosen.parts) == 1 else alone * (1 + solutions.GROUPS)
+        one_fit = LEAST_FACTORS * count * factor_s(min(len(known) // count, MOST_FACTORED))
+        least = one_fit if len(chosen.parts) == 1 else one_fit * (1 + solutions.GROUPS)
         if "rays" in chosen.parts:
             least += RAYS_FACTORS * factor_s(min(len(known), MOST_FACTORED))
         if least > budget.seconds:
@@ -231,16 +231,16 @@ class PlannedField(LearnedField):
                 "%g s are too few: the least fit of these rows takes about %.0f s", budget.seconds, least
             )
         several = len(chosen.parts) > 1
-        held = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
+        cut = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
         init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
         until_s = budget.seconds * (1 - STEPS_SHARE)
         share = solutions.CLOSED_SHARE * max(budget.seconds - budget.spent, solutions.LEAST_S)
         data = self._aligned(data, known, replace(context, budget_s=share))
-        found, reports = solutions.find(
-            chosen.parts, init, self.switches, data, fold, context, budget, until_s, held
+        fields, reports = solutions.find(
+            chosen.parts, init, self.switches, data, fold, context, budget, until_s, cut
         )
-        kept = solutions.weighed(found, data, fold, held)
-        self.field, self.started = solutions.joined(kept), "+".join(kept)
+        members = solutions.weighed(fields, data, fold, cut)
+        self.field, self.started = solutions.joined(members), "+".join(members)
         self.field.site = data.site
         self.init_s = budget.counted.wall
         log.info(
@@ -256,7 +256,7 @@ class PlannedField(LearnedField):
         gain = _late_gain(reports)
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
-        weighed = {*kept, "weighing", "final weights", *(("gradient steps",) if self.steps else ())}
+        weighed = {*members, "weighing", "final weights", *(("gradient steps",) if self.steps else ())}
         unused = {name: spent for name, spent in stages.items() if name not in weighed}
         notes = [note for name in self.started.split("+") for note in reports[name].notes]
         limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
@@ -295,9 +295,9 @@ class PlannedField(LearnedField):
             if not apart:
                 field.condition(data, fold.train)
             batch = data.batch(fold.val)
-            target, found = comparable(batch.target, data.site), field(batch.tx, batch.rx)
-            assert found.explained is not None
-            own = comparable(found.explained, data.site)
+            target, result = comparable(batch.target, data.site), field(batch.tx, batch.rx)
+            assert result.explained is not None
+            own = comparable(result.explained, data.site)
             self.explained = solution_weights.explained(own, target, data.site.kind != "csi")
         if isinstance(getattr(getattr(field, "process", None), "posterior", None), Nearest):
             log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
@@ -324,8 +324,8 @@ class PlannedField(LearnedField):
             ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
         except KeyboardInterrupt:  # these steps are taken anew; what searches found is kept
             searched = context.run_dir / "last.ckpt"
-            said = f"go on with ckpt_path={searched}" if searched.exists() else "there is no checkpoint yet"
-            raise KeyboardInterrupt(f"training was interrupted; {said}") from None
+            advice = f"go on with ckpt_path={searched}" if searched.exists() else "there is no checkpoint yet"
+            raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
         return ran.steps, True
 
     def _most_steps(self, context: FitContext) -> int:
@@ -359,11 +359,11 @@ class PlannedField(LearnedField):
     def answer(self, batch: Batch) -> Prediction:
         """See `Method.answer`."""
         if self.field is None or not self.field.reads_rows:
-            found = super().answer(batch)
+            result = super().answer(batch)
         else:
             of_field = self.field.answer(replace(batch, run=None))
-            found = Prediction(of_field.mean, (1 - of_field.unknown).clamp(0, 1), of_field.variance)
-        return self.runs.restored(found, batch.run)
+            result = Prediction(of_field.mean, (1 - of_field.unknown).clamp(0, 1), of_field.variance)
+        return self.runs.restored(result, batch.run)
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
@@ -390,22 +390,22 @@ class PlannedField(LearnedField):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        found = getattr(self.field, "process", None)
-        return None if found is None else found.exact()
+        result = getattr(self.field, "process", None)
+        return None if result is None else result.exact()
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
         if self.field is None or not self.field.forgets:
             return None
-        found = copy.copy(self)
-        found.field = copy.deepcopy(self.field)
-        found.field.condition(data, rows)
-        return found
+        result = copy.copy(self)
+        result.field = copy.deepcopy(self.field)
+        result.field.condition(data, rows)
+        return result
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; fields in closed form and a process alone have gradients."""
-        alone = self._average is not None and not self.size()
-        return None if self.field is not None or alone else super().gradient_problem()
+        process_only = self._average is not None and not self.size()
+        return None if self.field is not None or process_only else super().gradient_problem()
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.
@@ -418,10 +418,10 @@ class PlannedField(LearnedField):
         made = [(w, one.method) for w, one in parts if isinstance(getattr(one, "method", None), HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
-        found = [(weight, method.paths(tx, rx)) for weight, method in made]
-        gain = torch.cat([weight * one[0] for weight, one in found], dim=2)
-        delay = torch.cat([one[1] for _, one in found], dim=2)
-        return gain, delay, torch.cat([one[2] for _, one in found], dim=1), found[0][1][3]
+        result = [(weight, method.paths(tx, rx)) for weight, method in made]
+        gain = torch.cat([weight * one[0] for weight, one in result], dim=2)
+        delay = torch.cat([one[1] for _, one in result], dim=2)
+        return gain, delay, torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
 
     def trainer_options(self) -> bool:
         """See `TrainsByGradient`."""
@@ -453,14 +453,14 @@ class PlannedField(LearnedField):
         if self.field is None:
             twin = copy.copy(self)
             twin._average = None
-            found = LearnedField.reduced(twin, settings, measured)
-            return found if self._average is None else averaged(found, *self._average)
+            result = LearnedField.reduced(twin, settings, measured)
+            return result if self._average is None else averaged(result, *self._average)
         method, whole = self._method(), self.field
         if method is None:
             return self
-        found = reduced(method, settings, measured)
+        result = reduced(method, settings, measured)
         more = isinstance(whole, Mixture) and whole.residual is not None
-        return Blended(found, whole.residual, whole.share) if more else found  # type: ignore[union-attr, arg-type]
+        return Blended(result, whole.residual, whole.share) if more else result  # type: ignore[union-attr, arg-type]
 
     # -- storing -----------------------------------------------------------------------------------
 

@@ -47,7 +47,7 @@ def combinations(
     Strides must divide the columns, others are left out with a warning.
     """
     known = knobs(method)
-    alone = [{knob: value} for knob, values in singles.items() if knob in known for value in values]
+    single = [{knob: value} for knob, values in singles.items() if knob in known for value in values]
     axes = {knob: values for knob, values in grid.items() if knob in known and values is not None}
     if "stride" in axes:
         axes["stride"] = _dividing(axes["stride"], method)
@@ -56,7 +56,7 @@ def combinations(
         for chosen in product(*axes.values())
     ]
     seen: list[dict[str, Any]] = []
-    for settings in ({}, *alone, *together):
+    for settings in ({}, *single, *together):
         if settings not in seen:
             seen.append(settings)
             yield settings
@@ -159,8 +159,8 @@ class Filled(View):
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; images (B, H, W) of the full grid."""
-        found = self.inner.predict(tx, rx)
-        return Prediction(self.fill(found.mean), found.confidence, found.variance)
+        result = self.inner.predict(tx, rx)
+        return Prediction(self.fill(result.mean), result.confidence, result.variance)
 
     def fill(self, image: Tensor) -> Tensor:
         """(B, h, w) -> (B, H, W)."""
@@ -190,9 +190,9 @@ class Blended(View):
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
-        found = self.inner.predict(tx, rx)
-        mean = found.mean if self.own == 1 else found.mean * self.own
-        return replace(found, mean=torch.add(mean, self.other(tx, rx).mean, alpha=self.weight))
+        result = self.inner.predict(tx, rx)
+        mean = result.mean if self.own == 1 else result.mean * self.own
+        return replace(result, mean=torch.add(mean, self.other(tx, rx).mean, alpha=self.weight))
 
 
 def mean_alone(process: Method, settings: Settings | None = None) -> Method:

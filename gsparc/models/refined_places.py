@@ -46,20 +46,20 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
         place: (n,) int64, which of P places each was measured at.
         std: (P,) [m]; of a place without error, the displacement is 0.
     """
-    sure, count = 1 / seen.variance, len(std)
+    weight, count = 1 / seen.variance, len(std)
     slope = seen.slope * std[place][:, None, None]
-    own = torch.einsum("ndk,ndl,nd->nkl", slope, slope, sure)
+    own = torch.einsum("ndk,ndl,nd->nkl", slope, slope, weight)
     size = torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, place, own)
-    towards = torch.einsum("ndk,nd,nd->nk", slope, seen.residual, sure)
+    towards = torch.einsum("ndk,nd,nd->nk", slope, seen.residual, weight)
     pull = torch.zeros(count, 3, dtype=torch.float64).index_add(0, place, towards)
-    whole, entries = float((seen.residual.square() * sure).sum()), int((sure > 0).sum())
+    whole, entries = float((seen.residual.square() * weight).sum()), int((weight > 0).sum())
     tried = []
     for share in SHARES:
         precision = torch.eye(3, dtype=torch.float64) + size / share
         unit = torch.linalg.solve(precision, pull[..., None])[..., 0] / share
         exact = (whole / share + entries * math.log(share)) / 2
-        told = float((pull * unit).sum()) / share - float(precision.logdet().sum())
-        tried.append((exact - told / 2, exact, unit))
+        fit = float((pull * unit).sum()) / share - float(precision.logdet().sum())
+        tried.append((exact - fit / 2, exact, unit))
     least, _, unit = min(tried, key=lambda each: each[0])
     return unit * std[:, None], min(exact for _, exact, _ in tried) - least
 
@@ -80,10 +80,10 @@ def refined(
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
     moved, gain = displacements(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
-    said = f"errors of places explain the rows left out {gain:+.0f} nats better: positions "
+    note = f"errors of places explain the rows left out {gain:+.0f} nats better: positions "
     if gain <= 0:
-        return rows, np.zeros((len(rows), 3)), f"{said}stay as measured"
-    return rows, moved.numpy()[place], f"{said}refined by {float(moved.square().mean().sqrt()):.2g} m (rms)"
+        return rows, np.zeros((len(rows), 3)), f"{note}stay as measured"
+    return rows, moved.numpy()[place], f"{note}refined by {float(moved.square().mean().sqrt()):.2g} m (rms)"
 
 
 def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray, Linearised]:
@@ -107,8 +107,8 @@ def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray
         return real(comparable(field.answer(at(places)).mean, site))
 
     with torch.no_grad():
-        found = field.answer(at(moving))  # what is computed once and kept must not be so inside `jvp`
-    variance = torch.where(left.variance.isnan(), found.variance, left.variance).double()
+        result = field.answer(at(moving))  # what is computed once and kept must not be so inside `jvp`
+    variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
     if site.kind == "rssi":
         variance = variance * (10 / math.log(10) / left.mean.flatten().double().clamp_min(1e-30)).square()
     residual = real(comparable(batch.target, site)) - real(comparable(left.mean, site))

@@ -47,18 +47,18 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
     budget = context.time_budget(min(MOST_S, SHARE * given))
     errors = []
     for inner in cut_inside(data, fold, context.split, FOLDS, context.seed).folds:
-        learned, asked = (heard(data, part) for part in (np.union1d(inner.train, inner.val), inner.test))
+        learned, queries = (heard(data, part) for part in (np.union1d(inner.train, inner.val), inner.test))
         if len(learned) > TRIED_ON:
             learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:TRIED_ON])
         own = replace(context, run_dir=Path(), resume=None, budget_s=MOST_S)
-        parts = list(_by_station(data, learned, asked, own))
+        parts = list(_by_station(data, learned, queries, own))
         if not parts:
             continue
         joint, _ = INITIALISERS["joint_powers"](data, learned, PLAIN, False, own)
         rows = np.concatenate([part for part, _ in parts])
-        alone = torch.cat([said for _, said in parts])
+        separate = torch.cat([powers for _, powers in parts])
         target = _decibels(data.batch(rows).target)
-        errors.append([(_said(joint, data, rows) - target).square(), (alone - target).square()])
+        errors.append([(_said(joint, data, rows) - target).square(), (separate - target).square()])
         if budget.over():
             break
     if not errors:
@@ -69,13 +69,13 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
 
 
 def _by_station(
-    data: Measurements, learned: np.ndarray, asked: np.ndarray, context: FitContext
+    data: Measurements, learned: np.ndarray, queries: np.ndarray, context: FitContext
 ) -> Iterator[tuple[np.ndarray, Tensor]]:
     """Rows (m,) asked of each station with rows to learn from, and powers (m,) [dB] by its own process."""
     assert data.station is not None
-    for number in np.unique(data.station[asked]).tolist():
+    for number in np.unique(data.station[queries]).tolist():
         rows = np.flatnonzero(data.station == number)
-        known, left = (np.flatnonzero(np.isin(rows, part)) for part in (learned, asked))
+        known, left = (np.flatnonzero(np.isin(rows, part)) for part in (learned, queries))
         if len(known) >= LEAST_ROWS:
             part = data.subset(rows, of_station(data.site, number))
             field, _ = INITIALISERS["powers"](part, known, PLAIN, False, context)

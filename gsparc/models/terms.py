@@ -24,7 +24,7 @@ class EffectSettings(Checked):
         phase: carrier phase from places of sources, for channels.
         power: distance law in decibels and known walls along the path, for received powers.
         visibility: what hides: occluding boxes and finite mirrors of sources, known walls of powers and, of
-            several stations, Gaussians in the way; rasterized Gaussians always occlude each other.
+            several stations, shadowing of a place; rasterized Gaussians always occlude each other.
         residual: a process in the target's own correlation on what Gaussians leave.
     """
 
@@ -103,8 +103,8 @@ def called_for(
             raise ValueError(f"model.effects.{name}=true is not possible: {obstacle}")
         on[name] = switch is not False and obstacle is None
         if obstacle is None:
-            said = "" if switch == "auto" else ": as configured"
-            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{said}")
+            suffix = "" if switch == "auto" else ": as configured"
+            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{suffix}")
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = drawn is not None or switches.image is True

@@ -142,7 +142,7 @@ def lags(array: np.ndarray, wavelength: float) -> Lags:
     moved = which > 0
     # h_m conj(h_n) e^{-j k d.u}: Re cos + Im sin, and its conjugate twin sits at -d.
     imag[every[moved], len(unique) - 1 + which[moved]] = sign[moved]
-    kept = np.stack(
+    differences = np.stack(
         [difference.reshape(-1, 3)[(which == i) & (sign >= 0)].mean(0) for i in range(len(unique))]
     )
-    return Lags(kept, torch.from_numpy(real), torch.from_numpy(imag), m)
+    return Lags(differences, torch.from_numpy(real), torch.from_numpy(imag), m)

@@ -67,12 +67,12 @@ class SpectrumRenderer(nn.Module):
         h = vectors[:, :-1]
         products = torch.view_as_real(h[:, :, None] * h[:, None, :].conj())
         r = products.flatten(1) @ self.pairs
-        found = []
+        result = []
         for number, span in enumerate(self.spans):
             table, waves = getattr(self, f"table{number}"), getattr(self, f"waves{number}")
             rows = (r[:, span] @ table).view(-1, len(waves))
-            found.append((rows @ waves).view(len(vectors), self.square.shape[0], -1))
-        return found
+            result.append((rows @ waves).view(len(vectors), self.square.shape[0], -1))
+        return result
 
 
 def _harmonics(basis: Tensor, columns: int, periodic: bool) -> tuple[Tensor, Tensor]:
@@ -88,9 +88,9 @@ def _harmonics(basis: Tensor, columns: int, periodic: bool) -> tuple[Tensor, Ten
         return basis.permute(2, 0, 1).reshape(numbers, -1), torch.eye(width, dtype=basis.dtype)
     spectrum = torch.fft.rfft(basis, dim=1) / width
     peak = spectrum.abs().amax((0, 2))
-    kept = torch.nonzero(peak > NEGLIGIBLE * peak.max()).squeeze(1)
-    twice = torch.where((kept == 0) | (2 * kept == width), 1.0, 2.0).double()
-    turn = 2 * torch.pi / width * kept[:, None] * torch.arange(columns, dtype=torch.float64)
+    harmonics = torch.nonzero(peak > NEGLIGIBLE * peak.max()).squeeze(1)
+    twice = torch.where((harmonics == 0) | (2 * harmonics == width), 1.0, 2.0).double()
+    turn = 2 * torch.pi / width * harmonics[:, None] * torch.arange(columns, dtype=torch.float64)
     waves = torch.stack([twice[:, None] * turn.cos(), -twice[:, None] * turn.sin()], 1).flatten(0, 1)
-    table = torch.view_as_real(spectrum[:, kept]).permute(2, 0, 1, 3).reshape(numbers, -1)
+    table = torch.view_as_real(spectrum[:, harmonics]).permute(2, 0, 1, 3).reshape(numbers, -1)
     return table, waves

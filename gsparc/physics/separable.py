@@ -68,5 +68,5 @@ def _principal(gram: Tensor, lost: float) -> Tensor:
     """Eigenvectors (P, K) float32 of the largest eigenvalues; the others hold at most the share `lost`."""
     values, vectors = torch.linalg.eigh(gram)
     tail = values.clamp_min(0).cumsum(0)
-    kept = int((tail > lost * tail[-1]).sum())
-    return vectors[:, len(gram) - max(kept, 1) :].flip(1).float()
+    count = int((tail > lost * tail[-1]).sum())
+    return vectors[:, len(gram) - max(count, 1) :].flip(1).float()

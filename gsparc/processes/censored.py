@@ -47,8 +47,8 @@ def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
     inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
     ratio = (-inside.square() / 2 - 0.5 * math.log(2 * math.pi) - torch.special.log_ndtr(inside)).exp()
     series = -1 / t - t + 2 * t**3  # Abramowitz and Stegun 26.2.12
-    kept = t**2 * (1 - 6 * t**2 + 50 * t**4)
-    lost = torch.where(z < FAR, 1 - kept, ratio * (inside + ratio))
+    remaining = t**2 * (1 - 6 * t**2 + 50 * t**4)
+    lost = torch.where(z < FAR, 1 - remaining, ratio * (inside + ratio))
     return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
 
 
@@ -64,13 +64,13 @@ def propagate(known: ConditionalGaussian, level: Tensor) -> Sites:
         weights = factor.inverse @ (value - mean)
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
-        found, wide = _sites(cavity, cavity_variance, level)
+        result, wide = _sites(cavity, cavity_variance, level)
         settled = bool(((cavity - before).abs() / total.sqrt()).max() < SETTLED)
         if settled:
             break
         before = cavity
         both = (1 - DAMPING) / variance + DAMPING / wide
-        value = ((1 - DAMPING) * value / variance + DAMPING * found / wide) / both
+        value = ((1 - DAMPING) * value / variance + DAMPING * result / wide) / both
         variance = 1 / both
     apart = cavity_variance + variance
     evidence = -0.5 * (((value - mean) @ weights) + factor.log_determinant)
@@ -119,9 +119,9 @@ class ConditionalGaussian:
         """Entries (m,) bool that the known ones leave in doubt to lie below `level` (m,)."""
         return level - self.mean < CERTAIN * self.covariance.diagonal().sqrt()
 
-    def at(self, kept: Tensor) -> ConditionalGaussian:
+    def at(self, rows: Tensor) -> ConditionalGaussian:
         """The entries `kept` alone."""
-        return ConditionalGaussian(self.mean[kept], self.covariance[kept][:, kept], self.log_evidence)
+        return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
 
 
 def log_evidence(gram: Tensor, values: Tensor, unknown: Tensor) -> tuple[float, Tensor]:

@@ -57,9 +57,9 @@ class LeftOutDensity(torch.autograd.Function):
         steeper = (1 + 2 * excess / count) / (entries * amplitude)
         ctx.save_for_backward(inverse, ratio, steeper * ratio / share[:, None])
         ctx.by_share = -0.5 * (steeper * squared / share.square() + 1 / share)
-        found = gram.new_tensor(amplitude)
-        ctx.mark_non_differentiable(found)
-        return gram.new_tensor(density + 0.5 * excess**2), found
+        result = gram.new_tensor(amplitude)
+        ctx.mark_non_differentiable(result)
+        return gram.new_tensor(density + 0.5 * excess**2), result
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
@@ -133,11 +133,11 @@ def walked(
 
     points = [np.clip(start, low, high) for start in starts]
     start = min(points, key=lambda point: ask(point)[0]) if len(points) > 1 else points[0]
-    found = minimize(
+    result = minimize(
         ask, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
         options={"ftol": tolerance, "maxfun": looks}, callback=stop_when_late,
     )  # fmt: skip
-    return found.x, float(found.fun)
+    return result.x, float(result.fun)
 
 
 def by_left_out(

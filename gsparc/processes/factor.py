@@ -109,13 +109,6 @@ class Factor:
         with BLAS.limit(limits=1):
             return torch.from_numpy(trsm(1.0, upper, right.T, side=1, lower=0, trans_a=2 if adjoint else 0).T)
 
-    def bordered(self, cross: Tensor, own: Tensor) -> Factor:
-        """Of the covariance with more rows: `cross` (n, m) with these, and `own` (m, m)."""
-        white = self.whitened(cross)
-        corner = Factor.of(own - white.mH @ white).lower
-        zeros = self.lower.new_zeros(len(self.lower), len(corner))
-        return Factor(torch.cat([torch.cat([self.lower, zeros], 1), torch.cat([white.mH, corner], 1)]))
-
     @cached_property
     def root(self) -> Tensor:
         """`L^-1` (..., n, n): `K^-1 = root^H root`."""

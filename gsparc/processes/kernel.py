@@ -97,9 +97,9 @@ class Kernel:
 
     def gram(self, places: Tensor) -> Tensor:
         """Correlations (n, n) with noise of places (n, D) [m]."""
-        found = self.between(places, places)
-        found.diagonal().add_(self.noise)
-        return found
+        result = self.between(places, places)
+        result.diagonal().add_(self.noise)
+        return result
 
     @property
     def length(self) -> float:

@@ -23,13 +23,11 @@ from torch import Tensor
 
 from gsparc.ops.queries import nearest_weights, served
 from gsparc.ops.transforms import numbers
-from gsparc.processes.answer import Answer, Posterior
-from gsparc.processes.covering import covering
 from gsparc.processes.density import walked
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, WaveKernel, apart, bounds_of, matern_sum, unpacked
-from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, nearest_distance
-from gsparc.processes.prior import Prior
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance
+from gsparc.processes.prior import Answer, Posterior, Prior
 
 COVER = 20_000  # rows that weigh the mean law
 WHITENED = 1_024  # rows at a time that are whitened by their neighbours
@@ -80,12 +78,12 @@ class Values:
     @classmethod
     def of(cls, places: np.ndarray, values: Tensor) -> Values:
         """Of rows (n, D), (n, P)."""
-        alone, group, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+        unique, group, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
         counted = torch.from_numpy(count).to(values.dtype)
-        sums = values.new_zeros(len(alone), values.shape[1]).index_add_(
+        sums = values.new_zeros(len(unique), values.shape[1]).index_add_(
             0, torch.from_numpy(group.reshape(-1)), values
         )
-        return cls(alone, sums / counted[:, None], counted.double())
+        return cls(unique, sums / counted[:, None], counted.double())
 
 
 @dataclass(frozen=True)
@@ -133,8 +131,8 @@ class Nearest(Posterior):
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """See `Posterior`."""
-        found = self._answers(self.places, np.arange(len(self.places)))
-        return found.mean, found.left
+        result = self._answers(self.places, np.arange(len(self.places)))
+        return result.mean, result.left
 
     def _answers(self, queries: Tensor, without: np.ndarray | None, exact: bool = False) -> Answer:
         step = self._block
@@ -143,13 +141,13 @@ class Nearest(Posterior):
         if len(blocks) < 2 or not served(queries):
             return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
         first = next(parts)
-        found = Answer(
+        result = Answer(
             first.mean.new_empty(len(queries), first.mean.shape[1]), queries.new_empty(len(queries))
         )
         # Parts kept in a list would lie between freed systems in memory, which then is not used again.
         for block, part in zip(blocks, chain([first], parts), strict=True):
-            found.mean[block], found.left[block] = part.mean, part.left
-        return found
+            result.mean[block], result.left[block] = part.mean, part.left
+        return result
 
     def _answer(self, queries: Tensor, without: np.ndarray | None, exact: bool) -> Answer:
         index = torch.from_numpy(self.near.nearest(numbers(queries), without, self.most))
@@ -169,12 +167,12 @@ class Nearest(Posterior):
         """Of rows (B, k), see `weights_of`."""
         kernel = self.prior.kernel
         if type(kernel) is Kernel and served(queries):  # a subclass has other correlations
-            found = nearest_weights(
+            result = nearest_weights(
                 queries, self.places, self._solvable, index, kernel.lengths, kernel.shares
             )
-            if found is None:
+            if result is None:
                 raise NotPositiveDefiniteError("a covariance of near rows is not positive definite")
-            return found
+            return result
         return weights_of(kernel, queries, self.places[index], self.noise[index])
 
     @cached_property
@@ -371,5 +369,5 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     starts = [Kernel((long * share, long), shares, start.noise, 1.0) for share in SHORTER]
     if len(start.lengths) == 2:
         starts.append(start)
-    said = f"settings chosen on {len(rows)} of {count} places, each given its nearest {NEIGHBOURS}"
-    return most_likely(starts, sample, scale), f"{said} among {' and '.join(str(len(o)) for o in sets)}"
+    note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {NEIGHBOURS}"
+    return most_likely(starts, sample, scale), f"{note} among {' and '.join(str(len(o)) for o in sets)}"

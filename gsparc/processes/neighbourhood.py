@@ -1,4 +1,4 @@
-"""Neighbours of a place among very many, near ones and some that are not of the same spot."""
+"""Rows that cover a site, and neighbours of a place among very many, not all of the same spot."""
 
 from __future__ import annotations
 
@@ -11,13 +11,45 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.ops.transforms import followed, numbers
-from gsparc.processes.covering import covering
 from gsparc.processes.kernel import apart
 
 NEIGHBOURS = 30  # that tell of a place
 WIDER = 0.5  # share of them that are of sparser sets
 SPARSER = 8.0  # from one set of places to the next
 FEWEST = 500  # places in the sparsest of them
+ENOUGH = 0.8  # of rows that cover a site, one in each cell
+HALVINGS = 40  # of the side of cells, each a look at all rows
+
+
+def covering(places: np.ndarray, most: int, seed: int) -> np.ndarray:
+    """At most so many rows, sorted: one drawn in each of as many cubic cells of one side, the rest at random.
+
+    A vehicle that stood for an hour counts no more than a place that it drove by. Time is linear in n.
+
+    Args:
+        places: (n, D) [m].
+        most: rows, at least 1.
+        seed: of what is drawn.
+    """
+    if len(places) <= most:
+        return np.arange(len(places))
+    order = np.random.default_rng(seed).permutation(len(places))
+    low, size = places.min(0), max(float(np.ptp(places, axis=0).max()), np.finfo(float).tiny)
+    mixing = np.random.default_rng(0).integers(1, 2**62, places.shape[1])
+    fine, coarse, first = 0.0, size * 2, order[:1]
+    for _ in range(HALVINGS):
+        side = fine + (coarse - fine) / 2
+        cells = np.floor((places[order] - low) / side).astype(np.int64)
+        number = cells @ mixing  # of each cell its own, but for collisions of no weight
+        result = order[np.unique(number, return_index=True)[1]]
+        if len(result) <= most:
+            coarse, first = side, result
+        else:
+            fine = side
+        if len(first) >= ENOUGH * most or coarse - fine < 1e-3 * coarse:
+            break
+    rest = order[~np.isin(order, first)][: most - len(first)]
+    return np.sort(np.concatenate([first, rest]))
 
 
 @dataclass(frozen=True)
@@ -74,15 +106,15 @@ class Neighbourhood:
                 alone there is then no neighbour.
             most: neighbours.
         """
-        found: list[np.ndarray] = []
+        result: list[np.ndarray] = []
         more = 0 if without is None else 1
         for (own, count), (_, tree) in zip(self.shares(most), self._trees[::-1], strict=True):
             row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if without is not None:
                 later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
                 row = np.take_along_axis(row, later, 1)
-            found.append(row)
-        return np.concatenate(found, 1)
+            result.append(row)
+        return np.concatenate(result, 1)
 
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:

@@ -13,14 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.processes.answer import Answer, Posterior
 from gsparc.processes.conditioned import weighted
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.left_out import left_out
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
-from gsparc.processes.prior import Prior
+from gsparc.processes.prior import Answer, Posterior, Prior
 
 MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many of the nearest
 
@@ -53,23 +52,9 @@ class Exact(Posterior):
         """Of values (n, P) at places (n, D) float64 [m]; their covariance's factor where it is known."""
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra) if factor is None else factor
-        found = cls(prior, places, factor.solved(values - prior.mean(places)), extra)
-        found.__dict__["factor"] = factor  # as `cached_property` would keep it
-        return found
-
-    def given(self, places: Tensor, values: Tensor) -> Exact:
-        """The same given more rows (m, D), (m, P), in m n^2 instead of (n + m)^3 operations."""
-        cross = self.prior.between(self.rows, places)
-        own = self.prior.between(places, places)
-        own.diagonal().add_(self.prior.kernel.noise)
-        extra = torch.cat([self.extra, torch.zeros(len(places), dtype=torch.float64)])
-        every, rows = torch.cat([self.values(), values]), torch.cat([self.rows, places])
-        return Exact.of(self.prior, rows, every, extra, self.factor.bordered(cross, own))
-
-    def without(self, rows: Tensor) -> Exact:
-        """The same without rows (m,) by their numbers."""
-        kept = torch.ones(len(self.rows), dtype=torch.bool).index_fill(0, rows, False)
-        return Exact.of(self.prior, self.rows[kept], self.values()[kept], self.extra[kept])
+        result = cls(prior, places, factor.solved(values - prior.mean(places)), extra)
+        result.__dict__["factor"] = factor  # as `cached_property` would keep it
+        return result
 
     @property
     def places(self) -> Tensor:
@@ -110,12 +95,12 @@ class Exact(Posterior):
         return apart(queries, self.rows).amin(1)
 
     def _mean(self, queries: Tensor, cross: Tensor) -> Tensor:
-        found = weighted(cross, self.weights)
-        return found if self.prior.trend is None else self.prior.mean(queries) + found
+        result = weighted(cross, self.weights)
+        return result if self.prior.trend is None else self.prior.mean(queries) + result
 
     def _cross(self, queries: Tensor, own: Tensor) -> Tensor:
-        found = self.prior.kernel.between(queries, self.rows)
-        return found if self.prior.trend is None else found.addmm(own, self._columns.T)
+        result = self.prior.kernel.between(queries, self.rows)
+        return result if self.prior.trend is None else result.addmm(own, self._columns.T)
 
     @cached_property
     def _columns(self) -> Tensor:

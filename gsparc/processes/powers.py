@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.censored import ConditionalGaussian, propagate
-from gsparc.processes.covering import covering
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values, given
-from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering
 from gsparc.processes.posterior import Exact, Posterior
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
@@ -108,13 +107,13 @@ class PowerProcess:
         Unknown is the variance as a share of that of the known rows. What the mean law explains of them
         counts as known near them only: its slope says nothing of places far from all data.
         """
-        found = self.posterior.answer(queries)
+        result = self.posterior.answer(queries)
         own = 1 + self.kernel.noise
         whole = max(self.heard, own)
         by_law = 1 - own / whole  # share of that variance
         far = self.posterior.distance(queries) / self._reach
-        unknown = found.left / whole + by_law * (1 - (-far.square()).exp())
-        return found.mean[:, 0], self.kernel.amplitude * found.left, unknown.clamp_max(1.0)
+        unknown = result.left / whole + by_law * (1 - (-far.square()).exp())
+        return result.mean[:, 0], self.kernel.amplitude * result.left, unknown.clamp_max(1.0)
 
     @cached_property
     def _reach(self) -> float:
@@ -161,9 +160,9 @@ def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[Po
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
     heard = float((share * (values.values[:, 0] - middle).square()).sum()) / kernel.amplitude
-    said = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
+    note = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
     if not rows.silent.any():
-        return PowerProcess(given(prior, values, seed), heard), (said,)
+        return PowerProcess(given(prior, values, seed), heard), (note,)
     part = rows.drawn(MOST_ROWS, seed)
     few, notes = _exact(part, prior, seed)
     posterior = few.posterior
@@ -176,7 +175,7 @@ def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[Po
     )
     of = f"of {int(rows.silent.sum())} silent rows {int(part.silent.sum())}, drawn evenly, are looked at"
     nearest = given(prior, values, seed, stand_ins, posterior.extra[quiet])
-    return PowerProcess(nearest, heard), (said, of, *notes)
+    return PowerProcess(nearest, heard), (note, of, *notes)
 
 
 def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:

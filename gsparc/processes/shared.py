@@ -46,13 +46,6 @@ class Block:
         """(P, P) that it adds to the precision of the weights."""
         return self.columns.T @ self.columns
 
-    def scaled(self, scale: Tensor) -> Block:
-        """With columns times `scale` (P,); those of 0 go."""
-        used = scale.nonzero()[:, 0]
-        found = Block(self.process, self.columns[:, used] * scale[used], self.values)
-        found.__dict__["gram"] = scale[used, None] * self.gram[used[:, None], used] * scale[used]
-        return found
-
 
 class Shared:
     """What the rows of several processes say of shared terms, and so of each other.
@@ -82,8 +75,8 @@ class Shared:
             self._blocks[number] = Block.of(process, self.columns(process.rows))
         return self._blocks[number]
 
-    def answer(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, variance of a measurement, and the mean without the process's own part, each (B,).
+    def answer(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        """Mean and variance of a measurement, each (B,).
 
         Args:
             queries: (B, D) float64.
@@ -92,7 +85,7 @@ class Shared:
         block = self.block(number) if number in self.processes else None
         prior = self.never if block is None else block.process.prior
         columns = self.columns(queries)
-        explained = mean = prior.mean(queries)[:, 0] + columns @ self.mean
+        mean = prior.mean(queries)[:, 0] + columns @ self.mean
         left = prior.kernel.amplitude * prior.variance(prior.columns(queries))
         if block is not None:
             cross = deviation_of(prior) * prior.between(queries, block.process.rows)
@@ -100,7 +93,7 @@ class Shared:
             mean = mean + white @ (block.values - block.columns @ self.mean)
             left = (left - white.square().sum(1)).clamp_min(0.0)
             columns = columns - white @ block.columns
-        return mean, left + self.factor.whitened(columns.T).square().sum(0), explained
+        return mean, left + self.factor.whitened(columns.T).square().sum(0)
 
     @torch.no_grad()
     def left_out(self, number: int) -> tuple[Tensor, Tensor]:
@@ -132,11 +125,11 @@ def left_out_whole(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
     With C the covariance of the weights the inverse of a block is `L^-T (1 - V C V^T) L^-1`.
     """
     factor, mean = weights_of(blocks)
-    found = []
+    result = []
     for block in blocks:
         known = factor.whitened(block.columns.T)
         lower = block.process.factor.lower * deviation_of(block.process.prior)
         inner = Factor.of(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
         error = inner.solved((block.values - block.columns @ mean)[:, None])[:, 0]
-        found.append((lower @ error, inner.whitened(lower.T).square().sum(0)))
-    return found
+        result.append((lower @ error, inner.whitened(lower.T).square().sum(0)))
+    return result

@@ -1,4 +1,8 @@
-"""The mean law of powers, and what of it is uncertain."""
+"""The mean law of powers, and what of it is uncertain: losses in known walls among it.
+
+The multi-wall model (COST Action 231, "Digital mobile radio towards future generation systems", final report,
+1999, section 4.7.2): one loss for each wall, another for each floor.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.processes.wall_count import Walls
-
 TINY_M = 1e-6  # distance that has a logarithm
+LEVEL = 0.7  # upward part of a floor's normal
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,37 @@ def law_of_state(state: dict[str, Any]) -> Law | None:
     values, place = [float(v) for v in state["law"]], [float(v) for v in state["law_place"]]
     at = (place[0], place[1], place[2]) if place else None
     return Law(values[0], values[1], values[2], values[3], at) if values else None
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Q rectangles, boxes as six each.
+
+    Attributes:
+        axes: (Q, 3, 3) float64, of each its normal and two tangents.
+        corners: (Q, 3) lowest coordinates along these [m].
+        sizes: (Q, 2) along the tangents [m].
+        still: (3,) the end that stands [m]; (0,) where both move.
+    """
+
+    axes: Tensor
+    corners: Tensor
+    sizes: Tensor
+    still: Tensor
+
+    def crossed(self, places: Tensor) -> Tensor:
+        """How many walls and floors (n, 2) lie on paths to places (n, 3), or between both ends (n, 6) [m]."""
+        other = self.still.expand(len(places), 3) if len(self.still) else places[:, 3:]
+        start, end = (
+            (at @ self.axes.flatten(0, 1).T).view(len(places), -1, 3) - self.corners
+            for at in (places[:, :3], other)
+        )
+        apart = (start - end)[..., :1]
+        met = start + start[..., :1] / torch.where(apart == 0, 1.0, apart) * (end - start)
+        inside = ((met[..., 1:] >= 0) & (met[..., 1:] <= self.sizes)).all(-1)
+        hit = (inside & (start[..., 0] * end[..., 0] < 0)).to(places)
+        level = self.axes[:, 0, 2].abs() > LEVEL
+        return torch.stack([hit[:, ~level].sum(1), hit[:, level].sum(1)], 1)
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ class Cancelled(BaseException):
 
 
 @contextmanager
-def _within(name: str, said: Callable[[], bool]) -> Iterator[None]:
+def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
     """Within, this thread is asked `said` as `name`, beside what surrounds it."""
     before = getattr(_asked, name, None)
-    setattr(_asked, name, said if before is None else lambda: before() or said())
+    setattr(_asked, name, condition if before is None else lambda: before() or condition())
     try:
         yield
     finally:

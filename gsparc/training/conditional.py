@@ -107,8 +107,8 @@ class ConditionalField(nn.Module, ABC):
 
     def answer(self, batch: Batch) -> Posterior:
         """Answer rows, whose stations and runs may matter."""
-        found: Posterior = self(batch.tx, batch.rx)
-        return found
+        result: Posterior = self(batch.tx, batch.rx)
+        return result
 
     def objects(self) -> SiteObjects:
         """What it found to stand in the site."""

@@ -24,7 +24,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.training.context import FitContext
 from gsparc.training.module import GaussianModule
-from gsparc.training.pace import SPENT, Budget, Stretched
+from gsparc.training.pace import SPENT, Budget
 from gsparc.training.processes import Processes
 from gsparc.training.time_budget import Spent, TimeBudget
 
@@ -158,10 +158,8 @@ def run_stage(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    callbacks, pace = list(context.callbacks()), module.pace
-    if pace is not None:
-        callbacks = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
-    callbacks = [Budget(pace, budget), *watch, *callbacks]
+    pace = module.pace
+    callbacks = [Budget(pace, budget), *watch, *context.callbacks()]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)

@@ -85,10 +85,10 @@ class KeepBest(L.Callback):
         if isinstance(model, GaussianModel):
             edit.resize(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
-        taken = trainer.global_step
+        steps = trainer.global_step
         log.info(
             "gradient steps: %d taken, %s kept: what came after was no better on validation rows",
-            taken, f"the first {self.step}" if self.step else "none",
+            steps, f"the first {self.step}" if self.step else "none",
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ss
 from gsparc.training.optimizer import OptimizerSettings, conditional_optimizer, optimizer_for, scheduler_for
 from gsparc.training.pace import Pace
 from gsparc.training.processes import count
+from gsparc.training.schedule import in_steps
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,15 @@ class GaussianModule(L.LightningModule):
     def position(self) -> int:
         """How far the schedule is [steps]."""
         return self.global_step if self.pace is None else self.pace.step
+
+    def schedule_step(self, interval: int | float) -> int | None:
+        """The schedule's step where a callback acts every `interval` steps, or share of all.
+
+        Where seconds stretch the schedule: the last multiple that the last step passed; None where none was.
+        """
+        return (
+            self.global_step if self.pace is None else self.pace.passed(in_steps(interval, self.total_steps))
+        )
 
     @property
     def conditional(self) -> bool:
@@ -156,8 +166,8 @@ class GaussianModule(L.LightningModule):
         return self.model.site
 
     def _mean(self, batch: Batch) -> Tensor:
-        found = self.model(batch.tx, batch.rx) if self.conditional else self._render(batch)
-        return found.mean
+        result = self.model(batch.tx, batch.rx) if self.conditional else self._render(batch)
+        return result.mean
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Log validation figures."""

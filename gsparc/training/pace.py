@@ -14,7 +14,6 @@ import lightning.pytorch as L
 import torch
 
 from gsparc.training.processes import agreed
-from gsparc.training.schedule import in_steps
 from gsparc.training.time_budget import NOTHING, Spent, TimeBudget
 
 SPENT = "time/spent_s"  # metric of both clocks
@@ -108,48 +107,3 @@ class Budget(L.Callback):
         """Go on from there."""
         self._resumed = Spent(float(state["seconds"]), float(state["processor_s"]))
         self.budget.charge(self._resumed)
-
-
-class Stretched(L.Callback):
-    """A callback with an `interval` of steps, shown the steps of the stretched schedule.
-
-    Args:
-        inner: acts at multiples of its `interval`.
-        pace: says which step of the schedule it is.
-    """
-
-    def __init__(self, inner: Any, pace: Pace) -> None:
-        self.inner, self.pace = inner, pace
-
-    @property
-    def state_key(self) -> str:
-        """The inner callback's."""
-        return self.inner.state_key
-
-    def on_after_backward(self, trainer: L.Trainer, module: Any) -> None:
-        """As the inner callback, at the schedule's step."""
-        self.inner.on_after_backward(_At(trainer, self.pace.step), module)
-
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *rest: Any) -> None:
-        """As the inner callback, when a multiple of its interval was passed."""
-        multiple = self.pace.passed(in_steps(self.inner.interval, self.pace.total))
-        if multiple is not None:
-            self.inner.on_train_batch_end(_At(trainer, multiple), module, *rest)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The inner callback's."""
-        return self.inner.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """The inner callback's."""
-        self.inner.load_state_dict(state)
-
-
-class _At:
-    """A trainer at another step."""
-
-    def __init__(self, trainer: L.Trainer, step: int) -> None:
-        self._trainer, self.global_step = trainer, step
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._trainer, name)

@@ -77,13 +77,13 @@ class Processes(DDPStrategy):
 @torch.no_grad()
 def add_up(parameters: Iterable[Tensor]) -> None:
     """Replace every gradient by its sum over processes; one that no process has stays None."""
-    held = list(parameters)
-    own = [torch.zeros_like(p) if p.grad is None else p.grad for p in held]
-    has = own[0].new_tensor([p.grad is not None for p in held])
+    every = list(parameters)
+    own = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
+    has = own[0].new_tensor([p.grad is not None for p in every])
     flat = total(torch.cat([has, *(gradient.flatten() for gradient in own)]))
-    sums = flat[len(held) :].split([gradient.numel() for gradient in own])
-    for parameter, somewhere, found in zip(held, flat[: len(held)].tolist(), sums, strict=True):
-        parameter.grad = found.view_as(parameter).to(parameter.dtype) if somewhere else None
+    sums = flat[len(every) :].split([gradient.numel() for gradient in own])
+    for parameter, somewhere, result in zip(every, flat[: len(every)].tolist(), sums, strict=True):
+        parameter.grad = result.view_as(parameter).to(parameter.dtype) if somewhere else None
 
 
 def count() -> int:
@@ -105,10 +105,10 @@ def agreed(value: float, trainer: L.Trainer) -> float:
     """The first process's value: clocks differ, and all must decide alike."""
     if not distributed.is_initialized():
         return value
-    told = torch.tensor(value, dtype=torch.float64, device=trainer.strategy.root_device)
+    shared = torch.tensor(value, dtype=torch.float64, device=trainer.strategy.root_device)
     with _patient():
-        distributed.broadcast(told, 0)
-    return float(told)
+        distributed.broadcast(shared, 0)
+    return float(shared)
 
 
 def _reduced(values: Tensor, operation: ReduceOp.RedOpType) -> Tensor:

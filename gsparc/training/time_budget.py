@@ -102,6 +102,6 @@ class TimeBudget:
 
     def over(self, share: float = 1.0) -> bool:
         """Whether that share of it is spent; whoever asks then ends what it does."""
-        found = self.spent > share * self.seconds
-        self.limited |= found
-        return found
+        result = self.spent > share * self.seconds
+        self.limited |= result
+        return result

@@ -27,8 +27,13 @@ def trainer(callbacks=(), **figures) -> SimpleNamespace:
     )
 
 
-def test_validation_and_pictures_are_not_billed(clock, tmp_path):
-    bill, module = CostLedger(), SimpleNamespace(run_dir=tmp_path, train_seconds=0.0, prepared_seconds=0.0)
+@pytest.fixture
+def module(tmp_path):
+    return SimpleNamespace(run_dir=tmp_path / "new", train_seconds=0.0, prepared_seconds=0.0)
+
+
+def test_validation_and_pictures_are_not_billed(clock, module):
+    bill = CostLedger()
     run = trainer([bill])
     bill.on_train_start(run, module)
     clock.value += 3
@@ -43,32 +48,26 @@ def test_validation_and_pictures_are_not_billed(clock, tmp_path):
     assert module.train_seconds == bill.seconds == 6
 
 
-def test_a_pause_of_a_stopped_watch_does_not_start_it(clock):
+def test_a_pause_of_a_stopped_watch_or_of_none_starts_nothing(clock):
     bill = CostLedger()
     with bill.paused():
         clock.value += 5
     clock.value += 5
     assert bill.elapsed() == 0
-
-
-def test_no_ledger_nothing_to_pause():
     with CostLedger.paused_in(trainer()) as nothing:
         assert nothing is None
     assert CostLedger.seconds_in(trainer()) is None
 
 
-def test_the_curve_has_accuracy_beside_seconds(clock, tmp_path):
-    bill, module = (
-        CostLedger(),
-        SimpleNamespace(run_dir=tmp_path / "new", train_seconds=0.0, prepared_seconds=0.0),
-    )
+def test_the_curve_has_accuracy_beside_seconds(clock, module):
+    bill = CostLedger()
     run = trainer([bill], **{"val/psnr_db": 21.5, "model/num_gaussians": 40.0, "other": 1.0})
     bill.on_train_start(run, module)
     for _ in range(2):
         clock.value += 2
         bill.on_validation_start(run, module)
         bill.on_validation_end(run, module)
-    with (tmp_path / "new" / "learning_curve.csv").open() as file:
+    with (module.run_dir / "learning_curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["train_s"] for row in rows] == ["2.0", "4.0"]
     assert rows[0]["val/psnr_db"] == "21.5" and rows[0]["num_gaussians"] == "40" and "other" not in rows[0]

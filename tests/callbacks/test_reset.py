@@ -19,14 +19,14 @@ def module():
 
 
 def trainer(module, step: int) -> SimpleNamespace:
-    logits = module.model.gaussians.opacity_logits
+    logits, module.schedule_step = module.model.gaussians.opacity_logits, lambda interval: step
     optimizer = torch.optim.Adam([logits])
     logits.grad = torch.ones_like(logits)
     kept = logits.detach().clone()
     optimizer.step()
     with torch.no_grad():
         logits.copy_(kept)
-    return SimpleNamespace(optimizers=[optimizer], global_step=step, loggers=[])
+    return SimpleNamespace(optimizers=[optimizer], loggers=[])
 
 
 def test_opaque_ones_are_lowered_and_forget_their_momentum(module):

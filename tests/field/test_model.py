@@ -74,14 +74,6 @@ def test_the_reference_distance_is_from_the_still_end_to_the_moving_box(campaign
     assert model(campaign("spectrum"), attenuation=AttenuationSettings(d_ref=7.0)).d_ref == 7.0
 
 
-def test_the_emission_reads_the_end_that_moves(campaign):
-    for end in ("rx", "tx"):
-        data = campaign("spectrum", static_end=end)
-        batch = data.batch(np.arange(3))
-        where = data.site.moving(batch.tx, batch.rx)
-        assert torch.allclose(where, torch.from_numpy(data.moving[:3]).float())
-
-
 def test_a_frozen_view_equals_the_forward_pass_until_the_next_edit(campaign):
     data = campaign("spectrum")
     batch = data.batch(np.arange(6))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -105,3 +106,16 @@ def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
     (tmp_path / "run" / "fold1" / "refit").mkdir(parents=True)
     (tmp_path / "run" / "fold1" / "refit" / "last.ckpt").touch()
     assert parts.folder_of(tmp_path / given, parts.FOLDS) == tmp_path / found
+
+
+@pytest.mark.parametrize(
+    ("labels", "found"),
+    [
+        (["gp (Vecchia 30)"] * 2, "gp (Vecchia 30)"),
+        (["gp (Vecchia 30)", "gp (Vecchia 30)", "gp"], "gp (Vecchia 30 in 2 of 3)"),
+        (["gp"] * 2, "gp"),
+        ([], "gp"),
+    ],
+)
+def test_several_fits_are_named_by_what_most_say(labels, found):
+    assert parts.common_label("gp", [SimpleNamespace(label=label) for label in labels]) == found

@@ -15,7 +15,6 @@ from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold, SplitSettings, make_split
-from gsparc.models import checkpoint
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import for_links
 from gsparc.models.refined_places import Linearised, displaced, displacements, refined
@@ -123,16 +122,6 @@ def test_exact_places_stay_though_errors_are_claimed():
     method, report = _fitted(exact, fold, position_std=0.02)
     assert "positions stay as measured" in report.notes[0]
     assert _missed(method, exact, fold) < 0.02
-
-
-def test_the_refined_field_is_stored(tmp_path):
-    _, moved, fold = _channels(0.008)
-    method, _ = _fitted(moved, fold, position_std=0.008)
-    checkpoint.save(tmp_path / "model.ckpt", method, "model: {name: gsparc}", {})
-    twin = Gsparc()
-    twin.restore(moved.site, method.state())
-    batch = moved.batch(fold.test)
-    assert torch.equal(twin.answer(batch).mean, method.answer(batch).mean)
 
 
 @pytest.mark.parametrize("kind", ["powers", "channels of an array", "powers of several stations"])

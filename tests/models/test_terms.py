@@ -14,81 +14,77 @@ from gsparc.models.gsparc import plan
 from gsparc.models.terms import EffectSettings
 from gsparc.ops import SphereGrid
 
-AUTO, ANY = EffectSettings(), InitSettings()
 
-
-def channels(**site):
-    data = invent("csi", 20)
-    return replace(data, site=replace(data.site, **site))
-
-
-def test_powers_have_their_law_and_shadows():
-    assert plan(AUTO, ANY, invent("rssi", 20), 0).parts == ("powers",)
-    assert plan(EffectSettings(power=False), ANY, invent("rssi", 20), 0).rasterized
-
-
-def test_channels_have_sources_and_what_comes_from_everywhere():
-    assert plan(AUTO, ANY, channels(), 0).parts == ("sources", "diffuse")
-    assert plan(AUTO, ANY, channels(), 0, count=0).parts == ("diffuse",)
-    assert plan(EffectSettings(residual=False), ANY, channels(), 0).parts == ("sources",)
-    assert plan(AUTO, InitSettings("rays"), channels(), 0).parts == ("rays", "diffuse")
-
-
-def test_channels_from_nowhere_known_have_no_sources():
-    unplaced = channels(static_position=None)
-    found = plan(AUTO, ANY, unplaced, 0)
-    assert found.parts == ("diffuse",) and "does not say where the static end is" in found.reasons[-1]
-    with pytest.raises(ValueError, match=r"effects\.phase=true is not possible: the dataset does not say"):
-        plan(EffectSettings(phase=True), ANY, unplaced, 0)
-
-
-def test_an_array_takes_part_where_it_is_declared():
+def measured(kind: str):
+    """Small data of a kind; what stands before it is left out of the site or added to it."""
+    if not kind.endswith("array"):
+        data = invent(kind.removeprefix("unplaced "), 20)
+        return replace(data, site=replace(data.site, static_position=None)) if "unplaced" in kind else data
     site = array_site(SphereGrid.hemisphere(9, 18), planar_array())
-    still = replace(invent("spectrum", 20), site=site)
-    assert plan(AUTO, ANY, still, 0).array and not plan(EffectSettings(array=False), ANY, still, 0).array
-    moving = replace(still, site=replace(site, static_end="tx"))
-    assert plan(AUTO, ANY, moving, 0).parts == ("bearings", "process")
-    alone = EffectSettings(residual=False)
-    assert plan(alone, ANY, moving, 0).parts == ("bearings",)
-    with pytest.raises(ValueError, match="the receiver moves"):
-        plan(EffectSettings(array=True), ANY, moving, 0)
+    site = replace(site, static_end="tx") if kind.startswith("moving") else site
+    return replace(invent("spectrum", 20), site=site)
 
 
-def test_an_ablation_of_the_networks_is_not_answered_by_another_model():
-    assert plan(AUTO, ANY, channels(), 8).rasterized
-    assert plan(AUTO, InitSettings("uniform"), channels(), 0).rasterized
-
-
-def test_a_switch_says_what_it_may_be():
-    with pytest.raises(ValueError, match="one of true, false, auto"):
-        EffectSettings(phase="splat")
-
-
-def test_known_walls_serve_channels_and_powers():
-    scene = InitSettings("scene", file="room.yaml")
-    assert plan(AUTO, scene, channels(), 0).parts == ("scene", "diffuse")
-    assert plan(AUTO, scene, invent("rssi", 20), 0).parts == ("scene",)
+def planned(kind: str, effects=(), init="auto", hidden=0, count=1):
+    return plan(EffectSettings(**dict(effects)), InitSettings(init), measured(kind), hidden, count)
 
 
 @pytest.mark.parametrize(
-    ("kind", "site", "effects", "count", "said"),
+    ("kind", "given", "parts"),
     [
-        ("spectrum", {}, {}, 1, "the target is spectrum; walls mirror channels"),
-        ("csi", {"static_position": None}, {}, 1, "the dataset does not say where the static end is"),
-        ("rssi", {"static_position": None}, {}, 1, "the dataset does not say where the static end is"),
-        ("csi", {}, {"phase": False}, 1, r"model\.effects\.phase=false"),
-        ("csi", {}, {}, 0, r"model\.field\.count=0 is the residual alone"),
-        ("rssi", {}, {"visibility": False}, 1, "of received powers walls only hide"),
+        ("rssi", {}, ("powers",)),
+        ("rssi", {"effects": {"power": False}}, ()),
+        ("rssi", {"init": "scene"}, ("scene",)),
+        ("csi", {}, ("sources", "diffuse")),
+        ("csi", {"count": 0}, ("diffuse",)),
+        ("csi", {"effects": {"residual": False}}, ("sources",)),
+        ("csi", {"init": "rays"}, ("rays", "diffuse")),
+        ("csi", {"init": "scene"}, ("scene", "diffuse")),
+        ("csi", {"hidden": 8}, ()),  # an ablation of networks is not answered by another model
+        ("csi", {"init": "uniform"}, ()),
+        ("unplaced csi", {}, ("diffuse",)),
+        ("spectrum", {"effects": {"visibility": True}}, ()),
+        ("array", {}, ()),
+        ("moving array", {}, ("bearings", "process")),
+        ("moving array", {"effects": {"residual": False}}, ("bearings",)),
     ],
-)  # fmt: skip
-def test_what_known_walls_cannot_serve(kind, site, effects, count, said):
-    data = invent(kind, 20)
-    data = replace(data, site=replace(data.site, **site))
-    with pytest.raises(ValueError, match=f"init=scene is not possible: .*{said}"):
-        plan(EffectSettings(**effects), InitSettings("scene"), data, 0, count)
+)
+def test_what_a_site_calls_for(kind, given, parts):
+    found = planned(kind, **given)
+    assert found.parts == parts and found.rasterized == (not parts)
+    assert found.array == (kind == "array")
+    assert kind != "unplaced csi" or "does not say where the static end is" in found.reasons[-1]
 
 
-def test_rasterized_gaussians_always_occlude_each_other():
-    with pytest.raises(ValueError, match=r"visibility=false is not possible: rasterized"):
-        plan(EffectSettings(visibility=False), ANY, invent("spectrum", 20), 0)
-    assert plan(EffectSettings(visibility=True), ANY, invent("spectrum", 20), 0).rasterized
+def test_an_array_may_be_switched_off():
+    assert not planned("array", {"array": False}).array
+
+
+@pytest.mark.parametrize(
+    ("kind", "effects", "message"),
+    [
+        ("unplaced csi", {"phase": True}, r"effects\.phase=true is not possible: the dataset does not say"),
+        ("moving array", {"array": True}, "the receiver moves"),
+        ("spectrum", {"visibility": False}, "visibility=false is not possible: rasterized"),
+        ("csi", {"phase": "splat"}, "one of true, false, auto"),
+    ],
+)
+def test_terms_that_mean_nothing_here(kind, effects, message):
+    with pytest.raises(ValueError, match=message):
+        planned(kind, effects)
+
+
+@pytest.mark.parametrize(
+    ("kind", "effects", "count", "message"),
+    [
+        ("spectrum", {}, 1, "the target is spectrum; walls mirror channels"),
+        ("unplaced csi", {}, 1, "the dataset does not say where the static end is"),
+        ("unplaced rssi", {}, 1, "the dataset does not say where the static end is"),
+        ("csi", {"phase": False}, 1, r"model\.effects\.phase=false"),
+        ("csi", {}, 0, r"model\.field\.count=0 is the residual alone"),
+        ("rssi", {"visibility": False}, 1, "of received powers walls only hide"),
+    ],
+)
+def test_what_known_walls_cannot_serve(kind, effects, count, message):
+    with pytest.raises(ValueError, match=f"init=scene is not possible: .*{message}"):
+        planned(kind, effects, "scene", count=count)

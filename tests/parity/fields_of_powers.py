@@ -13,8 +13,7 @@ from gsparc.models.powers import waves
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.learning import Own
-from gsparc.models.powers.together.rows import link_rows
-from gsparc.models.powers.together.terms import Terms
+from gsparc.models.powers.together.terms import Terms, link_rows
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
@@ -65,7 +64,7 @@ def _together(quiet: bool) -> Arrays:
     about = Trend(0.0, Law(-32.0, 2.7, 1.0, 6.0, None), 1.2, 0.7)
     own = Own(Prior(TWO, about), {2: Prior(Kernel((2.0, 9.0), (0.3, 0.7), 0.1, 12.0), about)})
     terms = Terms.over(link_rows(data, known, places), about, 6.0, 15, 0)
-    terms = replace(terms, place_db=1.6, shadow_db=0.6)
+    terms = replace(terms, place_db=1.6)
     field = JointPowerField(data.site, places, own, terms, terms, 1.3)
     field.condition(data, known)
     batch, left = data.batch(np.arange(len(data) - 20, len(data))), field.left_out()
@@ -79,7 +78,7 @@ def _together(quiet: bool) -> Arrays:
 
 
 def field_of_four_stations() -> Arrays:
-    """Stations in one field with every shared term."""
+    """Stations in one field with its shared terms."""
     return _together(quiet=False)
 
 

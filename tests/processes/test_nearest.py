@@ -15,11 +15,10 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.reduced import reduced
 from gsparc.processes import neighbourhood, powers
-from gsparc.processes.covering import covering
 from gsparc.processes.kernel import Kernel, SmoothRough
 from gsparc.processes.nearest import Nearest, Values
 from gsparc.processes.nearest import given as given_places
-from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, Rows, conditioned
 from gsparc.processes.prior import Prior

@@ -72,24 +72,6 @@ def test_density_and_slope_of_circular_values():
     assert told.nll == pytest.approx(float(density))
 
 
-@pytest.mark.parametrize("kernel", [Kernel((0.5, 2.0), (0.3, 0.7), 0.05), WaveKernel(9.0, 0.8, 0.05)])
-def test_more_rows_and_fewer_are_a_fit_to_those(kernel):
-    generator = torch.Generator().manual_seed(0)
-    places = torch.rand(40, 3, generator=generator, dtype=torch.float64)
-    values = torch.randn(40, 2, generator=generator, dtype=torch.complex128)
-    values = values if isinstance(kernel, WaveKernel) else values.real
-    prior = Prior(kernel, Trend(0.0) if isinstance(kernel, Kernel) else None)
-    whole, queries = Exact.of(prior, places, values), places[:5] + 0.1
-    grown = Exact.of(prior, places[:33], values[:33]).given(places[33:], values[33:])
-    few = whole.without(torch.arange(33, 40))
-    for found, rows in ((grown, slice(40)), (few, slice(33))):
-        expected = Exact.of(prior, places[rows], values[rows])
-        for one in (found, Exact.read(found.state())):
-            torch.testing.assert_close(one.answer(queries).mean, expected.answer(queries).mean)
-            torch.testing.assert_close(one.answer(queries).left, expected.answer(queries).left)
-            torch.testing.assert_close(one.left_out()[0], expected.left_out()[0])
-
-
 @pytest.mark.parametrize("trend", [Trend(-70.0), Trend(0.0, Law(-40.0, 3.0, 0.1, 5.0, (0.5, 0.5, 3.0)))])
 def test_variance_of_many_rows_is_of_the_nearest(trend, monkeypatch):
     """Within 2 % at places among the rows and far from all; means are the exact ones."""

@@ -57,15 +57,14 @@ def test_a_checkpoint_with_every_step_done_still_ends_in_a_model(tmp_path):
     assert ledger.seconds > 0.0
 
 
-def test_a_second_interrupt_does_not_wait(tmp_path):
-    with pytest.raises(KeyboardInterrupt, match="go on with"):
-        run(tmp_path, Interrupt(7, times=2))
-    assert checkpoint.read(tmp_path / "run" / "last.ckpt").extra["trainer"]["global_step"] == 5
-
-
-def test_an_impatient_interrupt_at_the_start_has_nothing_to_go_on_from(tmp_path):
-    with pytest.raises(KeyboardInterrupt, match="there is no checkpoint yet"):
-        run(tmp_path, Interrupt(0, times=2))
+@pytest.mark.parametrize(
+    ("step", "advice", "left"), [(7, "go on with", 5), (0, "there is no checkpoint yet", None)]
+)
+def test_a_second_interrupt_does_not_wait(tmp_path, step, advice, left):
+    with pytest.raises(KeyboardInterrupt, match=advice):
+        run(tmp_path, Interrupt(step, times=2))
+    last = tmp_path / "run" / "last.ckpt"
+    assert left is None or checkpoint.read(last).extra["trainer"]["global_step"] == left
 
 
 def test_a_prime_number_of_steps_ends_exactly(tmp_path):

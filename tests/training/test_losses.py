@@ -50,12 +50,6 @@ def test_the_target_has_a_slope_too():
     assert torch.allclose(tangent, b.grad.sum(), rtol=1e-3)
 
 
-def test_an_image_is_like_itself():
-    a = images().float()
-    assert torch.allclose(ssim(a, a), torch.ones(3), atol=1e-5)
-    assert torch.allclose(spectrum_loss(a, a), torch.zeros(3), atol=1e-5)
-
-
 def test_too_small_an_image_is_refused():
     with pytest.raises(ValueError, match="at least 11 x 11"):
         ssim(images(1, 10, 30), images(1, 10, 30))
@@ -71,11 +65,8 @@ def test_spectrum_loss_mixes_l1_and_ssim():
 def test_images_smaller_than_the_window_are_learned_by_their_absolute_error():
     """The default loss refused a user's own 10 x 40 spectra, and named no way out."""
     a, b = images(2, 10, 40), images(2, 10, 40, seed=1)
-    assert torch.equal(spectrum_loss(a, b, 0.2), (a - b).abs().mean((1, 2)))
-
-
-def test_no_ssim_no_limit_on_the_size():
-    assert spectrum_loss(images(2, 3, 3), images(2, 3, 3), 0.0).shape == (2,)
+    for weight in (0.0, 0.2):
+        assert torch.equal(spectrum_loss(a, b, weight), (a - b).abs().mean((1, 2)))
 
 
 def test_channel_loss_is_the_mean_squared_error():

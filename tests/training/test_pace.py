@@ -18,7 +18,7 @@ from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
 from gsparc.training.context import FitContext
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
-from gsparc.training.pace import Budget, Pace, Stretched
+from gsparc.training.pace import Budget, Pace
 from gsparc.training.time_budget import Spent, TimeBudget
 
 
@@ -52,21 +52,6 @@ def test_rates_follow_the_seconds():
     optimizer.step()
     scheduler.step()  # one step, all of the schedule
     assert optimizer.param_groups[0]["lr"] == pytest.approx(0.5 * first)
-
-
-def test_callbacks_see_the_step_of_the_schedule():
-    seen = []
-    inner = SimpleNamespace(
-        interval=100, state_key="inner", state_dict=dict,
-        on_train_batch_end=lambda trainer, module: seen.append((trainer.global_step, trainer.other)),
-    )  # fmt: skip
-    pace = Pace(400, 10.0)
-    stretched = Stretched(inner, pace)
-    trainer = SimpleNamespace(global_step=3, other="kept")
-    for seconds in (1.0, 2.6, 2.7, 5.1):
-        pace.spend(seconds)
-        stretched.on_train_batch_end(trainer, None)
-    assert seen == [(100, "kept"), (200, "kept")] and stretched.state_key == "inner"
 
 
 def test_validations_were_not_counted_and_a_resumed_run_has_the_rest(monkeypatch):

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from gsparc.locate.baselines.methods import Locator, mean_place, without_gaps
-from gsparc.processes.covering import covering
+from gsparc.processes.neighbourhood import covering
 
 BATCH, RATE = 64, 1e-3
 HIDDEN = 256  # units of each of two layers

@@ -32,8 +32,8 @@ from gsparc.models.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
-from gsparc.processes.covering import covering
 from gsparc.processes.features import whitened
+from gsparc.processes.neighbourhood import covering
 from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)

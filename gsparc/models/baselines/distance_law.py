@@ -93,8 +93,8 @@ def fit_line(decades: np.ndarray, rows: Rows, start: np.ndarray) -> tuple[float,
         return value, np.array(slopes)
 
     bounds = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB))]
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-    return float(found.fun), found.x
+    result = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    return float(result.fun), result.x
 
 
 def _start(decades: np.ndarray, rows: Rows) -> np.ndarray:
@@ -122,9 +122,9 @@ def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
     start = at_best = _start(np.log10(far), rows)
     best = np.inf
     for floor in np.unique(np.geomspace(low, high, FLOORS)):
-        value, found = fit_line(np.log10(np.maximum(far, floor)), rows, start)
+        value, result = fit_line(np.log10(np.maximum(far, floor)), rows, start)
         if value < best:
-            best, at_best, law, start = value, found, replace(law, floor=float(floor)), found
+            best, at_best, law, start = value, result, replace(law, floor=float(floor)), result
     count = int((~rows.silent).sum())
     few = math.sqrt(count / max(count - PARAMETERS, 1)) if count else 1.0  # parameters swallow residuals
     level, exponent, scale = (float(value) for value in at_best)
@@ -156,15 +156,15 @@ def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
         return value, np.array([*slopes, *by_place])
 
     limits = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB)), *(bounds / size)]
-    found = []
+    result = []
     for place in starts:
         place = place + 0.05 * size * (high - low <= 1e-3 * size)  # in the plane itself heights have no slope
         decades = 0.5 * np.log10(((place - rows.places) ** 2).sum(1) + tiny)
         start = np.concatenate([_start(decades, rows), place / size])
-        found.append(
+        result.append(
             minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late)
         )
-    return min(found, key=lambda one: float(one.fun)).x[3:] * size
+    return min(result, key=lambda one: float(one.fun)).x[3:] * size
 
 
 def law_of(rows: Rows, site: Site) -> tuple[Law, tuple[str, ...]]:
@@ -214,6 +214,6 @@ class DistanceLaw(Differentiable):
         return self.law.state()
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        found = law_of_state(state)
-        assert found is not None
-        self.law = found
+        result = law_of_state(state)
+        assert result is not None
+        self.law = result

@@ -23,11 +23,10 @@ from gsparc.models.powers.settings import MEANS, MeanName, fit_powers
 from gsparc.models.reduced import Filled, MeanOnly, View
 from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
 from gsparc.ops import Pose
-from gsparc.processes.covering import covering
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Nearest, Sample, Values, given, most_likely
-from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering
 from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
@@ -149,15 +148,15 @@ class GaussianProcess(Differentiable):
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Of rows too many for one factor: components of rows that cover the site, scores by the nearest."""
-        kept = covering(positions, CHOSEN_ON, 0)
-        parts = principal_components(targets[kept], self.kind, self.limit)
-        start = choose_kernel(positions[kept], parts.scores, len(parts.mean))
+        rows = covering(positions, CHOSEN_ON, 0)
+        parts = principal_components(targets[rows], self.kind, self.limit)
+        start = choose_kernel(positions[rows], parts.scores, len(parts.mean))
         scores, self.lost = projected(targets, self.kind, parts.mean, parts.axes)
         kernel, said = kernel_given_nearest(positions, scores, len(parts.mean), start, 0)
         once = torch.ones(len(scores), dtype=torch.float64)
         self.scores = given(Prior(kernel), Values(positions, torch.from_numpy(scores), once), 0)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
-        basis = f"{len(parts.axes)} components of {len(kept)} rows, mean square left out {self.lost:.2e}"
+        basis = f"{len(parts.axes)} components of {len(rows)} rows, mean square left out {self.lost:.2e}"
         told_by = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
         settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
         return tuple(f"gp: {note}" for note in (settings, said, told_by, basis))
@@ -183,9 +182,9 @@ class GaussianProcess(Differentiable):
         """See `Reconditions`; of powers alone."""
         if self.powers is None:
             return None
-        found = copy.copy(self)
-        found.powers, _ = conditioned(rows_of(data, rows), self.powers.trend, self.powers.kernel, 0)
-        return found
+        result = copy.copy(self)
+        result.powers, _ = conditioned(rows_of(data, rows), self.powers.trend, self.powers.kernel, 0)
+        return result
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         if self.powers is not None:
@@ -195,11 +194,11 @@ class GaussianProcess(Differentiable):
                 power, (1 - share).to(dtype), entry_variance(spread.to(dtype), power, self.kind)
             )
         assert self.scores is not None
-        found, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
-        mean = self._composed(found.mean, dtype)
-        variance = (kernel.amplitude * found.left + self.lost).to(dtype)
-        sure = (1 - found.left / (1 + kernel.noise)).to(dtype)
-        return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
+        result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
+        mean = self._composed(result.mean, dtype)
+        variance = (kernel.amplitude * result.left + self.lost).to(dtype)
+        confidence = (1 - result.left / (1 + kernel.noise)).to(dtype)
+        return Prediction(mean, confidence, entry_variance(variance, mean, self.kind))
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean (B, ...) of `predict` alone: the variance is most of a prediction."""
@@ -232,18 +231,18 @@ class GaussianProcess(Differentiable):
             return MeanOnly(self, self.mean_at)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
-        kept: Tensor | slice = slice(
+        components: Tensor | slice = slice(
             None
         )  # a view: the axes of thousands of images are hundreds of megabytes
         if count < len(self.axes):
-            kept = self.scores.weights.square().sum(0).topk(count).indices
-        mean, axes, shape = self.mean, self.axes[kept], self.shape
+            components = self.scores.weights.square().sum(0).topk(count).indices
+        mean, axes, shape = self.mean, self.axes[components], self.shape
         if stride > 1:
             assert grid is not None
             parts = [part.unflatten(-1, shape)[..., ::stride, ::stride] for part in (mean, axes)]
             shape = tuple(parts[0].shape)
             mean, axes = (part.flatten(-2).contiguous() for part in parts)
-        lean = ReducedMean(self, mean, axes, self.scores, kept, shape)
+        lean = ReducedMean(self, mean, axes, self.scores, components, shape)
         return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
 
     def _learned(self) -> dict[str, Any]:
@@ -271,8 +270,8 @@ def projected(
     scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
     for start in range(0, len(targets), block):
         rows = to_real(targets[start : start + block], kind) - mean
-        scores[start : start + block] = found = rows @ axes.T
-        beyond += float((rows.astype(np.float64) ** 2).sum()) - float((found.astype(np.float64) ** 2).sum())
+        scores[start : start + block] = result = rows @ axes.T
+        beyond += float((rows.astype(np.float64) ** 2).sum()) - float((result.astype(np.float64) ** 2).sum())
     return scores, max(beyond, 0.0) / (len(targets) * len(mean))
 
 
@@ -294,10 +293,10 @@ def kernel_given_nearest(
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
     sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
-    found = most_likely([start], sample, pdist(places[row]))
+    result = most_likely([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
-    said = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
-    return replace(found, amplitude=found.amplitude * len(strong) / entries * share), said
+    note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
+    return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note
 
 
 class ReducedMean(View):
@@ -317,14 +316,14 @@ class ReducedMean(View):
         mean: Tensor,
         axes: Tensor,
         scores: Exact,
-        kept: Tensor | slice,
+        components: Tensor | slice,
         shape: tuple[int, ...],
     ) -> None:
         super().__init__(inner)
         assert inner.site is not None
         self._kind, self._site, self._shape = inner.site.kind, inner.site, shape
         self._mean, self._axes = mean, axes
-        self._weights = scores.weights[:, kept].float().contiguous()
+        self._weights = scores.weights[:, components].float().contiguous()
         self._middle = scores.rows.mean(0).float()
         self._scale = math.sqrt(3) / float(scores.prior.kernel.length)
         self._places = (scores.rows.float() - self._middle) * self._scale

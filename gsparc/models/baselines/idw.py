@@ -51,10 +51,10 @@ class InverseDistance(Interpolator):
         distance, row = self.tree.query(queries, k=np.arange(1, count + 1))  # nearest first
         weight = 1 / np.maximum(distance, self.NEAR) ** self.power
         weight = torch.from_numpy(weight / weight.sum(1, keepdims=True)).float()
-        found = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind))
-        blend = torch.bmm(weight[:, None], found.view(*row.shape, -1))[:, 0]
-        sure = torch.from_numpy(np.exp(-distance[:, 0] / self.spacing)).float()
-        return Prediction(self._decode(blend), confidence=sure)
+        result = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind))
+        blend = torch.bmm(weight[:, None], result.view(*row.shape, -1))[:, 0]
+        confidence = torch.from_numpy(np.exp(-distance[:, 0] / self.spacing)).float()
+        return Prediction(self._decode(blend), confidence=confidence)
 
     def _learned(self) -> dict[str, Any]:
         return {"positions": torch.from_numpy(self.positions), "targets": torch.from_numpy(self.targets)}

@@ -21,10 +21,10 @@ from gsparc.training.context import FitContext, FitReport
 def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     """What a reader must know of channels of several runs that are learned as if they were of one."""
     count = 0 if data.run is None or data.site.kind != "csi" else len(np.unique(data.run[rows]))
-    said = (
+    note = (
         f"channels of {count} runs, each with a factor of its own, are taken as one; dataset.runs=[...] keeps"
     )
-    return (f"{said} some, model=complex_gp learns the factors",) if count > 1 else ()
+    return (f"{note} some, model=complex_gp learns the factors",) if count > 1 else ()
 
 
 class Interpolator(Method):

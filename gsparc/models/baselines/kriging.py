@@ -86,8 +86,8 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     low, high = [0, 0, limit * 1e-3], [spread * 3, spread * 10, limit * 10]
     start = [float(gamma[0]) / 2, spread, limit / 5]
     start = [min(max(s, a), b) for s, a, b in zip(start, low, high, strict=True)]
-    found, _ = curve_fit(law, distance, gamma, start, 1 / np.sqrt(number[filled]), bounds=(low, high))
-    return Variogram(*(float(v) for v in found))
+    result, _ = curve_fit(law, distance, gamma, start, 1 / np.sqrt(number[filled]), bounds=(low, high))
+    return Variogram(*(float(v) for v in result))
 
 
 class Kriging(Interpolator):
@@ -192,8 +192,8 @@ class Kriging(Interpolator):
         else:
             towards = weighed(self.channels, torch.complex64)
             mean = torch.polar(10 ** (decibels / 20), towards.angle()).view(-1, *self.shape)
-        sure = (1 - variance / self.variogram.total).clamp(0, 1)
-        return Prediction(mean, sure, entry_variance(variance, mean, "rssi") if power else None)
+        confidence = (1 - variance / self.variogram.total).clamp(0, 1)
+        return Prediction(mean, confidence, entry_variance(variance, mean, "rssi") if power else None)
 
     def _learned(self) -> dict[str, Any]:
         v = self.variogram

@@ -27,11 +27,10 @@ from gsparc.models.image_sources.run_factors import RunFactors, run_factors
 from gsparc.models.method import LeftOut, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.covering import covering
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import WaveKernel
 from gsparc.processes.nearest import Nearest, Values, given, solved
-from gsparc.processes.neighbourhood import Neighbourhood
+from gsparc.processes.neighbourhood import Neighbourhood, covering
 from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.prior import Prior
 from gsparc.training.context import FitContext, FitReport

@@ -62,8 +62,8 @@ class Mixture(ConditionalField):
 
     def objects(self) -> SiteObjects:
         """Those of the heaviest member that found any."""
-        found = [self._fields()[i].objects() for i in np.argsort(self.weights)[::-1]]
-        return next((one for one in found if len(one)), found[0])
+        result = [self._fields()[i].objects() for i in np.argsort(self.weights)[::-1]]
+        return next((one for one in result if len(one)), result[0])
 
     def _fields(self) -> list[ConditionalField]:
         return list(self.members)  # type: ignore[arg-type]
@@ -86,10 +86,10 @@ class Mixture(ConditionalField):
 
         The variance errs high by what the residual explains.
         """
-        found = [member(tx, rx) for member in self._fields()]
-        pairs = list(zip(self.weights, found, strict=True))
+        result = [member(tx, rx) for member in self._fields()]
+        pairs = list(zip(self.weights, result, strict=True))
         mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
-        apart = [(one.mean - mean).abs().square().flatten(1).mean(1) for one in found]
+        apart = [(one.mean - mean).abs().square().flatten(1).mean(1) for one in result]
         variance = torch.stack(
             [w * (one.variance + a) for (w, one), a in zip(pairs, apart, strict=True)]
         ).sum(0)
@@ -102,17 +102,17 @@ class Mixture(ConditionalField):
 
     def left_out(self) -> LeftOutRows:
         """The mean of all."""
-        found = self._mean_left_out()
+        result = self._mean_left_out()
         if self.residual is None:
-            return found
-        return replace(found, mean=found.mean + self.share * self.residual.left_out().mean)
+            return result
+        return replace(result, mean=result.mean + self.share * self.residual.left_out().mean)
 
     def _mean_left_out(self) -> LeftOutRows:
-        found = [member.left_out() for member in self._fields()]
-        pairs = list(zip(self.weights, found, strict=True))
+        result = [member.left_out() for member in self._fields()]
+        pairs = list(zip(self.weights, result, strict=True))
         mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
         variance = torch.stack([weight * one.variance for weight, one in pairs]).sum(0)
-        return LeftOutRows(found[0].rows, mean, variance)
+        return LeftOutRows(result[0].rows, mean, variance)
 
     def state(self) -> dict[str, Any]:
         """That of none: members are stored by their kinds."""

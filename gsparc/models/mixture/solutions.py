@@ -47,7 +47,7 @@ SEARCHES = ("sources",)  # of them, those that also give an answer of few source
 
 def find(
     parts: tuple[str, ...], init: InitSettings, effects: EffectSettings, data: Measurements, fold: Fold,
-    context: FitContext, budget: TimeBudget, until_s: float, held: InnerFolds | None,
+    context: FitContext, budget: TimeBudget, until_s: float, cut: InnerFolds | None,
 ) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:  # fmt: skip
     """What initialisers find, and what each cost.
 
@@ -60,26 +60,26 @@ def find(
         parts: names of initialisers, which have settings `init`.
         fold: validation rows are solved for, too, where nothing is weighed.
         until_s: the second of the running `budget` by which all should be found.
-        held: how training rows are cut; None of one initialiser.
+        cut: how training rows are cut; None of one initialiser.
 
     Raises:
         ValueError: the only initialiser, or the one asked for, cannot solve this.
     """
-    several = held is not None
+    several = cut is not None
     rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
-    groups = () if held is None else _groups(held, fold.train)
+    groups = () if cut is None else _groups(cut, fold.train)
     first = CLOSED_SHARE if any(part in OPEN_ENDED for part in parts) else 1.0
     plans = [(part, init, first) for part in parts if part not in OPEN_ENDED]
     for part in (part for part in parts if part in OPEN_ENDED):
         if several and part in SEARCHES:
             plans.append((f"few {part}", replace(init, **FEW), FEW_SHARE))
         plans.append((part, init, 1.0))
-    found: dict[str, ConditionalField] = {}
+    fields: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
     for name, settings, share in plans:
         part = name.split()[-1]
         least = SEARCH_LOOKS * factor_s(settings.search_rows) if part in SEARCHES else 0.0
-        if found and context.resume is None and least > until_s - budget.spent:
+        if fields and context.resume is None and least > until_s - budget.spent:
             log.info("init=%s is left out: the seconds are too few for a search", name)
             budget.limited = True
             continue
@@ -97,7 +97,7 @@ def find(
                 field, report = INITIALISERS[part](data, rows, settings, clutter, within)
             if effects.residual is False and isinstance(field, Mixture):
                 field = next(one for _, one in field.parts())
-            found[name] = field
+            fields[name] = field
             if part not in OPEN_ENDED:
                 field.held = _held(field, data, rows, groups, until_s, budget, report.seconds)
         except KeyboardInterrupt:
@@ -108,14 +108,14 @@ def find(
             if len(parts) == 1 or name == init.name:
                 raise
             log.info("init=%s is left out: %s", name, error)
-            found.pop(name, None)
+            fields.pop(name, None)
             continue
         if field.held is not None:
             target = comparable(data.batch(field.held.rows).target, data.site)
             miss = solution_weights.error(comparable(field.held.mean, data.site), target)
             report = replace(report, error=miss)
         reports[name] = report
-    return found, reports
+    return fields, reports
 
 
 def least_error(reports: Iterable[FitReport]) -> float:
@@ -148,10 +148,10 @@ def weighed(
     first = next(iter(solutions))
     if len(solutions) == 1:
         return {first: (solutions[first], 1.0)}
-    held = [field.held for field in solutions.values() if field.held is not None]
+    left_out = [field.held for field in solutions.values() if field.held is not None]
     rows = np.zeros(0, np.int64)
-    if len(held) == len(solutions):
-        rows = np.asarray(functools.reduce(np.intersect1d, [one.rows for one in held]), np.int64)
+    if len(left_out) == len(solutions):
+        rows = np.asarray(functools.reduce(np.intersect1d, [one.rows for one in left_out]), np.int64)
     batch = data.batch(fold.val)
     predicted = []
     for field in solutions.values():
@@ -167,8 +167,8 @@ def weighed(
         return {first: (solutions[first], 1.0)}
     target = comparable(data.batch(rows).target, data.site)
     assert cut is not None
-    alone = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
-    unit = np.where(cut.unit == NOT_TESTED, alone, cut.unit)[rows]
+    single = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
+    unit = np.where(cut.unit == NOT_TESTED, single, cut.unit)[rows]
     weights = solution_weights.weights(predicted, target, unit)
     for name, one, weight in zip(solutions, predicted, weights, strict=True):
         log.info(
@@ -178,16 +178,16 @@ def weighed(
     return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
 
 
-def joined(kept: dict[str, tuple[ConditionalField, float]]) -> ConditionalField:
+def joined(members: dict[str, tuple[ConditionalField, float]]) -> ConditionalField:
     """The weighed mean, or the only one."""
-    fields, weights = zip(*kept.values(), strict=True)
+    fields, weights = zip(*members.values(), strict=True)
     return fields[0] if len(fields) == 1 else Mixture(fields, weights)
 
 
 def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
     """Training rows (n,) of each group."""
-    found = [np.intersect1d(one.test, train) for one in cut.folds]
-    return tuple(group for group in found if 0 < len(group) < len(train))
+    result = [np.intersect1d(one.test, train) for one in cut.folds]
+    return tuple(group for group in result if 0 < len(group) < len(train))
 
 
 def _held(
@@ -202,7 +202,7 @@ def _held(
     """
     if not groups:
         return None
-    found, began = [], budget.spent
+    answers, began = [], budget.spent
     for number, group in enumerate(groups):
         each = (budget.spent - began) / number if number else fitted_s
         if budget.spent + each > until_s:
@@ -212,9 +212,9 @@ def _held(
             return None
         field.condition(data, np.setdiff1d(rows, group))
         batch = data.batch(group)
-        found.append(field(batch.tx, batch.rx))
+        answers.append(field(batch.tx, batch.rx))
     field.condition(data, rows)
-    mean, variance = (torch.cat([getattr(one, name) for one in found]) for name in ("mean", "variance"))
+    mean, variance = (torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)
 
 

@@ -110,8 +110,8 @@ def best_weights(gram: np.ndarray) -> np.ndarray:
     """
     values, vectors = np.linalg.eigh(gram / max(np.trace(gram), np.finfo(float).tiny))
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    found = nnls(np.vstack([root, np.ones(len(gram))]), np.append(np.zeros(len(gram)), 1.0))[0]
-    return found / found.sum()
+    result = nnls(np.vstack([root, np.ones(len(gram))]), np.append(np.zeros(len(gram)), 1.0))[0]
+    return result / result.sum()
 
 
 def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
@@ -140,16 +140,16 @@ def choose(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """
     errors = np.einsum("nkk->nk", gram)
     winner = int(errors.mean(0).argmin())
-    alone = np.eye(gram.shape[1])[winner]
+    single = np.eye(gram.shape[1])[winner]
     part = np.unique(unit, return_inverse=True)[1].reshape(-1) % PARTS
     if gram.shape[1] < 2 or part.max() == 0:
-        return alone
+        return single
     mixed = np.empty(len(gram))
     for number in range(int(part.max()) + 1):
         here = part == number
         mixed[here] = squared(_pruned(gram[~here].mean(0)), gram[here])
     gain, error = paired(errors[:, winner] - mixed, unit)
-    return _pruned(gram.mean(0)) if gain > error else alone
+    return _pruned(gram.mean(0)) if gain > error else single
 
 
 def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
@@ -159,7 +159,7 @@ def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
 
 def _pruned(gram: np.ndarray) -> np.ndarray:
     """The best weights (K,) without those that matter little."""
-    kept = best_weights(gram) >= LEAST_WEIGHT
-    found = np.zeros(len(gram))
-    found[kept] = best_weights(gram[np.ix_(kept, kept)])
-    return found
+    large = best_weights(gram) >= LEAST_WEIGHT
+    result = np.zeros(len(gram))
+    result[large] = best_weights(gram[np.ix_(large, large)])
+    return result

@@ -122,11 +122,11 @@ class CalibratedRayTracer(Method):
 
     def _notes(self, dark: int) -> tuple[str, ...]:
         assert self.learned is not None
-        said = ", ".join(
+        materials = ", ".join(
             f"{name} {one.permittivity:.3g} and {one.conductivity:.2g} S/m"
             for name, one in self.learned.materials.items()
         )
-        notes = [f"permittivity and conductivity of {said}; residuals {self.learned.scale_db:.2g} dB"]
+        notes = [f"permittivity and conductivity of {materials}; residuals {self.learned.scale_db:.2g} dB"]
         if dark:
             notes.append(f"{dark} training rows have no path; such places get {self._silent_db:.4g} dB")
         return tuple(f"{self.name}: {note}" for note in notes)

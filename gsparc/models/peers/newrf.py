@@ -80,22 +80,22 @@ class NeWRF(TrainedPeer):
             "votes": votes(seen, len(centres)),
         }
 
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
-        return DirectedRays(scene, found, self)
+        return DirectedRays(scene, precomputed, self)
 
 
 class DirectedRays(Network):
     """The network and the march."""
 
-    def __init__(self, scene: Scene, found: dict[str, Tensor], settings: NeWRF) -> None:
-        super().__init__(scene, len(found["virtual"]))
+    def __init__(self, scene: Scene, precomputed: dict[str, Tensor], settings: NeWRF) -> None:
+        super().__init__(scene, len(precomputed["virtual"]))
         assert scene.site.wavelength is not None
-        self.found = found
-        self.samples, self.neighbours = settings.samples, min(settings.neighbours, len(found["places"]))
+        self.precomputed = precomputed
+        self.samples, self.neighbours = settings.samples, min(settings.neighbours, len(precomputed["places"]))
         self.wavenumber = 2 * math.pi / scene.site.wavelength
-        reach = (found["virtual"][:, None] - found["places"][None]).norm(dim=-1)
-        self.far = float(torch.quantile(reach[found["votes"].T > 0], 0.99)) + AROUND
+        reach = (precomputed["virtual"][:, None] - precomputed["places"][None]).norm(dim=-1)
+        self.far = float(torch.quantile(reach[precomputed["votes"].T > 0], 0.99)) + AROUND
         around = torch.stack([scene.box[0] - self.far, scene.box[1] + self.far])
         self.place = PositionEncoding(EncodingSettings("fourier", settings.octaves), around)
         self.heading = PositionEncoding(EncodingSettings("fourier", 2), torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -108,11 +108,11 @@ class DirectedRays(Network):
         At least half of the nearest training receivers see them. Training receivers (`skip_self`) see what
         they were measured to see.
         """
-        distance = torch.cdist(places, self.found["places"])
+        distance = torch.cdist(places, self.precomputed["places"])
         near = distance.topk(1 if skip_self else self.neighbours, largest=False).indices
-        share = (self.found["votes"] > 0)[near].float().mean(1)
+        share = (self.precomputed["votes"] > 0)[near].float().mean(1)
         best = share.topk(max(int((share >= 0.5).sum(1).max()), 1), dim=1)
-        return self.found["virtual"][best.indices], best.values >= 0.5
+        return self.precomputed["virtual"][best.indices], best.values >= 0.5
 
     def march(self, places: Tensor, goals: Tensor, likely: Tensor, draw: torch.Generator | None) -> Tensor:
         """Channels (B,) of rays from places (B, 3) towards goals (B, P, 3) [m], those likely (B, P)."""

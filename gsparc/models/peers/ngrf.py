@@ -46,7 +46,7 @@ class NGRF(TrainedPeer):
     count: int = 30
     rate: float = 5e-3
 
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`; `ValueError` without a frequency, or for spectra without an array."""
         site = scene.site
         if site.subcarriers_hz is None and site.carrier_hz is None:

@@ -122,7 +122,7 @@ class TrainedPeer(Method):
     rate: float = 2e-3
     seed: int = 0
     network: Network | None = field(default=None, init=False, repr=False)
-    found: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+    precomputed: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     steps: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
@@ -132,8 +132,8 @@ class TrainedPeer(Method):
                 f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
             )
 
-    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
-        """The untrained network of a scene; `found` is what was computed before training."""
+    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
+        """The untrained network of a scene; `precomputed` is what was computed before training."""
         network: Network = self.makes(scene, self)
         return network
 
@@ -158,8 +158,8 @@ class TrainedPeer(Method):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         L.seed_everything(self.seed, verbose=False)
-        self.site, self.found = data.site, self.precompute(data, rows)
-        self.network = self.build(_scene(data, rows), self.found)
+        self.site, self.precomputed = data.site, self.precompute(data, rows)
+        self.network = self.build(_scene(data, rows), self.precomputed)
         self._train(data, rows, budget)
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
@@ -230,7 +230,7 @@ class TrainedPeer(Method):
         return {
             "shape": list(scene.shape),
             "receiver": None if receiver is None else [receiver.position, receiver.rotation],
-            **{"transmitter": scene.transmitter, "box": scene.box, "found": self.found},
+            **{"transmitter": scene.transmitter, "box": scene.box, "found": self.precomputed},
             **{"network": network.state_dict(), "steps": self.steps},
         }
 
@@ -239,8 +239,8 @@ class TrainedPeer(Method):
         receiver = None if state["receiver"] is None else Pose(*state["receiver"])
         self.site = site
         scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"], state["box"])
-        self.found, self.steps = dict(state["found"]), int(state["steps"])
-        self.network = self.build(scene, self.found)
+        self.precomputed, self.steps = dict(state["found"]), int(state["steps"])
+        self.network = self.build(scene, self.precomputed)
         self.network.load_state_dict(state["network"])
         self.network.eval()
 

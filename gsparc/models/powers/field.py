@@ -20,20 +20,15 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.haste import haste
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
-from gsparc.models.powers.settings import choose_about, choose_prior
-from gsparc.models.target_rows import (
-    entry_variance,
-    from_real,
-    rows_of,
-)
+from gsparc.models.powers.settings import choose_prior, chosen_among
+from gsparc.models.target_rows import entry_variance, from_real, rows_of
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
-from gsparc.processes.trend import Trend, trend_of
-from gsparc.processes.wall_count import Walls
+from gsparc.processes.trend import Trend, Walls, trend_of
 from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.training.time_budget import TimeBudget
 
@@ -92,13 +87,7 @@ class PowerField(ConditionalField):
         return tuple(name for name, there in named.items() if there)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`; what rows say where nothing was heard is that powers are below a level.
-
-        Raises:
-            ValueError: no rows.
-        """
-        if not len(rows):
-            raise ValueError("a field of powers needs at least one row")
+        """See `ConditionalField`; what rows say where nothing was heard is that powers are below a level."""
         seen = rows_of(data, rows)
         self.process, _ = conditioned(seen, self.trend, self.kernel, self.seed)
         self._tree = None
@@ -120,8 +109,8 @@ class PowerField(ConditionalField):
         mean, spread, share, explained = (torch.cat(part) for part in zip(*parts, strict=True))
         mean, spread, share, explained = (part.to(tx.dtype) for part in (mean, spread, share, explained))
         power = self._power(mean)
-        said = self._power(explained) if self.count else None
-        return Posterior(power, entry_variance(spread, power, "rssi"), said, share)
+        explained_power = self._power(explained) if self.count else None
+        return Posterior(power, entry_variance(spread, power, "rssi"), explained_power, share)
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
@@ -209,12 +198,8 @@ def initialise(
         walls: that are known; no waves are sought beside them.
 
     Raises:
-        ValueError: not powers, several stations, or no rows.
+        ValueError: no rows.
     """
-    if data.site.kind != "rssi":
-        raise ValueError(f"a field of powers needs received powers (rssi), not {data.site.kind}")
-    if data.site.stations is not None and len(data.site.stations) > 1:
-        raise ValueError(f"a field of powers is of one station, not of {len(data.site.stations)}")
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
@@ -223,18 +208,18 @@ def initialise(
     if walls is not None:
         law, notes = law_of(seen, data.site)
         trend = replace(trend_of_rows(seen, law), walls=walls)
-        kernel, more = choose_about(seen, trend, seed, pace)
-        said = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
-        return PowerField(data.site, trend, kernel, seed), (said, *notes, *more)
+        _, kernel, more = chosen_among(seen, [(trend, 0.0, ())], seed, pace)
+        note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
+        return PowerField(data.site, trend, kernel, seed), (note, *notes, *more)
     trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, pace)
     field = PowerField(data.site, trend, kernel, seed)
     if waves:
         order = np.argsort(rows)
         assert data.site.wavelength is not None
-        field.fringes, said = find_fringes(
+        field.fringes, note = find_fringes(
             seen.at(order), rows[order], (trend, kernel), data.site.wavelength, seed, budget
         )
-        notes = (*notes, said)
+        notes = (*notes, note)
     return field, notes
 
 

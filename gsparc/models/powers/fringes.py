@@ -151,8 +151,8 @@ def sampled(places: np.ndarray, wavelength: float | None) -> bool:
     """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
     if wavelength is None or places.shape[1] != 3:
         return False
-    alone = np.unique(places, axis=0)
-    return len(alone) > 1 and float(np.median(nearest(alone))) < wavelength / 2
+    unique = np.unique(places, axis=0)
+    return len(unique) > 1 and float(np.median(nearest(unique))) < wavelength / 2
 
 
 def nearest(places: np.ndarray) -> np.ndarray:
@@ -179,10 +179,10 @@ def find_fringes(
         budget: none is sought beyond it, nor beyond `SECONDS`.
     """
     own = TimeBudget(SECONDS, "processor")
-    kept = draw(rows.silent, MOST_ROWS, seed)
-    drawn = f" (of {len(kept)} of {len(rows.places)} rows)" if len(kept) < len(rows.places) else ""
-    rows, numbers = rows.at(kept), numbers[kept]
-    count, level = len(kept), 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
+    chosen = draw(rows.silent, MOST_ROWS, seed)
+    drawn = f" (of {len(chosen)} of {len(rows.places)} rows)" if len(chosen) < len(rows.places) else ""
+    rows, numbers = rows.at(chosen), numbers[chosen]
+    count, level = len(chosen), 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
     basis = basis_of(rows.places, wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
@@ -208,8 +208,8 @@ def find_fringes(
     if fringes is None or gain is None or not gain.exceeds(0.0):
         return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{drawn}"
     share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
-    said = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
-    return fringes, f"{said} between rows and a block away, the process the rest{drawn}"
+    note = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
+    return fringes, f"{note} between rows and a block away, the process the rest{drawn}"
 
 
 def _held_out_mean(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:

@@ -60,30 +60,23 @@ def choose_prior(
     rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
 ) -> tuple[Trend, Kernel, tuple[str, ...]]:
     """The settings of `fit_powers` alone, and what must be said of them."""
-    trend, kernel, notes = _chosen(rows, _trends(rows, site, mean), seed, haste)
+    trend, kernel, notes = chosen_among(rows, _trends(rows, site, mean), seed, haste)
     return trend, kernel, (_description(trend, kernel), *notes)
 
 
-def choose_about(
-    rows: Rows, trend: Trend, seed: int = 0, haste: Haste = UNHURRIED
-) -> tuple[Kernel, tuple[str, ...]]:
-    """The kernel about a mean law that is given, and what must be said of it."""
-    return _chosen(rows, [(trend, 0.0, ())], seed, haste)[1:]
-
-
-def _chosen(
+def chosen_among(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
 ) -> tuple[Trend, Kernel, tuple[str, ...]]:
-    """The best of `trends` with its kernel, and what must be said of the choice."""
+    """The best of mean laws (each with its cost and notes), its kernel, and what must be said of it."""
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     with late_when(haste.late):
         pace = replace(haste, rows=min(haste.rows, COMPARED_ON)) if many else haste
-        trend, kernel, said = _settings(rows, trends, seed, pace)
+        trend, kernel, notes = _settings(rows, trends, seed, pace)
     if many:  # given their nearest, all tell of settings
         values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
         kernel, how = settings_of(Prior(kernel, trend), values, seed)
-        said = (*said, f"then {how}")
-    return trend, kernel, said
+        notes = (*notes, f"then {how}")
+    return trend, kernel, notes
 
 
 @dataclass(frozen=True)
@@ -107,10 +100,10 @@ def _settings(
     few = loud.at(draw(np.zeros(len(loud.places), bool), compared_on, seed))
     weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, haste.rows), seed))
     both = weighed.silent.any() and not weighed.silent.all()
-    found = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
+    candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     if both and not late():
-        found = [_weighed(weighed, one) for one in found]
-    best = max(found, key=lambda one: one.score)
+        candidates = [_weighed(weighed, one) for one in candidates]
+    best = max(candidates, key=lambda one: one.score)
     if len(loud.places) > len(few.places) and not both and not late():
         best = _refined(loud, best)
     if len(loud.places) >= TWO_LENGTHS_NEED and not late():
@@ -118,8 +111,8 @@ def _settings(
         best = max((best, _weighed(weighed, two) if both else two), key=lambda one: one.score)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):
-        said = f"settings chosen on {count} of {len(rows.places)} rows, drawn evenly"
-        return best.trend, best.kernel, (*best.notes, said)
+        note = f"settings chosen on {count} of {len(rows.places)} rows, drawn evenly"
+        return best.trend, best.kernel, (*best.notes, note)
     return best.trend, best.kernel, best.notes
 
 

@@ -58,8 +58,8 @@ def basis_of(places: np.ndarray, wavelength: float) -> Basis:
     waves = 2 * math.pi / wavelength * sphere(WAVES).numpy()
     plane = Basis(waves, np.eye(WAVES)).plane(places)
     values, vectors = eigh(plane.conj().T @ plane / len(places))
-    kept = values > KEPT * values[-1]
-    return Basis(waves, vectors[:, kept] / math.sqrt(values[kept].sum()))
+    large = values > KEPT * values[-1]
+    return Basis(waves, vectors[:, large] / math.sqrt(values[large].sum()))
 
 
 def decibels_of(field: np.ndarray) -> np.ndarray:
@@ -81,10 +81,10 @@ def fit_waves(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generato
         scale = now.scale()
         now = _Misfit.of(columns, decibels, weights, hidden, scale)
         for _ in range(steps):
-            found = _step(columns, decibels, now, hidden, scale, damping)
-            if found is None:
+            result = _step(columns, decibels, now, hidden, scale, damping)
+            if result is None:
                 break
-            better, damping = found
+            better, damping = result
             settled, now = now.value - better.value < SETTLED * now.value, better
             if settled:
                 break
@@ -114,11 +114,11 @@ class _Misfit:
 
     def scale(self) -> float:
         """Of the errors [dB], by a few steps of expectation maximisation."""
-        found = SCALE_DB
+        result = SCALE_DB
         for _ in range(5):
-            share = (DEGREES + 1) / (DEGREES + (self.error / found) ** 2)
-            found = max(math.sqrt(float((share * self.error**2).mean())), LEAST_DB)
-        return found
+            share = (DEGREES + 1) / (DEGREES + (self.error / result) ** 2)
+            result = max(math.sqrt(float((share * self.error**2).mean())), LEAST_DB)
+        return result
 
 
 def _step(

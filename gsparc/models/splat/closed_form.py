@@ -141,8 +141,8 @@ def warm_start(
     first = parts[0]
     own = rows[: len(first.outputs)]
     places = torch.from_numpy(data.moving[own]).float().double()
-    alone = whitened(places, process.prior.length, process.prior.noise, "matern32", len(own))
-    inverse = alone.weigh.mT @ alone.weigh
+    features = whitened(places, process.prior.length, process.prior.noise, "matern32", len(own))
+    inverse = features.weigh.mT @ features.weigh
     if model.error is not None:
         model.error.set(*_errors(first, inverse, process.prior.noise, mean))
     return _left_out(first, inverse, data.moving[own], mean)

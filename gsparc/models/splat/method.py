@@ -349,12 +349,12 @@ class LearnedField(Method):
     def _answered(
         self, model: GaussianModel, frozen: FrozenView | FrozenArray | None, tx: Tensor, rx: Pose
     ) -> Prediction:
-        found = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
-        mean = found.mean
+        result = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
+        mean = result.mean
         if model.site.kind == "spectrum":
             mean = mean.clamp(0, 1) if mean.dtype == torch.float64 else mean.clamp_(0, 1)
-        if model.error is not None and found.unknown is not None:
-            return Prediction(mean, *model.error(found.unknown))
+        if model.error is not None and result.unknown is not None:
+            return Prediction(mean, *model.error(result.unknown))
         if model.confidence is None:
             return Prediction(mean)
         return Prediction(mean, model.confidence.normalised(model.site.moving(tx, rx)))

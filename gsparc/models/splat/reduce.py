@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.field import edit
-from gsparc.field.fewer_features import distil_features
+from gsparc.field.encoding import PositionEncoding, Prior
 from gsparc.field.frozen import FrozenArray, frozen_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.field.response import ArrayResponse
@@ -21,6 +21,7 @@ from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Filled, coarser
 from gsparc.ops import Pose, SphereGrid, mean_weights
+from gsparc.processes.features import correlation, farthest, with_places
 
 if TYPE_CHECKING:
     from gsparc.models.splat.method import LearnedField
@@ -60,11 +61,11 @@ def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) ->
         batch = data.batch(np.array([row]))
         emitted = model.features(batch.tx, batch.rx).abs().sum(-1).mean(0)
         total += emitted * _weights(model, batch.rx)
-    found = {"contribution": total / len(chosen)}
+    result = {"contribution": total / len(chosen)}
     if model.site.static_end == "rx":
         rx = data.batch(chosen[:1]).rx
-        found["receiver"] = torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])
-    return found
+        result["receiver"] = torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])
+    return result
 
 
 def _weights(model: GaussianModel, rx: Pose) -> Tensor:
@@ -180,9 +181,9 @@ def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
     own = _weights_of(few, rx, grid)
     gram = own.mT @ own
     gram.diagonal().add_(RIDGE * gram.diagonal().mean() + 1e-12)
-    found = torch.linalg.solve(gram, own.mT @ wanted)
-    few.emission.weight2.copy_(found[:, :-1, None])
-    few.emission.bias2.copy_(found[:, -1:])
+    result = torch.linalg.solve(gram, own.mT @ wanted)
+    few.emission.weight2.copy_(result[:, :-1, None])
+    few.emission.bias2.copy_(result[:, -1:])
 
 
 def _weights_of(model: GaussianModel, rx: Pose, grid: SphereGrid) -> Tensor:
@@ -191,3 +192,32 @@ def _weights_of(model: GaussianModel, rx: Pose, grid: SphereGrid) -> Tensor:
     view.site = replace(model.site, grid=grid)
     frozen = view.freeze(rx)
     return frozen.render(torch.eye(len(model.gaussians)), frozen.version).flatten(1).mT
+
+
+@torch.no_grad()
+def distil_features(model: GaussianModel, share: float) -> None:
+    """Keep the `share` of the places behind the emission's features that lie farthest apart.
+
+    The emissions of the whole field at all its places, with their noise, are what the fewer features are
+    fitted to; what they cannot tell counts as unknown.
+
+    Args:
+        model: changed in place; its features tell the unknown share.
+        share: in (0, 1].
+    """
+    emission, old = model.emission, model.emission.encoding
+    places, length, noise = old.anchors.double(), old.length, old.noise
+    own = correlation(places, places, length, old.kernel)
+    own.diagonal().add_(noise)
+    count, width, channels = emission.weight2.shape
+    weights = emission.weight2.permute(1, 0, 2).reshape(width, count * channels).double()
+    chosen = farthest(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
+    features = with_places(places[chosen], places, length, noise, old.kernel)
+    result = features.weigh @ (own @ (old.whitening.double() @ weights))
+    prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())
+    few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)
+    emission.encoding = few.to(old.anchors.device)
+    emission.weight2 = torch.nn.Parameter(
+        result.float().view(-1, count, channels).permute(1, 0, 2).contiguous(), emission.weight2.requires_grad
+    )
+    model.gaussians.version += 1

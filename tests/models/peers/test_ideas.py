@@ -143,7 +143,7 @@ def test_newrf_asks_the_neighbours_how_many_paths_there_are(tmp_path):
     votes = torch.zeros(6, 6)
     votes[:3, 0] = votes[3:, 1:] = votes[0, 1] = 1  # one of the first three sees another
     places = torch.eye(3)[:1] * torch.tensor([0.0, 0.1, 0.2, 9.0, 9.1, 9.2])[:, None]
-    net.found = {"places": places, "virtual": torch.rand(6, 3), "votes": votes}
+    net.precomputed = {"places": places, "virtual": torch.rand(6, 3), "votes": votes}
     assert net.search(places[[1, 4]], False)[1].sum(1).tolist() == [1, 5]
 
 

@@ -135,17 +135,6 @@ def test_left_out_rows_are_predicted_without_them():
         assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
 
 
-def test_state_makes_it_again(blocked, tmp_path):
-    data, field, _ = blocked
-    torch.save(field.state(), tmp_path / "field.pt")
-    again = restored(data.site, torch.load(tmp_path / "field.pt", weights_only=True))
-    batch = data.batch(np.arange(200, 230))
-    for name in ("mean", "variance", "unknown"):
-        one, other = (getattr(f(batch.tx, batch.rx), name) for f in (field, again))
-        assert torch.allclose(one, other, rtol=1e-5), name
-    assert torch.allclose(field.left_out().mean, again.left_out().mean, rtol=1e-4)
-
-
 def test_both_ends_may_move():
     data = town(60)
     rng = np.random.default_rng(0)
@@ -167,8 +156,6 @@ def test_what_cannot_be_is_refused():
     data = town(20)
     with pytest.raises(ValueError, match="at least one row"):
         initialise(data, np.arange(0))
-    with pytest.raises(ValueError, match="rssi"):
-        initialise(replace(data, site=replace(data.site, kind="csi")), np.arange(9))
     with pytest.raises(ValueError, match="condition it first"):
         small_field(data).left_out()
 

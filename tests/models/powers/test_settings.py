@@ -95,18 +95,12 @@ def test_intervals_cover_what_they_promise():
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
 
 
-def test_back_from_disk_and_as_a_mean_alone(tmp_path):
+def test_a_mean_alone_has_no_variance():
     data, method = town(120), GaussianProcess()
     batch, _ = fit(method, data, 100)
-    torch.save(method.state(), tmp_path / "state.pt")
-    again = GaussianProcess()
-    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    said, then = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
-    for part in ("mean", "confidence", "variance"):
-        assert torch.allclose(getattr(said, part), getattr(then, part), rtol=1e-5)
     lean = reduced(method, {"confidence": False}, {}).predict(batch.tx, batch.rx)
-    assert lean.variance is None and torch.allclose(lean.mean, said.mean, rtol=1e-5)
-    assert method.knobs() == ("confidence",)
+    assert lean.variance is None and method.knobs() == ("confidence",)
+    assert torch.allclose(lean.mean, method.predict(batch.tx, batch.rx).mean, rtol=1e-5)
 
 
 @pytest.mark.slow

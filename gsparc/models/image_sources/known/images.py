@@ -16,7 +16,7 @@ from gsparc.data.walls import SceneWalls, area, box_faces, normal_of
 from gsparc.models.image_sources.clutter.blocking import Clutter, tangents, visible_share
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Paths, Unfolding
 from gsparc.physics.mirror_planes import Reflections, all_sequences, images
-from gsparc.processes.wall_count import Walls
+from gsparc.processes.trend import Walls
 
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
 MOST_SEQUENCES = 3_000  # sequences of walls of each length that are looked at, over the largest of them

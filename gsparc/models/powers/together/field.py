@@ -1,8 +1,8 @@
-"""The field of powers of many ends: a law, Gaussians and a place term of the site, a process of each end.
+"""The field of powers of many ends: a law and a place term of the site, a process of each end.
 
-Stations that were heard answer by their own process about what the site shares: its law, and further terms
-where groups of places that were left out say so. A station that was never heard is answered by the shared
-terms, as strong as stations that were left out want them. Either end may be the station.
+Stations that were heard answer by their own process about the law of the site. A station that was never
+heard is answered by the law and a process of place that all stations share, as strong as stations that were
+left out want it. Either end may be the station.
 """
 
 from __future__ import annotations
@@ -16,12 +16,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.data.site_objects import SiteObjects
 from gsparc.models.per_station import SAME_PLACE_M
-from gsparc.models.powers.groups import Gain
-from gsparc.models.powers.together.learning import Own, gain_of_places, learn_own, learn_strength
-from gsparc.models.powers.together.rows import link_rows, places_of
-from gsparc.models.powers.together.terms import LAW_DB, TALL, Terms
+from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
+from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
@@ -39,7 +36,6 @@ MOST_EACH = 6_000  # rows of a station
 MEMORY = 3e9  # bytes of all stations' factors
 PLACES = 600  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
-SURER = 2.0  # with few rows of each station the others say more than with all of them
 
 
 class JointPowerField(ConditionalField):
@@ -79,32 +75,16 @@ class JointPowerField(ConditionalField):
 
     @property
     def count(self) -> int:
-        """Gaussians in the way to stations that were heard."""
-        return self.heard.count
+        """None."""
+        return 0
 
     @property
     def terms(self) -> tuple[str, ...]:
         """`power` always: its law is of the site."""
         return ("power", "residual")
 
-    def objects(self) -> SiteObjects:
-        """Gaussians that all stations are seen through, else those that stations never heard would be."""
-        for terms, posterior in ((self.heard, self.posterior), (self.unheard, self.elsewhere)):
-            if posterior is not None and terms.count:
-                means = terms.cells.numpy()
-                scales = terms.width * np.array([1, 1, TALL]) * np.ones_like(means)
-                losses = -terms.shadow_db * posterior.mean[len(LAW_DB) : len(LAW_DB) + terms.count].numpy()
-                return SiteObjects.of(gaussians=(means, scales, np.zeros(len(means)), losses))
-        return SiteObjects.of()
-
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`; silent rows say that powers are below a level.
-
-        Raises:
-            ValueError: no rows.
-        """
-        if not len(rows):
-            raise ValueError("a field of powers needs at least one row")
+        """See `ConditionalField`; silent rows say that powers are below a level."""
         every = link_rows(data, rows, self.places)
         used = every.thinned(most_each(len(every.stations)), self.seed)
         few = used.thinned(UNHEARD_EACH, self.seed)
@@ -127,18 +107,17 @@ class JointPowerField(ConditionalField):
             ValueError: before `condition`.
         """
         posterior, elsewhere = self._conditioned()
-        places, number = self._asked(tx, rx, station)
-        mean, spread, share, explained = (torch.zeros(len(places), dtype=torch.float64) for _ in range(4))
+        places, number = self._ends(tx, rx, station)
+        mean, spread, share = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
         for one in number.unique().tolist():
             of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
             for chosen in torch.nonzero(number == one)[:, 0].split(QUERIES):
-                mean[chosen], left, explained[chosen] = of.answer(places[chosen], one)
+                mean[chosen], left = of.answer(places[chosen], one)
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
-        mean, spread, share, explained = (part.to(tx.dtype) for part in (mean, spread, share, explained))
+        mean, spread, share = (part.to(tx.dtype) for part in (mean, spread, share))
         power = self._power(mean)
-        variance = entry_variance(spread, power, "rssi")
-        return Posterior(power, variance, self._power(explained) if self.count else None, share)
+        return Posterior(power, entry_variance(spread, power, "rssi"), None, share)
 
     def answer(self, batch: Batch) -> Posterior:
         """See `ConditionalField`; two stations may stand at one place."""
@@ -181,7 +160,7 @@ class JointPowerField(ConditionalField):
             raise ValueError("a field of powers: condition it first")
         return self.posterior, self.elsewhere
 
-    def _asked(self, tx: Tensor, rx: Pose, station: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _ends(self, tx: Tensor, rx: Pose, station: Tensor | None) -> tuple[Tensor, Tensor]:
         """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""
         sender = tx.cpu().double()
         receiver = rx.position.reshape(-1, 3).expand(len(tx), 3).cpu().double()
@@ -230,7 +209,6 @@ def most_each(stations: int) -> int:
 def initialise(
     data: Measurements,
     rows: np.ndarray,
-    sure: float = 1.0,
     shared: bool = True,
     seed: int = 0,
     budget: TimeBudget | None = None,
@@ -240,58 +218,40 @@ def initialise(
     Args:
         data: powers of several stations.
         rows: (n,) to learn from, at least one.
-        sure: standard errors that the gain of shared terms must exceed, at left-out places or stations.
         shared: whether there may be any beside the law.
         seed: of rows and places that are drawn.
         budget: settings are not learned beyond it.
 
     Raises:
-        ValueError: not powers, not several stations, or no rows.
+        ValueError: not several stations, or no rows.
     """
-    if data.site.kind != "rssi":
-        raise ValueError(f"a field of powers needs received powers (rssi), not {data.site.kind}")
     if data.site.stations is None or len(data.site.stations) < 2:
         raise ValueError("a field of powers of many ends needs several stations")
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     places, notes = places_of(data, rows)
     every = link_rows(data, rows, places)
-    own, said = learn_own(every, seed, budget)
+    own, remarks = learn_own(every, seed, budget)
     most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
     if largest > most:
-        said.append(f"at most {most} rows of each station are learned from, of up to {largest}")
+        remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
     assert own.never.trend is not None
     plain = Terms.over(every, own.never.trend, 1.0, 0, seed)
     field = JointPowerField(data.site, places, own, plain, plain, 1.0, seed)
     if not shared:
-        return field, (*notes, *said)
-    strength = learn_strength(every, own, sure, seed, budget)
-    field.inflation = strength.inflation
-    if strength.gain is None:
-        said.append("no shared terms: too few stations to leave some out")
-        return field, (*notes, *said)
-    said.append("stations left out, after one constant: " + _gain_text(strength.gain, "shared terms"))
-    if not strength.terms.there:
-        return field, (*notes, *said)
-    field.unheard = strength.terms.known_at(every, PLACES if strength.terms.place_db else 0, seed)
-    at_places = None
-    if budget is None or not budget.over(0.8):
-        at_places = gain_of_places(every, own, plain, strength.terms, seed)
-    if at_places is None:
-        said.append("no time to try shared terms on groups of places that are left out")
-    else:
-        said.append("groups of places left out: " + _gain_text(at_places, "shared terms"))
-        if at_places.exceeds(SURER * sure):
-            field.heard = field.unheard
-    return field, (*notes, *said)
-
-
-def _gain_text(gain: Gain, what: str) -> str:
+        return field, (*notes, *remarks)
+    terms, field.inflation, gain = learn_strength(every, own, seed, budget)
+    if gain is None:
+        remarks.append("no shared terms: too few stations to leave some out")
+        return field, (*notes, *remarks)
     before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
-    return (
-        f"rmse {before:.3g} dB without {what}, {after:.3g} dB with them "
-        f"(gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
+    remarks.append(
+        f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, {after:.3g} dB "
+        f"with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
     )
+    if terms.place_db:
+        field.unheard = terms.known_at(every, PLACES, seed)
+    return field, (*notes, *remarks)
 
 
 def restored(site: Site, state: dict[str, Any]) -> JointPowerField:
@@ -299,7 +259,7 @@ def restored(site: Site, state: dict[str, Any]) -> JointPowerField:
     never = Prior.read(state["never"])
     assert never.trend is not None
     own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
-    heard, unheard = (Terms(never.trend, **state[name]) for name in ("heard", "unheard"))
+    heard, unheard = (Terms.read(never.trend, state[name]) for name in ("heard", "unheard"))
     field = JointPowerField(
         site, state["places"].numpy(), own, heard, unheard, float(state["inflation"]), int(state["seed"])
     )

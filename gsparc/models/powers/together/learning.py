@@ -10,16 +10,14 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.groups import Gain, compared, folds, groups
-from gsparc.models.powers.together.rows import LinkRows
-from gsparc.models.powers.together.terms import Terms
+from gsparc.models.powers.groups import Gain, compared
+from gsparc.models.powers.together.terms import LinkRows, Terms
 from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart, bounds_of
 from gsparc.processes.posterior import Exact
@@ -41,9 +39,9 @@ LEAST_STATIONS = 3  # to leave some out
 TRIED_ON, TRIED_EACH = 3_600, 300  # rows of all stations, and of each, for the strength of shared terms
 TRIED_PLACES = 300  # that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
-PLACE, SHADOW = (0.0, 0.03, 0.1, 0.2), (0.0, 0.02, 0.06, 0.15)  # variances, of a station's own
+PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
+ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
 WIDEST = 4.0  # factor that variances are corrected by at most
-COMPARED_EACH, FOLDS = 400, 5  # rows of each station and folds of left-out places
 
 
 @dataclass(frozen=True)
@@ -76,21 +74,18 @@ class Own:
 
     def given(self, rows: LinkRows, terms: Terms, seed: int) -> Shared:
         """What rows say; pseudo-values of silent ones follow from their own station's."""
-        found = {}
+        result = {}
         for number in rows.stations:
             prior, part = self.prior(number), rows.of(number)
-            places, values, extra = (
-                torch.from_numpy(part.places),
-                torch.from_numpy(part.decibels)[:, None],
-                None,
-            )
+            places, extra = torch.from_numpy(part.places), None
+            values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
                 wide = WithTerms(**vars(_trend(prior)), shared=terms.columns, unit=deviation_of(prior))
                 known = conditioned(part, wide, _kernel(prior), seed)[0].posterior
                 assert isinstance(known, Exact)
                 places, values, extra = known.rows, known.values(), known.extra
-            found[number] = Exact.of(prior, places, values, extra)
-        return Shared(found, self.never, terms.columns)
+            result[number] = Exact.of(prior, places, values, extra)
+        return Shared(result, self.never, terms.columns)
 
     @property
     def variance(self) -> float:
@@ -114,20 +109,20 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
     Searches end with what they have when the budget is over; single stations have no settings of their own
     when half of it is.
     """
-    trend, said = _site_law(rows, seed)
+    trend, notes = _site_law(rows, seed)
     heard = rows if rows.silent.all() else rows.loud
-    alone = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
+    numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else late_when(budget.over):
-        kernel, found = _common_settings(heard, trend, seed)
+        kernel, priors = _common_settings(heard, trend, seed)
         if budget is not None and budget.over(0.5):
-            alone = []
-        for number in alone:
+            numbers = []
+        for number in numbers:
             distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
             bounds = bounds_of(2, distance.numpy())
             _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
-            found[number] = Prior(own, trend)
-    said += [f"settings of their own for {len(alone)} stations"] if alone else []
-    return Own(Prior(kernel, trend), found), said
+            priors[number] = Prior(own, trend)
+    notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
+    return Own(Prior(kernel, trend), priors), notes
 
 
 def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
@@ -179,96 +174,51 @@ def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
     return apart(places, places), trend.terms(places), values[:, None]
 
 
-@dataclass(frozen=True)
-class Strength:
-    """Shared terms for stations that were never heard.
-
-    Attributes:
-        terms: as strong as left-out stations want them; possibly of the law alone.
-        inflation: of variances, as left-out stations ask for.
-        gain: of shared terms at left-out stations, each after one constant; None if not tried.
-    """
-
-    terms: Terms
-    inflation: float = 1.0
-    gain: Gain | None = None
-
-
 def learn_strength(
-    rows: LinkRows, own: Own, sure: float, seed: int, budget: TimeBudget | None = None
-) -> Strength:
-    """The strengths of least squared error at left-out stations, each after one constant.
+    rows: LinkRows, own: Own, seed: int, budget: TimeBudget | None = None
+) -> tuple[Terms, float, Gain | None]:
+    """Shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
         rows: of all stations.
         own: of the stations' own processes.
-        sure: standard errors that the gain over none must exceed.
         seed: of rows and places drawn.
         budget: no further length is tried when it is over.
+
+    Returns:
+        The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
+        g gains at these, each after one constant, None if not tried.
     """
-    loud = rows if rows.silent.all() else rows.loud
-    few = loud.thinned(min(TRIED_EACH, max(TRIED_ON // len(loud.stations), 1)), seed)
+    heard = rows if rows.silent.all() else rows.loud
+    few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(_kernel(own.never).lengths)
-    terms = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
+    bare = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
     if len(few.stations) < LEAST_STATIONS:
-        return Strength(terms)
-    processes = own.given(few, terms, seed).processes
-    bare, none, best = terms, _left_out(_blocks(processes, terms), terms), None
+        return bare, 1.0, None
+    processes = own.given(few, bare, seed).processes
+    best = plain = bare, *_left_out(processes, bare)
     for length in LENGTHS:
-        if best is not None and budget is not None and budget.over():
+        if length != LENGTHS[0] and budget is not None and budget.over():
             break
-        terms = replace(bare, length=length * short)
-        blocks = _blocks(processes, terms)
-        for place, shadow in product(PLACE, SHADOW):
-            if best is not None and not place and length != LENGTHS[0]:
-                continue  # without the shared process its length means nothing
-            deviations = [math.sqrt(share * own.variance) for share in (place, shadow)]
-            strong = replace(terms, place_db=deviations[0], shadow_db=deviations[1])
-            found = _left_out(blocks, strong)
-            if best is None or (found[0] ** 2).mean() < (best[1][0] ** 2).mean():
-                best = strong, found
-    assert best is not None
-    gain = compared(best[1][0] ** 2, none[0] ** 2, none[2])
-    terms, found = best if gain.exceeds(sure) else (bare, none)
-    return Strength(terms, min(max(found[1], 1 / WIDEST), WIDEST), gain)
+        for share in PLACE:
+            terms = replace(bare, length=length * short, place_db=math.sqrt(share * own.variance))
+            result = _left_out(processes, terms)
+            if (result[0] ** 2).mean() < (best[1] ** 2).mean():
+                best = terms, *result
+    gain = compared(best[1] ** 2, plain[1] ** 2, plain[3])
+    terms, _, ratio, _ = best if gain.exceeds(ERRORS) else plain
+    return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
 
 
-def _blocks(processes: Mapping[int, Exact], terms: Terms) -> list[Block]:
-    return [Block.of(process, terms.units(process.rows)) for process in processes.values()]
-
-
-def _left_out(blocks: list[Block], terms: Terms) -> tuple[np.ndarray, float, np.ndarray]:
+def _left_out(processes: Mapping[int, Exact], terms: Terms) -> tuple[np.ndarray, float, np.ndarray]:
     """Errors (n,) [dB] of what was heard of stations left out, after a constant of each, and their stations.
 
     Between them the mean square of errors without that constant over their predicted variances.
     """
-    scale, errors, ratios = terms.scale(), [], []
-    for error, variance in left_out_whole([block.scaled(scale) for block in blocks]):
+    errors, ratios = [], []
+    blocks = [Block.of(process, terms.columns(process.rows)) for process in processes.values()]
+    for error, variance in left_out_whole(blocks):
         ratios.append(float((error.square() / variance).mean()))
         errors.append((error - error.mean()).numpy())
     station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])
     return np.concatenate(errors), float(np.mean(ratios)), station
-
-
-def gain_of_places(rows: LinkRows, own: Own, plain: Terms, strong: Terms, seed: int) -> Gain | None:
-    """What shared terms gain at squares of floor that are left out for all stations."""
-    few = rows.thinned(COMPARED_EACH, seed)
-    group = groups(few.places)
-    errors: list[list[np.ndarray]] = [[], []]
-    told = []
-    for part in folds(group, FOLDS, seed):
-        rest, part = few.at(np.setdiff1d(np.arange(len(group)), part)), part[~few.silent[part]]
-        if not len(part) or rest.silent.all():
-            continue
-        part = part[np.argsort(few.station[part], kind="stable")]
-        told.append(group[part])
-        for terms, found in zip((plain, strong), errors, strict=True):
-            posterior = own.given(rest, terms, seed)
-            for number in few.at(part).stations:
-                asked = few.at(part).of(number)
-                said, _, _ = posterior.answer(torch.from_numpy(asked.places), number)
-                found.append(said.numpy() - asked.decibels)
-    if not told:
-        return None
-    other, one = (np.concatenate(part) ** 2 for part in errors)
-    return compared(one, other, np.concatenate(told))

@@ -1,15 +1,12 @@
-"""What powers of all stations of a site share beside their mean law, as columns of unit normal weights.
+"""Powers between pairs of ends as rows of stations, and what stations share beside their mean law.
 
-`P = law + b decades + c decades^2 + w . shadows + g(place) + r_station + noise`: the law's exponent
-is corrected, and bent; Gaussians on a grid take or give decibels along the path between the ends (P. Agrawal
-and N. Patwari, "Correlated link shadow fading in multi-hop wireless networks", IEEE Trans. Wireless Commun. 8
-(2009)); g, of a moving end's place, is the same for all stations, as street and crowd are. r is the process
-of a station's own (`learning.py`).
+`P = law + b decades + c decades^2 + g(place) + r_station + noise`: the law's exponent is corrected, and bent;
+g, of a moving end's place, is the same for all stations, as street and crowd are. b, c and g are columns of
+unit normal weights; r is the process of a station's own (`learning.py`).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,16 +15,81 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.models.powers.together.rows import LinkRows
+from gsparc.data.schema import Measurements
+from gsparc.models.baselines.distance_law import seek_place
+from gsparc.models.target_rows import rows_of
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart, matern32
+from gsparc.processes.powers import Rows
 from gsparc.processes.trend import Trend
 
 LAW_DB = (5.0, 5.0)  # deviations a decade from the middle, of a slope and of a bend
 JITTER = 1e-6  # of a correlation's diagonal
-TALL = 1e4  # of a Gaussian of the grid, in its widths: it takes as much at all heights
-CELLS = (16, 600)  # Gaussians of the grid, fewest and most
-ROWS_A_CELL = 8
+
+
+@dataclass(frozen=True)
+class LinkRows(Rows):
+    """Rows of several stations; `places` (n, 6) float64 are of the moving end and of the station [m].
+
+    Attributes:
+        station: (n,) int64.
+        index: (n,) int64, of the measurements.
+    """
+
+    station: np.ndarray
+    index: np.ndarray
+
+    @property
+    def stations(self) -> list[int]:
+        """Numbers of the stations that have rows, ascending."""
+        return [int(number) for number in np.unique(self.station)]
+
+    def of(self, number: int) -> LinkRows:
+        """The rows of one station."""
+        return self.at(np.flatnonzero(self.station == number))
+
+    def thinned(self, each: int, seed: int) -> LinkRows:
+        """At most so many rows of each station, at places that they share where they do.
+
+        Rows where something was heard come first where there are too many, up to half of them.
+        """
+        _, place = np.unique(self.places[:, :3], axis=0, return_inverse=True)
+        place = place.reshape(-1)
+        rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
+        chosen = []
+        for number in self.stations:
+            own = np.flatnonzero(self.station == number)
+            own = own[np.argsort(rank[own], kind="stable")]
+            if len(own) > each:
+                loud, quiet = own[~self.silent[own]], own[self.silent[own]]
+                share = max(round(each * len(loud) / len(own)), min(len(loud), each // 2))
+                own = np.concatenate([loud[:share], quiet[: each - share]])
+            chosen.append(own)
+        return self.at(np.sort(np.concatenate(chosen)))
+
+
+def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
+    site, notes = data.site, []
+    assert site.stations is not None and data.station is not None
+    places = np.array(site.stations.position, np.float64)
+    for number in np.flatnonzero(~np.isfinite(places).all(1)):
+        own = rows[data.station[rows] == number]
+        if len(own):
+            places[number] = seek_place(rows_of(data, own))
+            where = ", ".join(f"{value:.4g}" for value in places[number] + site.origin)
+            name = site.stations.name[number]
+            notes.append(f"the place of station {name} is not given; estimated from powers at ({where}) m")
+    return places, tuple(notes)
+
+
+def link_rows(data: Measurements, rows: np.ndarray, places: np.ndarray) -> LinkRows:
+    """Rows (n,) of stations that stand at `places` (T, 3) [m]."""
+    assert data.station is not None
+    station = data.station[rows].astype(np.int64)
+    seen = rows_of(data, rows)
+    ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
+    return LinkRows(ends, seen.decibels, seen.silent, station, np.asarray(rows, np.int64))
 
 
 @dataclass(frozen=True)
@@ -39,9 +101,7 @@ class Terms:
         nearest, farthest: decades of what was heard, of the middle; beyond, the law bends no more.
         inducing: (M, 3) places that g is known at [m].
         length: of g [m].
-        cells: (N, 3) middles of the grid's Gaussians [m].
-        width: their standard deviation along the ground [m].
-        place_db, shadow_db: deviations of g, and of what a Gaussian takes straight through it; 0: none.
+        place_db: deviation of g; 0: there is none.
     """
 
     trend: Trend
@@ -49,22 +109,15 @@ class Terms:
     farthest: float
     inducing: Tensor
     length: float
-    cells: Tensor
-    width: float
     place_db: float = 0.0
-    shadow_db: float = 0.0
 
     @classmethod
     def over(cls, rows: LinkRows, trend: Trend, length: float, places: int, seed: int) -> Terms:
-        """With g known at so many places of rows, drawn evenly, and a grid over both ends; all of 0 dB."""
-        at = torch.from_numpy(rows.places)
-        decades = _decades(trend, at)
-        ends = np.concatenate([rows.places[:, :3], rows.places[:, 3:]])
-        count = min(max(len(ends) // 2 // ROWS_A_CELL, CELLS[0]), CELLS[1])
-        cells, width = grid(ends.min(0), ends.max(0), count)
+        """With g of 0 dB, known at so many places of rows, drawn evenly."""
+        decades = _decades(trend, torch.from_numpy(rows.places))
         none = torch.zeros(0, 3, dtype=torch.float64)
-        found = cls(trend, float(decades.min()), float(decades.max()), none, length, cells, width)
-        return found.known_at(rows, places, seed)
+        bare = cls(trend, float(decades.min()), float(decades.max()), none, length)
+        return bare.known_at(rows, places, seed)
 
     def known_at(self, rows: LinkRows, most: int, seed: int) -> Terms:
         """The same with g known at so many places of rows, drawn evenly."""
@@ -72,36 +125,16 @@ class Terms:
         drawn = np.random.default_rng(seed).permutation(len(every))[:most]
         return replace(self, inducing=torch.from_numpy(every[np.sort(drawn)]))
 
-    @property
-    def there(self) -> bool:
-        """Whether there are any beside the law's."""
-        return bool(self.place_db or self.shadow_db)
-
-    @property
-    def count(self) -> int:
-        """Gaussians in the way."""
-        return len(self.cells) if self.shadow_db else 0
-
-    def scale(self) -> Tensor:
-        """Deviations (P,) [dB] of the weights of `units`."""
-        parts = zip((self.shadow_db, self.place_db), (len(self.cells), len(self.inducing)), strict=True)
-        return torch.tensor([*LAW_DB] + [each for one, many in parts for each in [one] * many]).double()
-
-    def units(self, places: Tensor) -> Tensor:
-        """All columns (n, P) of 1 dB at places of both ends (n, 6) [m]."""
-        shadows = crossed(places, self.cells, self.width)
-        known = self._factor.whitened(matern32(apart(self.inducing, places[:, :3]), self.length)).T
-        return torch.cat([self._of_law(places), shadows, known], 1)
-
     def columns(self, places: Tensor) -> Tensor:
-        """Those of the terms that are there (n, P) [dB] at places of both ends (n, 6) [m]."""
-        parts = [self._of_law(places) * torch.tensor(LAW_DB, dtype=torch.float64)]
-        if self.shadow_db:
-            parts.append(self.shadow_db * crossed(places, self.cells, self.width))
-        if self.place_db:
-            near = matern32(apart(self.inducing, places[:, :3]), self.length)
-            parts.append(self.place_db * self._factor.whitened(near).T)
-        return torch.cat(parts, 1)
+        """(n, P) [dB] at places of both ends (n, 6) [m]."""
+        decades = _decades(self.trend, places)
+        inside = decades.clamp(self.nearest, self.farthest)
+        bend = inside.square() + 2 * inside * (decades - inside)
+        law = torch.stack([decades, bend], 1) * torch.tensor(LAW_DB, dtype=torch.float64)
+        if not self.place_db:
+            return law
+        near = matern32(apart(self.inducing, places[:, :3]), self.length)
+        return torch.cat([law, self.place_db * self._factor.whitened(near).T], 1)
 
     @cached_property
     def _factor(self) -> Factor:
@@ -109,45 +142,23 @@ class Terms:
         gram.diagonal().add_(JITTER)
         return Factor.of(gram, "raise")
 
-    def _of_law(self, places: Tensor) -> Tensor:
-        decades = _decades(self.trend, places)
-        inside = decades.clamp(self.nearest, self.farthest)
-        bend = inside.square() + 2 * inside * (decades - inside)
-        return torch.stack([decades, bend], 1)
-
     def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `Terms` takes, but for the trend."""
+        """Tensors and numbers that `read` needs, but for the trend."""
         return {name: value for name, value in vars(self).items() if name not in ("trend", "_factor")}
+
+    @classmethod
+    def read(cls, trend: Trend, state: dict[str, Any]) -> Terms:
+        """The terms whose `state()` this was.
+
+        Raises:
+            ValueError: with Gaussians along the paths, as earlier versions had them.
+        """
+        if state.get("shadow_db"):
+            raise ValueError("learned with Gaussians along paths, which are no more; train again")
+        names = ("nearest", "farthest", "inducing", "length", "place_db")
+        return cls(trend, *(state[name] for name in names))
 
 
 def _decades(trend: Trend, places: Tensor) -> Tensor:
     assert trend.law is not None
     return trend.law.decades(places) - trend.middle
-
-
-def crossed(places: Tensor, cells: Tensor, width: float) -> Tensor:
-    """(n, N) of Gaussians on the paths between both ends (n, 6) [m]; the way straight through one counts 1.
-
-    With the start p and the way q of a path in standard deviations from a Gaussian, the exponent
-    -|p + t q|^2 / 2 is a parabola in t: its integral over [0, 1] is a difference of error functions.
-    """
-    start = (places[:, None, :2] - cells[:, :2]) / width
-    way = ((places[:, 3:5] - places[:, :2]) / width)[:, None]
-    squared = way.square().sum(-1).clamp_min(1e-12)
-    along = (start * way).sum(-1) / squared
-    closest = (start.square().sum(-1) - along.square() * squared).clamp_min(0.0)
-    size = (squared / 2).sqrt()
-    return 0.5 * torch.exp(-0.5 * closest) * (torch.erf((1 + along) * size) - torch.erf(along * size))
-
-
-def grid(low: np.ndarray, high: np.ndarray, most: int) -> tuple[Tensor, float]:
-    """Middles (N, 3) of at most so many Gaussians on a square grid over a box (3,), (3,), and their width.
-
-    It is half of their spacing: the sum of equal ones is flat.
-    """
-    size = np.maximum((high - low)[:2], 1e-3)
-    spacing = max(math.sqrt(float(size.prod()) / most), float(size.max()) / most)
-    count = np.maximum(np.floor(size / spacing), 1).astype(int)
-    axes = [low[k] + (np.arange(count[k]) + 0.5) * size[k] / count[k] for k in range(2)]
-    x, y = (part.ravel() for part in np.meshgrid(*axes, indexing="ij"))
-    return torch.from_numpy(np.stack([x, y, np.full(len(x), (low[2] + high[2]) / 2)], 1)), spacing / 2
