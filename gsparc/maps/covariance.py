@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from gsparc.data.errors import DataError
-from gsparc.data.schema import Site
-from gsparc.maps.making import levels_at
+from gsparc.maps.making import levels_at, local_of
 from gsparc.maps.promise import Promise
 from gsparc.models.method import HasProcess
 from gsparc.models.powers.settings import fit_powers
@@ -80,8 +79,9 @@ def unknown_of(
         process = asking.method.process() if isinstance(asking.method, HasProcess) else None
         if process is None:
             process = _stand_in(asking, promise, number)
-        local = _queries(asking, places, other_end, process.places.shape[1])
-        covariance = posterior(process, local)
+        local = local_of(asking.site, places, other_end, process.places.shape[1] == 6)
+        assert isinstance(process.posterior, Exact)
+        covariance = process.posterior.covariance(torch.from_numpy(local)).numpy()
         noise = process.kernel.amplitude * process.kernel.noise
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
@@ -110,13 +110,6 @@ def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCo
     return [ErrorCovariance(prior.numpy(), variance * NOISE, np.ones(len(places)))]
 
 
-def posterior(process: PowerProcess, places: np.ndarray) -> np.ndarray:
-    """Covariance (S, S) [dB^2] of the power at places (S, D), given what the process knows."""
-    exact = process.posterior
-    assert isinstance(exact, Exact)
-    return exact.covariance(torch.from_numpy(places)).numpy()
-
-
 def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerProcess:
     """A process of what the model predicts at places it knows."""
     if promise is None:
@@ -135,17 +128,3 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     good = np.isfinite(level)
     rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
     return fit_powers(rows, asking.site, "constant")[0].exact()
-
-
-def _queries(asking: Predictor, places: np.ndarray, other: Sequence[float] | None, width: int) -> np.ndarray:
-    """Local places (S, D) as the process has them."""
-    site: Site = asking.site
-    local = places - site.origin
-    if width == 3:
-        return local
-    still = site.static_position
-    if still is None and other is None:
-        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    still = np.asarray(other, np.float64) - site.origin if still is None else still
-    both = np.broadcast_to(still, local.shape), local
-    return np.hstack(both[::-1] if site.static_end == "rx" else both)

@@ -23,7 +23,7 @@ from gsparc.evaluation.from_above import (
     scale_bar,
 )
 from gsparc.maps.area import Grid
-from gsparc.maps.field_map import REFUSED, FieldMap
+from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.placing import Placing
 from gsparc.maps.planning import Plan
@@ -75,17 +75,16 @@ def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
     """
     several = len(found.stations) > 1
     of = " of the strongest station" if several else ""
-    yield Layer("power", f"received power{of} [{unit}]", found.strongest(found.power_db))
+    yield Layer("power", f"received power{of} [{unit}]", found.layer("power_db"))
     if several:
-        values = np.where(found.best_server == REFUSED, np.nan, found.best_server.astype(float))
         doubt = (found.unsure, UNSURE) if found.unsure.any() else None
-        yield Layer("best_server", "strongest station", values, words=found.stations, unsure=doubt)
+        best = found.layer("best_server")
+        yield Layer("best_server", "strongest station", best, words=found.stations, unsure=doubt)
     if np.isfinite(found.sinr_db).any():
         yield Layer("sinr", "signal over interference and noise [dB]", found.sinr_db)
     level = f"{found.threshold_db:g} {unit}"
     yield Layer("outage", f"probability of less than {level}", found.outage, "magma_r", (0.0, 1.0))
-    error = found.strongest(found.expected_error_db)
-    yield Layer("expected_error", "expected error [dB]", error, "cividis")
+    yield Layer("expected_error", "expected error [dB]", found.layer("expected_error_db"), "cividis")
     width = found.strongest(found.upper_db - found.lower_db)
     yield Layer("width", f"width of the {found.share:.0%} interval [dB]", width, "cividis")
     for name, label, colours, limits in (

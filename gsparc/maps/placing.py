@@ -11,11 +11,11 @@ from scipy.stats import norm
 
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
-from gsparc.data.schema import End, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.maps.area import Grid
 from gsparc.maps.intervals import Evidence
-from gsparc.maps.making import levels_of, map_of
+from gsparc.maps.making import levels_at, map_of
 from gsparc.maps.planning import coarse_grid, walkable_places
 from gsparc.maps.promise import Promise, evidence_of, without
 from gsparc.models.method import Method
@@ -193,8 +193,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
 
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] of a station at `place` (3,) in cells (n, 3)."""
-    static: End = predictor.site.static_end or "tx"
-    level, spread = levels_of(predictor, lambda part: {static: place, predictor.site.moving_end: part}, cells)
+    level, spread = levels_at(predictor, cells, station=place)
     return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 

@@ -9,7 +9,6 @@ import torch
 from small_worlds import LAW, fold, rows, smooth, spread, trend
 
 from gsparc.data.own import from_arrays
-from gsparc.maps import covariance
 from gsparc.models.baselines import gp
 from gsparc.models.left_out_images import predict_left_out
 from gsparc.models.powers import settings as power_settings
@@ -82,7 +81,7 @@ def _powers(kernel: Kernel, law: Law | None, quiet: int) -> Arrays:
     return {
         "mean": mean.numpy(), "variance": variance.numpy(), "unknown": unknown.numpy(),
         "slope": at.grad.numpy(), "given": process.posterior.values()[:, 0].numpy(),
-        "covariance": covariance.posterior(process, QUERIES),
+        "covariance": process.posterior.covariance(torch.from_numpy(QUERIES)).numpy(),
     }  # fmt: skip
 
 
