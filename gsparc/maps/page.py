@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment
-from matplotlib import colormaps
 from PIL import Image
 
 from gsparc.data.files import whole_file
 from gsparc.evaluation.from_above import MOST_POINTS
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.pictures import Layer, class_colours
+from gsparc.maps.pictures import Layer
 
 MOST_CELLS = 600  # along a side: the page shows every n-th cell of larger maps
 LEVELS = 65_534  # of a value; 65535 is no value
@@ -74,17 +73,12 @@ def _encoded(layer: Layer, every: int) -> dict[str, Any]:
     code = np.full(values.shape, NOTHING, np.uint16)
     code[known] = np.round((values[known] - least) / scale).astype(np.uint16)
     low, high = layer.range()
-    if layer.words:
-        low, high = -0.5, len(layer.words) - 0.5
-        colours = class_colours(len(layer.words))
-    else:
-        colours = colormaps[layer.colours](np.linspace(0, 1, 256))
     return {
         "name": layer.name, "label": layer.label, "words": list(layer.words), "ny": values.shape[0],
         "nx": values.shape[1], "least": least, "scale": scale, "low": low, "high": high,
         "data": base64.b64encode(code.astype("<u2").tobytes()).decode(),
         "unsure": None if layer.unsure is None else _bits(layer.unsure[0][::every, ::every]),
-        "colours": (colours[:, :3] * 255).round().astype(int).tolist(),
+        "colours": (layer.table()[:, :3] * 255).round().astype(int).tolist(),
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import ListedColormap
 from matplotlib.transforms import Affine2D
 
 from gsparc.evaluation.drawing import panels, save
@@ -32,6 +32,10 @@ from gsparc.prediction.predictor import Predictor
 
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
+OF_PATHS: tuple[tuple[str, str, Any, Any], ...] = (
+    ("delay_spread_ns", "delay spread [ns]", "plasma", None),
+    ("direction_deg", "azimuth of the strongest path [degrees]", "twilight", (-180.0, 180.0)),
+)
 UNSURE = "hatched: less likely than not the strongest and above its floor"
 
 
@@ -59,11 +63,20 @@ class Layer:
 
     def range(self) -> tuple[float, float]:
         """Of the colours."""
+        if self.words:
+            return -0.5, len(self.words) - 0.5
         if self.limits is not None:
             return self.limits
         known = self.values[np.isfinite(self.values)]
         low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
         return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
+
+    def table(self) -> np.ndarray:
+        """Colours (n, 4) from the lower to the upper end of the range: of each class, or 256."""
+        if not self.words:
+            return colormaps[self.colours](np.linspace(0, 1, 256))
+        count = len(self.words)
+        return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
 
 
 def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
@@ -87,17 +100,12 @@ def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
     yield Layer("expected_error", "expected error [dB]", found.layer("expected_error_db"), "cividis")
     width = found.strongest(found.upper_db - found.lower_db)
     yield Layer("width", f"width of the {found.share:.0%} interval [dB]", width, "cividis")
-    for name, label, colours, limits in (
-        ("delay_spread_ns", "delay spread [ns]", "plasma", None),
-        ("direction_deg", "azimuth of the strongest path [degrees]", "twilight", (-180.0, 180.0)),
-    ):
+    for name, label, *colours in OF_PATHS:
         if name in found.extra:
-            yield Layer(name, label, found.extra[name], colours, limits)
-    if several:
-        for number, name in enumerate(found.stations):
-            values = found.power_db[number]
-            if np.isfinite(values).any():
-                yield Layer(f"power {name}", f"received power of {name} [{unit}]", values)
+            yield Layer(name, label, found.extra[name], *colours)
+    for name, values in zip(found.stations, found.power_db, strict=True) if several else ():
+        if np.isfinite(values).any():
+            yield Layer(f"power {name}", f"received power of {name} [{unit}]", values)
 
 
 def file_name(layer: Layer) -> str:
@@ -122,20 +130,12 @@ def draw_layer(found: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     nothing = np.where(found.refused, 1.0, np.nan)
     grey = ListedColormap(["0.82"])
     axis.imshow(nothing, origin="lower", extent=found.grid.extent, cmap=grey, zorder=1, alpha=0.6)
+    limits = dict(zip(("vmin", "vmax"), layer.range(), strict=True))
+    drawn = _cells(axis, found.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
+    ends = "neither" if layer.limits or layer.words else "both"
+    bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=layer.label)
     if layer.words:
-        count = len(layer.words)
-        norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
-        drawn = _cells(
-            axis, found.grid, layer.values, plan, cmap=ListedColormap(class_colours(count)), norm=norm
-        )
-        bar = figure.colorbar(drawn, ax=axis, ticks=np.arange(count), shrink=0.85, pad=0.02)
-        bar.ax.set_yticklabels(layer.words)
-    else:
-        limits = dict(zip(("vmin", "vmax"), layer.range(), strict=True))
-        drawn = _cells(axis, found.grid, layer.values, plan, cmap=layer.colours, **limits)
-        ends = "neither" if layer.limits else "both"
-        bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends)
-    bar.set_label(layer.label)
+        bar.set_ticks(np.arange(len(layer.words)), labels=layer.words)
     if layer.unsure is not None:
         _hatch(axis, found, *layer.unsure)
     bounded(axis, (left, low), (right, high), title=title)
@@ -168,7 +168,7 @@ def draw_plan(axis: Any, plan: FloorPlan) -> None:
     """The floor plan, where it lies."""
     height, width = plan.image.shape[:2]
     a, b, c, d, e, f = plan.matrix()
-    turn = Affine2D(np.array([[a, c, e], [b, d, f], [0, 0, 1]])) + axis.transData
+    turn = Affine2D.from_values(a, b, c, d, e, f) + axis.transData
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 
@@ -183,11 +183,6 @@ def draw_places(axis: Any, found: FieldMap) -> None:
     if 1 < len(known) <= NAMED:
         for where, name in zip(known[inside], np.array(found.stations)[inside], strict=True):
             annotate(axis, name, where)
-
-
-def class_colours(count: int) -> np.ndarray:
-    """Colours (count, 4) of a layer of classes."""
-    return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
 
 
 def draw_plan_picture(

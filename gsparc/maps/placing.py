@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.stats import norm
@@ -23,7 +23,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
 Goal = Literal["coverage", "worst"]
-GOALS = ("coverage", "worst")
+GOALS = get_args(Goal)
 DECILE = 0.1
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out

@@ -181,7 +181,7 @@ def coarse_grid(
 def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
     """Places (n, 3) in polygons or along lines of a file."""
     left, right, south, north = grid.extent
-    shapes: Shapes = read_shapes(path, key, origin, "either", max(right - left, north - south))
+    shapes: Shapes = read_shapes(path, key, origin, True, max(right - left, north - south))
     found = [np.zeros((0, 2))]
     if shapes.polygons:
         low, high = (np.array(v) for v in Shapes(shapes.polygons, ()).bounds())
