@@ -143,12 +143,15 @@ def own_deviations(share: float) -> Calibration:
 
 
 def answering(
-    predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None
+    predictor: Predictor,
+    wanted: Sequence[str | int] | None,
+    promise: Promise | None = None,
+    key: str = "stations",
 ) -> tuple[list[str], list[str]]:
-    """Names of the stations that are mapped, and what must be said of the others.
+    """Names of the stations that are mapped, and notes on the others.
 
     Those are stations that the model does not answer for, and, where something is promised, stations that it
-    never heard: what was held out tells nothing of them.
+    never heard: what was held out tells nothing of them. `key` is the setting that `wanted` comes from.
 
     Raises:
         DataError: one of them was asked for, or none is left.
@@ -157,14 +160,14 @@ def answering(
     if stations is None:
         if wanted is not None:
             raise DataError(
-                f"stations={list(wanted)}: the model of {predictor.site.name} has one; leave it out"
+                f"{key}={list(wanted)}: the model of {predictor.site.name} has no stations; leave it out"
             )
         return [""], []
     names: list[str] = []
     for one in wanted if wanted is not None else stations.name:
         number = station_number(one, stations.name, len(stations))
         if number is None:
-            raise DataError(f"stations: no station {one!r}{suggest(str(one), stations.name)}")
+            raise DataError(f"{key}: no station {one!r}{suggest(str(one), stations.name)}")
         names.append(stations.name[number])
     if not names:
         raise DataError("stations=[]: name one at least, or all")

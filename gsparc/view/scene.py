@@ -131,9 +131,9 @@ class Legend:
         low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
         return cls(label, float(low), float(high if high > low else low + 1.0), colours)
 
-    def strip(self, count: int = 64) -> np.ndarray:
-        """Colours (count, 3) uint8 from low to high."""
-        return self.of(np.linspace(self.low, self.high, count))
+    def strip(self) -> np.ndarray:
+        """Colours (16, 3) uint8 from low to high."""
+        return self.of(np.linspace(self.low, self.high, 16))
 
 
 @dataclass(frozen=True)

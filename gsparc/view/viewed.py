@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.errors import DataError
-from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import open_files
 from gsparc.maps import levels
+from gsparc.maps.making import answering
 from gsparc.models import loading
 from gsparc.models.reduced import reduced
 from gsparc.prediction.confidence import Trusted
@@ -200,32 +199,8 @@ def open_viewed(
         ways.append(Predictor(lean, site, whole, point, sure, None, stored.extra))
     complete = min((one for one in points if not one.settings), key=lambda one: one.p50_ms, default=None)
     ways.append(Predictor(method, site, point=complete, trusted=trusted, extra=stored.extra))
-    return Viewed(
-        str(path), tuple(ways), data, test, _stations(ways[-1], station), tuple(notes),
-        unit or site.level_unit,
-    )  # fmt: skip
-
-
-def _stations(predictor: Predictor, wanted: str | int | None) -> tuple[str | None, ...]:
-    stations = predictor.site.stations
-    if stations is None:
-        if wanted is not None:
-            raise DataError(
-                f"station={wanted}: the model of {predictor.site.name} has no stations; leave it out"
-            )
-        return (None,)
-    if wanted is not None:
-        number = station_number(wanted, stations.name, len(stations))
-        if number is None:
-            raise DataError(f"station={wanted}: there is none; there are {', '.join(stations.name)}")
-        return (stations.name[number],)
-    found = []
-    for name in stations.name:
-        try:
-            predictor.at(name)
-            found.append(name)
-        except ValueError as error:
-            log.warning("%s is left out: %s", name, error)
-    if not found:
-        raise DataError("the model answers for none of its stations")
-    return tuple(found)
+    names, missing = answering(ways[-1], None if station is None else [station], key="station")
+    for note in missing:
+        log.warning(note)
+    stations = tuple(name or None for name in names)
+    return Viewed(str(path), tuple(ways), data, test, stations, tuple(notes), unit or site.level_unit)
