@@ -45,8 +45,8 @@ class ErrorCovariance:
 
     def gains(self, targets: np.ndarray) -> np.ndarray:
         """What a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
-        told = (self.weight * targets) @ self.covariance**2
-        return told / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
+        explained = (self.weight * targets) @ self.covariance**2
+        return explained / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
 
     def variances(self) -> np.ndarray:
         """Of a measurement's error at each place (S,), as held-out blocks scale it."""

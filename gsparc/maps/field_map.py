@@ -37,7 +37,7 @@ class FieldMap:
         sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
         outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
         share: of measurements that the intervals hold; the field alone lies in them more often.
-        calibrated: whether held-out blocks say so; else the model's own deviations alone.
+        calibrated: whether arrays-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
         extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`.
         places: (n, 2) where was measured, world [m].
@@ -106,19 +106,19 @@ class FieldMap:
         """
         try:
             with np.load(path, allow_pickle=False) as stored:
-                held = {name: stored[name] for name in stored.files}
-            x, y, inside = held.pop("x"), held.pop("y"), held.pop("inside")
+                arrays = {name: stored[name] for name in stored.files}
+            x, y, inside = arrays.pop("x"), arrays.pop("y"), arrays.pop("inside")
             step = float(x[1] - x[0]) if len(x) > 1 else float(y[1] - y[0]) if len(y) > 1 else 1.0
-            grid = Grid(x, y, float(held.pop("height")), step, inside)
-            names = tuple(str(name) for name in held.pop("stations"))
-            facts: dict[str, Any] = {name: held.pop(name) for name in ARRAYS}
+            grid = Grid(x, y, float(arrays.pop("height")), step, inside)
+            names = tuple(str(name) for name in arrays.pop("stations"))
+            facts: dict[str, Any] = {name: arrays.pop(name) for name in ARRAYS}
             for name, kind in (("share", float), ("calibrated", bool), ("threshold_db", float)):
-                facts[name] = kind(held.pop(name))
+                facts[name] = kind(arrays.pop(name))
         except FileNotFoundError:
             raise DataError(f"map={path}: no such file; expected map.npz of gsparc map") from None
         except (KeyError, ValueError, OSError, EOFError, BadZipFile):
             raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
-        return cls(grid=grid, stations=names, extra=held, **facts)
+        return cls(grid=grid, stations=names, extra=arrays, **facts)
 
     def figures(self) -> dict[str, float | int | None]:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""
@@ -224,18 +224,18 @@ def loads(given: float | Sequence[float] | Mapping[str, float], stations: Sequen
     return np.broadcast_to(values, (len(stations),))
 
 
-def geotiff_wanted(asked: bool | None, origin: Georeference | None) -> bool:
+def geotiff_wanted(wanted: bool | None, origin: Georeference | None) -> bool:
     """Whether a GeoTIFF is written; None: where it can be.
 
     Raises:
         DataError: it is asked for, and cannot be.
     """
     there = find_spec("rasterio") is not None
-    if asked and origin is None:
+    if wanted and origin is None:
         raise DataError("geotiff=true: positions were in metres about an unknown origin, not in degrees")
-    if asked and not there:
+    if wanted and not there:
         raise DataError("geotiff=true: needs rasterio; pip install 'gsparc[maps]'")
-    return there and origin is not None and asked is not False
+    return there and origin is not None and wanted is not False
 
 
 def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> None:

@@ -187,8 +187,8 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         every = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:
         every = grid.places()
-    kept = every[np.unique(np.linspace(0, len(every) - 1, min(count, len(every))).astype(int))]
-    return np.column_stack([kept[:, :2], np.full(len(kept), height)])
+    few = every[np.unique(np.linspace(0, len(every) - 1, min(count, len(every))).astype(int))]
+    return np.column_stack([few[:, :2], np.full(len(few), height)])
 
 
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

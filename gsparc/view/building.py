@@ -89,7 +89,7 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
             named = len(viewed.stations) <= MOST_NAMES or name == station
             text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
             parts.append(Mark(f"station {name or ''}".strip(), place, text))
-    objects = viewed.asked(station).method.objects()
+    objects = viewed.predictor_of(station).method.objects()
     origin = viewed.site.origin
     parts += [
         _mesh(f"mirror {number}", [_square(plane, frame.middle - origin, extent) + origin], MIRROR, 0.12)
@@ -169,7 +169,7 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
 @torch.no_grad()
 def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
     """Gaussians in world coordinates: those that are rendered, or those that paths lose power in."""
-    predictor = viewed.asked(station)
+    predictor = viewed.predictor_of(station)
     method, site = predictor.method, predictor.site
     if isinstance(method, HasGaussians):
         try:

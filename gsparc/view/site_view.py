@@ -93,7 +93,7 @@ class SiteView:
             levels = values if viewed.site.kind in MAPPED else np.full(len(values), np.nan)
             known = usual(measured.places, levels, viewed.others(name))
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        objects, origin = viewed.asked(name).method.objects(), viewed.site.origin
+        objects, origin = viewed.predictor_of(name).method.objects(), viewed.site.origin
         faces = () if self.given.walls is None else self.given.walls.faces
         boxes = objects.boxes + origin
         if self.given.walls is not None:
@@ -126,7 +126,7 @@ class SiteView:
     def plane(self, name: str | None, grid: Grid) -> Plane:
         """Power over all of some cells, the transmitter where it first stands if both ends move."""
         other = None if self.viewed.site.static_end is not None else self.starts(name)["tx"].tolist()
-        *_, plane = refining(self.viewed.asked(name), grid, other)
+        *_, plane = refining(self.viewed.predictor_of(name), grid, other)
         assert plane is not None
         return plane
 

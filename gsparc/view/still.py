@@ -38,7 +38,7 @@ def draw_still(view: SiteView, path: Path) -> None:
     """
     name = view.viewed.stations[0]
     one, viewed = view.station(name), view.viewed
-    answer = ask(viewed.asked(name), view.starts(name))
+    answer = ask(viewed.predictor_of(name), view.starts(name))
     figure, axes = panels(WIDTH, HEIGHT, 1, 2, width_ratios=[1.6, 1.0])
     place = axes[0, 0].get_subplotspec()
     axes[0, 0].remove()

@@ -19,7 +19,7 @@ from gsparc.models import loading
 from gsparc.models.reduced import reduced
 from gsparc.prediction.confidence import Trusted
 from gsparc.prediction.confidence import kept as trusted_of
-from gsparc.prediction.operating_point import kept
+from gsparc.prediction.operating_point import stored_points
 from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
@@ -87,8 +87,8 @@ class Viewed:
         """Ends that can be dragged."""
         return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
 
-    def asked(self, station: str | None, way: int = -1) -> Predictor:
-        """Who answers for a station."""
+    def predictor_of(self, station: str | None, way: int = -1) -> Predictor:
+        """Of a station, at one of the operating points."""
         return self.ways[way] if station is None else self.ways[way].at(station)
 
     def still(self, station: str | None) -> np.ndarray | None:
@@ -139,10 +139,10 @@ class Viewed:
             what = "received power" if data.site.kind == "rssi" else "power of a channel"
             label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
         errors = np.full(len(rows), np.nan)
-        held = np.flatnonzero(np.isin(rows, self.test))
-        held = held[np.linspace(0, len(held) - 1, min(len(held), MOST_ERRORS)).astype(int)]
-        for start in range(0, len(held), CHUNK):
-            part = held[start : start + CHUNK]
+        tested = np.flatnonzero(np.isin(rows, self.test))
+        tested = tested[np.linspace(0, len(tested) - 1, min(len(tested), MOST_ERRORS)).astype(int)]
+        for start in range(0, len(tested), CHUNK):
+            part = tested[start : start + CHUNK]
             errors[part] = _errors(self.predictor, data, rows[part], values[part])
         return Measured(places, values, label, errors, error_label)
 
@@ -151,11 +151,11 @@ class Viewed:
 def _errors(predictor: Predictor, data: Measurements, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Of rows (n,): |difference of levels| [dB], or PSNR [dB] of spectra."""
     batch = data.batch(rows)
-    said = predictor.method.answer(batch)
+    prediction = predictor.method.answer(batch)
     if data.site.kind == "spectrum":
-        square = (said.mean - batch.target).square().flatten(1).mean(1).double().numpy()
+        square = (prediction.mean - batch.target).square().flatten(1).mean(1).double().numpy()
         return -10 * np.log10(np.maximum(square, LEAST_RATIO))
-    mean = replace(said, variance=None)
+    mean = replace(prediction, variance=None)
     return np.abs(levels.predicted(mean, data.site.kind, data.site.target_scale)[0] - values)
 
 
@@ -190,13 +190,13 @@ def open_viewed(
         method, stored = loading.load(path)
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
     site, trusted = stored.site, trusted_of(stored.extra)
-    points, measured = kept(stored.extra)
+    points, measured = stored_points(stored.extra)
     ways = []
     for point in sorted((point for point in points if point.settings), key=lambda point: point.p50_ms):
-        lean, whole, sure = reduced(method, point.settings, measured), method, trusted
+        lean, whole, confidence = reduced(method, point.settings, measured), method, trusted
         if point.settings.get("confidence") is False:
-            whole, sure = lean, Trusted()
-        ways.append(Predictor(lean, site, whole, point, sure, None, stored.extra))
+            whole, confidence = lean, Trusted()
+        ways.append(Predictor(lean, site, whole, point, confidence, None, stored.extra))
     complete = min((one for one in points if not one.settings), key=lambda one: one.p50_ms, default=None)
     ways.append(Predictor(method, site, point=complete, trusted=trusted, extra=stored.extra))
     names, missing = answering(ways[-1], None if station is None else [station], key="station")

@@ -18,7 +18,7 @@ from gsparc.view.viewed import open_viewed
 
 def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
     name, grid = power_view.viewed.stations[0], power_view.grid
-    asked = power_view.viewed.asked(name)
+    asked = power_view.viewed.predictor_of(name)
     planes = [plane for plane in refining(asked, grid) if plane is not None]
     assert [plane.stride for plane in planes] == [2, 1]
     assert all(np.isfinite(plane.level_db).all() for plane in planes)
@@ -43,7 +43,7 @@ def test_what_distance_explains_is_taken_off_a_plane(power_view):
 
 
 def test_a_lifted_plane_is_asked_at_its_height(power_view):
-    asked = power_view.viewed.asked(power_view.viewed.stations[0])
+    asked = power_view.viewed.predictor_of(power_view.viewed.stations[0])
     high = replace(thinned(power_view.grid, 10), height=6.0)
     *_, plane = refining(asked, high)
     assert (high.places()[:, 2] == 6.0).all() and max(high.shape) <= 11
@@ -67,7 +67,7 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
 def test_a_plane_of_channels_has_the_level_that_answers_have(tmp_path):
     """It was of the mean alone: up to 24 dB below the answer where the mean fades and the error does not."""
     viewed = open_viewed(trained(channels(tmp_path / "room.npz", shape="S"), "gp"))
-    *_, plane = refining(viewed.asked(None), grid_for(viewed, {"step_m": 0.5}))
-    said = [ask(viewed.asked(None), {"rx": place}) for place in plane.grid.places()]
+    *_, plane = refining(viewed.predictor_of(None), grid_for(viewed, {"step_m": 0.5}))
+    said = [ask(viewed.predictor_of(None), {"rx": place}) for place in plane.grid.places()]
     assert any(one.response is not None and one.spread_db > 2 for one in said)
     np.testing.assert_allclose(plane.level_db[plane.grid.inside], [one.level_db for one in said], atol=1e-3)

@@ -38,10 +38,10 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
     power = np.square(np.abs(found.gain[:, 0].astype(np.complex128)))
     order = np.argsort(-power, axis=1)[:, :PATHS]
 
-    def kept(value: np.ndarray) -> np.ndarray:
+    def top(value: np.ndarray) -> np.ndarray:
         return np.take_along_axis(value, order.reshape(order.shape + (1,) * (value.ndim - 2)), 1)
 
-    strongest, towards, delay = kept(power), kept(found.direction), kept(found.delay_s[:, 0])
+    strongest, towards, delay = top(power), top(found.direction), top(found.delay_s[:, 0])
     away = LIGHT * delay[..., None] * towards  # from a place to the source
     normal = place[:, None] + away - still
     apart = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -55,7 +55,7 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
     silent = strongest <= 0
     arrays = {
         "power": 10 * np.log10(np.where(silent, np.nan, strongest)), "delay": delay,
-        "phase": np.degrees(np.angle(kept(found.gain[:, 0]))), "inter": np.where(direct, 0.0, 1.0),
+        "phase": np.degrees(np.angle(top(found.gain[:, 0]))), "inter": np.where(direct, 0.0, 1.0),
         "inter_pos": meets[:, :, None],
     }  # fmt: skip
     for name, one in (("aoa", towards), ("aod", leaves)):

@@ -66,7 +66,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             legends += more
         sphere, extent = view.sphere(name), view.extent(name)
         for place in walk(view, name, steps // len(names)):
-            answer = ask(viewed.asked(name), {**view.starts(name), moving: place})
+            answer = ask(viewed.predictor_of(name), {**view.starts(name), moving: place})
             dot.position = scene.frame.drawn(place)
             label.text = (f"{name}: " if len(names) > 1 else "") + headline(answer, view.unit)
             parts: list[Part] = list(rays_of(answer, extent) or ())

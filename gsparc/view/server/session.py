@@ -313,7 +313,7 @@ class Session:
         if threads != torch.get_num_threads():
             torch.set_num_threads(threads)
         try:
-            answer = ask(self.view.viewed.asked(self.station, way), places)
+            answer = ask(self.view.viewed.predictor_of(self.station, way), places)
         except ValueError as error:
             self.said.content = f"**{error}**"
             return
@@ -414,7 +414,7 @@ class Session:
         yield
 
     def _predicted_plane(self, grid: Grid, beyond: bool) -> Iterator[None]:
-        predictor = self.view.viewed.asked(self.station)
+        predictor = self.view.viewed.predictor_of(self.station)
         other = self.places["tx"] if self.site.static_end is None else None
         known, there = self.one.about.usual, self._still()
         legend, begin = None if beyond else self.one.power, time.perf_counter()
