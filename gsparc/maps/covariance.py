@@ -60,14 +60,9 @@ def unknown_of(
     promise: Promise | None,
     other_end: Sequence[float] | None = None,
 ) -> list[ErrorCovariance]:
-    """Of every station, as the model's own process says, or one fitted to what the model predicts.
+    """At world places (S, 3) [m] of every station, by the model's process, or one of what it predicts.
 
-    Args:
-        predictor: of powers.
-        places: (S, 3) world [m].
-        stations: names; [""] where there is one.
-        promise: evidence of held-out blocks; None: variances as the model states them.
-        other_end: see `map_of`.
+    Held-out blocks of `promise` scale the variances.
 
     Raises:
         DataError: the model has neither a process nor known places.
@@ -97,11 +92,8 @@ def unknown_of(
 
 
 def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
-    """The same where nothing was measured: shadowing of one length about a level nobody knows.
-
-    Args:
-        places: (S, 3) [m].
-        length_m: over which powers are alike; None: `SHARE_OF_SIDE` of the longer side.
+    """The same where nothing was measured: shadowing about a level nobody knows, alike over
+    `length_m`, else `SHARE_OF_SIDE` of the longer side of places (S, 3) [m].
     """
     length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)
     variance = SHADOWING_DB**2

@@ -33,16 +33,7 @@ def write_page(
     lines: Sequence[str],
     plan: FloorPlan | None,
 ) -> None:
-    """Write a page that needs nothing but itself.
-
-    Args:
-        path: HTML file.
-        found: the map.
-        drawn: its layers.
-        title: of the page.
-        lines: what a reader must know.
-        plan: beneath the map.
-    """
+    """Write an HTML page of layers that needs nothing but itself; `lines` are what a reader must know."""
     every = max(1, -(-max(found.grid.shape) // MOST_CELLS))
     text = files("gsparc.maps").joinpath("page.html.j2").read_text(encoding="utf-8")
     left, right, low, high = found.grid.extent

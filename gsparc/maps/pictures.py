@@ -80,12 +80,7 @@ class Layer:
 
 
 def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
-    """Every layer of a map that says something; of several stations, also the power of each.
-
-    Args:
-        found: the map.
-        unit: of powers: `dBm` where they are.
-    """
+    """Every layer of a map that says something; of several stations, also the power of each, in `unit`."""
     several = len(found.stations) > 1
     of = " of the strongest station" if several else ""
     yield Layer("power", f"received power{of} [{unit}]", found.layer("power_db"))
@@ -114,15 +109,7 @@ def file_name(layer: Layer) -> str:
 
 
 def draw_layer(found: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
-    """Save one layer.
-
-    Args:
-        found: the map.
-        layer: of it.
-        path: PNG file.
-        title: above.
-        plan: beneath.
-    """
+    """Save one layer as PNG, over a floor plan."""
     left, right, low, high = found.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)

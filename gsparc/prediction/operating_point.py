@@ -74,11 +74,6 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
 
     Sets torch's number of threads to the point's.
 
-    Args:
-        method: as stored.
-        stored: its checkpoint.
-        budget_ms: for one query end to end [ms].
-
     Raises:
         ValueError: the budget is no positive number, or nothing fits; the fastest point is named.
     """

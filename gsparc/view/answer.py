@@ -62,11 +62,7 @@ class Rays:
 
 
 def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
-    """Ask about one place (two where both ends move).
-
-    Args:
-        predictor: of one station where there are several.
-        ends: world places (3,) [m] of the ends that move.
+    """Predict at world places (3,) [m] of the ends that move, of one station where there are several.
 
     Raises:
         ValueError: a place that cannot be.

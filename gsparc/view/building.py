@@ -58,14 +58,7 @@ class Given:
 
 
 def build(viewed: Viewed, given: Given, station: str | None, measured: Measured | None) -> Scene:
-    """Everything that stands still, seen from one station.
-
-    Args:
-        viewed: the model.
-        given: what else is known.
-        station: whose measurements and Gaussians are drawn.
-        measured: of that station.
-    """
+    """Everything that stands still, with the measurements and the Gaussians of one station."""
     shown = [viewed.box()]  # where was measured, and the ends that stand
     shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
     if viewed.site.static_end is None:

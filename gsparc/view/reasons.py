@@ -86,13 +86,7 @@ class Surroundings:
 
 
 def reasons(answer: Answer, moving: str, about: Surroundings) -> list[str]:
-    """Why the level is what it is, one line each.
-
-    Args:
-        answer: at a place.
-        moving: the end that was dragged.
-        about: what is known there.
-    """
+    """Why the level is what it is, one line each; `moving` is the end that was dragged."""
     here, there = answer.ends[moving], answer.ends.get("rx" if moving == "tx" else "tx")
     lines = _among(answer, about.values)
     if there is not None:

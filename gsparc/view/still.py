@@ -30,12 +30,7 @@ FLATTEST = 0.2  # of height to width, that a flat site is drawn with
 
 
 def draw_still(view: SiteView, path: Path) -> None:
-    """Save the scene of the first station with the answer at the first place as PNG.
-
-    Args:
-        view: the model.
-        path: of the file.
-    """
+    """Save the scene of the first station with the answer at the first place as PNG."""
     name = view.viewed.stations[0]
     one, viewed = view.station(name), view.viewed
     answer = ask(viewed.predictor_of(name), view.starts(name))

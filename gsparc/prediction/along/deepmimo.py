@@ -15,15 +15,10 @@ DIRECT_M = 0.1  # a source so near the static end is that end
 
 
 def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, float]:
-    """Write a scenario: the static end is DeepMIMO's transmitter, places are its receivers.
+    """Write a scenario: the static end is DeepMIMO's transmitter, places (n, 3) [m, world] are receivers.
 
     A source that is not the static end is given as one reflection, in the plane that mirrors the one into the
     other: directions and delays are the source's, points of several reflections are not.
-
-    Args:
-        folder: there.
-        predictor: whose channels are made of paths, of one static end whose place is known.
-        place: (n, 3) [m, world] of the moving end.
 
     Returns: the most paths of a place, and the share of power that those beyond `PATHS` have.
 

@@ -17,10 +17,6 @@ class TrajectoryChannel(ChannelModel):
 
     >>> channel = OFDMChannel(TrajectoryChannel("model-sionna/cir.npz"), resource_grid)
 
-    Args:
-        path: the file.
-        seed: of the times at which stretches begin.
-
     Raises:
         ValueError: a batch longer than the trajectory.
     """

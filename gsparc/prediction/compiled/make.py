@@ -52,12 +52,7 @@ class Compiled:
 
 
 def compiled(predictor: Predictor, count: int = 256, seed: int = 0) -> Compiled:
-    """The form of a model of one station.
-
-    Args:
-        predictor: of the model.
-        count: random places that a distilled form's error is measured at.
-        seed: of places.
+    """The form of a model of one station; its error is measured at `count` random places.
 
     Raises:
         ValueError: no form answers as this model does, or it is of several stations.

@@ -51,13 +51,7 @@ LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
 
 
 class Session:
-    """Everything of one client; callbacks only note what is wanted, a `LatestJobQueue` does it.
-
-    Args:
-        client: of viser.
-        view: what all clients share.
-        work: does what is asked.
-    """
+    """Everything of one client; callbacks only note what is wanted, a `LatestJobQueue` does it."""
 
     def __init__(self, client: Any, view: SiteView, work: LatestJobQueue, threads: int) -> None:
         self.client, self.view, self.work, self.threads = client, view, work, threads
