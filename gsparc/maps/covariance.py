@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.maps.making import levels_at, local_of
 from gsparc.maps.promise import Promise
@@ -112,7 +113,7 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     own = promise.known[promise.station == number]
     if not len(own):
         own = promise.known
-    own = own[np.linspace(0, len(own) - 1, min(len(own), LEARNED)).astype(int)]
+    own = own[evenly(len(own), LEARNED)]
     if own.shape[1] == 6:
         raise DataError(f"{asking.method.name} states no covariance; plan for models of one moving end")
     world = own + asking.site.origin

@@ -13,6 +13,7 @@ import numpy as np
 from jinja2 import Environment
 from PIL import Image
 
+from gsparc.data.blocks import evenly
 from gsparc.data.files import whole_file
 from gsparc.evaluation.from_above import MOST_POINTS
 from gsparc.maps.field_map import FieldMap
@@ -37,7 +38,7 @@ def write_page(
     every = max(1, -(-max(found.grid.shape) // MOST_CELLS))
     text = files("gsparc.maps").joinpath("page.html.j2").read_text(encoding="utf-8")
     left, right, low, high = found.grid.extent
-    few = found.places[np.linspace(0, len(found.places) - 1, min(len(found.places), MOST_POINTS)).astype(int)]
+    few = found.places[evenly(len(found.places), MOST_POINTS)]
     stations = [
         {"name": name, "x": float(x), "y": float(y)}
         for name, (x, y) in zip(found.stations, found.station_place, strict=True)

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.stats import norm
 
+from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.schema import Measurements
@@ -187,7 +188,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         every = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:
         every = grid.places()
-    few = every[np.unique(np.linspace(0, len(every) - 1, min(count, len(every))).astype(int))]
+    few = every[evenly(len(every), count)]
     return np.column_stack([few[:, :2], np.full(len(few), height)])
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from gsparc.data.blocks import evenly
 from gsparc.data.schema import Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import SceneWalls, box_faces
@@ -17,6 +18,7 @@ from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.levels import MAPPED
 from gsparc.models.method import HasGaussians
 from gsparc.ops import Pose
+from gsparc.physics.waves import LIGHT
 from gsparc.view.answer import SILENT_DB, Answer
 from gsparc.view.crossed import fans
 from gsparc.view.scene import EXTENT, Faces, Frame, Legend, Lines, Mark, Part, Points, Scene, Sheet, Splats
@@ -114,7 +116,7 @@ def ground_of(viewed: Viewed, given: Given) -> float:
 
 
 def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
-    chosen = np.linspace(0, len(measured.places) - 1, min(len(measured.places), MOST_POINTS)).astype(int)
+    chosen = evenly(len(measured.places), MOST_POINTS)
     places, values = measured.places[chosen], measured.values[chosen]
     size = dot_size(places, extent)
     legends[VALUES] = Legend.over(measured.label, values)
@@ -269,7 +271,7 @@ def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     paths, receiver = answer.paths, answer.ends.get("rx")
     if paths is None or paths.towards is None or receiver is None:
         return None
-    length = paths.delay_ns * 0.299792458
+    length = paths.delay_ns * 1e-9 * LIGHT
     shown = np.minimum(length, REACH * extent)
     ends = receiver + paths.towards * shown[:, None]
     colours = PATHS.of(paths.gain_db - paths.gain_db.max(initial=-np.inf))

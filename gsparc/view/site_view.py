@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.blocks import evenly
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.levels import MAPPED
@@ -145,4 +146,4 @@ def walk(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
         low, high = view.viewed.box()
         return [low + (high - low) * share for share in np.linspace(0.1, 0.9, count)]
     places = measured.places
-    return list(places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)])
+    return list(places[evenly(len(places), count)])

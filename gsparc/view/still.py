@@ -13,6 +13,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from gsparc.data.blocks import evenly
 from gsparc.evaluation.drawing import panels, save
 from gsparc.view.answer import ask
 from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
@@ -89,7 +90,7 @@ def _dots(axis: Any, part: Points, low: np.ndarray, high: np.ndarray) -> None:
     inside = np.flatnonzero(((part.places >= low) & (part.places <= high)).all(axis=1))
     if part.name not in (VALUES, GAUSSIANS, SOURCES) or not len(inside):
         return
-    few = inside[np.linspace(0, len(inside) - 1, min(len(inside), MOST_DOTS)).astype(int)]
+    few = inside[evenly(len(inside), MOST_DOTS)]
     how = {"alpha": 0.4, "s": 9} if part.name == GAUSSIANS else {"alpha": 0.9, "s": 6}
     axis.scatter(
         *part.places[few].T, c=part.colours[few] / 255, linewidths=0, depthshade=False, zorder=3, **how

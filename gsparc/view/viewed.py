@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.data.blocks import evenly
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import open_files
 from gsparc.maps import levels
@@ -140,7 +141,7 @@ class Viewed:
             label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
         errors = np.full(len(rows), np.nan)
         tested = np.flatnonzero(np.isin(rows, self.test))
-        tested = tested[np.linspace(0, len(tested) - 1, min(len(tested), MOST_ERRORS)).astype(int)]
+        tested = tested[evenly(len(tested), MOST_ERRORS)]
         for start in range(0, len(tested), CHUNK):
             part = tested[start : start + CHUNK]
             errors[part] = _errors(self.predictor, data, rows[part], values[part])

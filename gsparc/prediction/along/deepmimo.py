@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.prediction.along.taps import LIGHT, located_paths
+from gsparc.physics.waves import LIGHT
+from gsparc.prediction.along.taps import located_paths
 from gsparc.prediction.predictor import Predictor
 
 PATHS = 25  # that a DeepMIMO scenario has at most

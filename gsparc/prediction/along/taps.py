@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from gsparc.physics.waves import LIGHT
 from gsparc.prediction.export import Paths
 from gsparc.prediction.predictor import Predictor
 
-LIGHT = 299_792_458.0
 PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs
 MOST = 50_000  # instants
 CHUNK = 64  # places that the model answers at once

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from gsparc.physics.waves import LIGHT
 from gsparc.prediction.along import deepmimo
-from gsparc.prediction.along.taps import LIGHT
 from gsparc.prediction.export import Paths
 
 CARRIER = 3.5e9

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hydra import compose, initialize_config_module
+from campaigns import compose
 
 import gsparc
 from gsparc.commands import export
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.models import checkpoint
+from gsparc.physics.waves import LIGHT
 from gsparc.prediction.along import emulators
-from gsparc.prediction.along.taps import LIGHT, Trajectory, fitted
+from gsparc.prediction.along.taps import Trajectory, fitted
 from gsparc.prediction.export import Paths
 
 CARRIER = 3.5e9
@@ -165,8 +166,7 @@ def test_the_command_writes_all_and_checks_them(tmp_path, monkeypatch):
     monkeypatch.setattr(export, "run_directory", lambda: tmp_path)
 
     def run(*given):
-        with initialize_config_module("gsparc.conf", version_base=None):
-            return export.task(compose("export", list(given)))
+        return export.task(compose(*given, config="export"))
 
     out, common = tmp_path / "out", (f"ckpt={tmp_path}/model.ckpt", "to=cir", f"table={tmp_path}/drive.csv")
     facts = run(*common, f"out={out}", "file=h5", "taps=4")
