@@ -114,12 +114,12 @@ def map_of(
         error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
         power, error = mean.astype(np.float32), error.astype(np.float32)
         best = best_server(power)
-        first = np.maximum(best, 0), np.arange(len(best))
+        strongest = np.maximum(best, 0), np.arange(len(best))
         part = {
             "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
             "best_server": best, "server_chance": server_chance(power, error, usual, floor),
             "sinr_db": sinr(power, load_of, noise_db),
-            "outage": calibration.below(threshold_db, power[first], error[first]),
+            "outage": calibration.below(threshold_db, power[strongest], error[strongest]),
         }  # fmt: skip
         for name, found in part.items():
             flat[name][..., cells] = found
@@ -226,10 +226,10 @@ def levels_at(
     station: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
-    parts = [
-        predicted(predictor.predict(**ends_of(predictor.site, part, other, station)), predictor.site.kind)
-        for part in _chunks(places, CHUNK)
-    ]
+    parts = []
+    for part in _chunks(places, CHUNK):
+        ends: dict[str, Any] = {**ends_of(predictor.site, part, other, station)}
+        parts.append(predicted(predictor.predict(**ends), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread
 

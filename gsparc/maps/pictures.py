@@ -122,7 +122,7 @@ def draw_layer(found: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     ends = "neither" if layer.limits or layer.words else "both"
     bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=layer.label)
     if layer.words:
-        bar.set_ticks(np.arange(len(layer.words)), labels=layer.words)
+        bar.set_ticks(list(range(len(layer.words))), labels=layer.words)
     if layer.unsure is not None:
         _hatch(axis, found, *layer.unsure)
     bounded(axis, (left, low), (right, high), title=title)

@@ -96,8 +96,8 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
         parts += _cloud_parts(cloud, legends, extent)
     hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
     faces = np.array(box_faces(*viewed.box()))
-    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
-    parts.append(Lines("box of measurements", edges, np.full((len(edges), 3), 150, np.uint8)))
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
+    parts.append(Lines("box of measurements", sides, np.full((len(sides), 3), 150, np.uint8)))
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
