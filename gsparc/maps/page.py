@@ -64,10 +64,10 @@ def _encoded(layer: Layer, every: int) -> dict[str, Any]:
     scale = (most - least) / LEVELS or 1.0
     code = np.full(values.shape, NOTHING, np.uint16)
     code[known] = np.round((values[known] - least) / scale).astype(np.uint16)
-    low, high = layer.range()
     return {
-        "name": layer.name, "label": layer.label, "words": list(layer.words), "ny": values.shape[0],
-        "nx": values.shape[1], "least": least, "scale": scale, "low": low, "high": high,
+        "name": layer.name, "label": layer.legend.label, "words": list(layer.words), "ny": values.shape[0],
+        "nx": values.shape[1], "least": least, "scale": scale,
+        "low": layer.legend.low, "high": layer.legend.high,
         "data": base64.b64encode(code.astype("<u2").tobytes()).decode(),
         "unsure": None if layer.unsure is None else _bits(layer.unsure[0][::every, ::every]),
         "colours": (layer.table()[:, :3] * 255).round().astype(int).tolist(),

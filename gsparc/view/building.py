@@ -11,17 +11,17 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsparc.data.blocks import evenly
-from gsparc.data.schema import Site
+from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.levels import MAPPED
+from gsparc.maps.pictures import Legend
 from gsparc.models.method import HasGaussians
 from gsparc.ops import Pose
-from gsparc.physics.waves import LIGHT
 from gsparc.view.answer import SILENT_DB, Answer
 from gsparc.view.crossed import fans
-from gsparc.view.scene import EXTENT, Faces, Frame, Legend, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
 from gsparc.view.viewed import Measured, Viewed
 
 log = logging.getLogger(__name__)

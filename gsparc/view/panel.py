@@ -9,9 +9,9 @@ import numpy as np
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import logarithmic, panels
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import Answer
 from gsparc.view.reasons import Usual
-from gsparc.view.scene import Legend
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
 MOST_LINES = 4  # antennas whose responses are drawn

@@ -10,9 +10,10 @@ import numpy as np
 
 from gsparc.maps.area import Grid
 from gsparc.maps.making import levels_at
+from gsparc.maps.pictures import Legend
 from gsparc.prediction.predictor import Predictor
 from gsparc.view.reasons import Usual
-from gsparc.view.scene import Legend, Sheet
+from gsparc.view.scene import Sheet
 
 FIRST = 400  # cells of the first, coarsest picture, about
 STEP_S = 0.03  # of a step: what a drag waits for [s]

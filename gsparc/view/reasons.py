@@ -10,10 +10,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.site_objects import SiteObjects
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import SILENT_DB, Answer, azimuth_elevation
 from gsparc.view.building import SURFACES
 from gsparc.view.crossed import Obstacles, crossed_losses
-from gsparc.view.scene import Faces, Legend, Part
+from gsparc.view.scene import Faces, Part
 
 NEAREST_M = 0.1  # where a distance law ends
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of

@@ -13,12 +13,12 @@ from gsparc.data.blocks import evenly
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.levels import MAPPED
-from gsparc.maps.pictures import Layer
+from gsparc.maps.pictures import Layer, Legend
 from gsparc.view.building import VALUES, Given, Sphere, build, start_place
 from gsparc.view.crossed import Obstacles
 from gsparc.view.plane import Plane, refining
 from gsparc.view.reasons import Surroundings, usual
-from gsparc.view.scene import EXTENT, Legend, Points, Scene
+from gsparc.view.scene import EXTENT, Points, Scene
 from gsparc.view.viewed import Measured, Viewed
 
 

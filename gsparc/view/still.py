@@ -15,12 +15,13 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from gsparc.data.blocks import evenly
 from gsparc.evaluation.drawing import panels, save
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import ask
 from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
 from gsparc.view.panel import RED, draw_answer
 from gsparc.view.plane import thinned
 from gsparc.view.reasons import ENDS, headline
-from gsparc.view.scene import Faces, Legend, Lines, Mark, Points
+from gsparc.view.scene import Faces, Lines, Mark, Points
 from gsparc.view.site_view import SiteView
 
 WIDTH, HEIGHT, DPI = 8.0, 4.4, 150  # readable at 600 pixels

@@ -69,7 +69,8 @@ def of_images(model, **settings):
 
 def of_a_real_array(real, folder):
     """The release's 160 spectra."""
-    train(campaigns.compose("dataset=rfid", f"dataset.root={real}", "model=gsparc", "baselines=[]"), folder)
+    settings = ("dataset=rfid", f"dataset.root={real}", "model=gsparc", "baselines=[]", "logger=none")
+    train(campaigns.compose(*settings), folder)
     return gsparc.load(folder / "model.ckpt")
 
 

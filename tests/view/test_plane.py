@@ -8,10 +8,10 @@ import numpy as np
 from campaigns import channels
 from towns import trained
 
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import ask
 from gsparc.view.plane import Plane, beyond_distance, refining, sheet, thinned, weakest
 from gsparc.view.reasons import usual
-from gsparc.view.scene import Legend
 from gsparc.view.site_view import grid_for
 from gsparc.view.viewed import open_viewed
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.physics.waves import LIGHT
+from gsparc.data.schema import LIGHT
 from gsparc.prediction.along.taps import located_paths
 from gsparc.prediction.predictor import Predictor
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from gsparc.physics.waves import LIGHT
+from gsparc.data.schema import LIGHT
 from gsparc.prediction.export import Paths
 from gsparc.prediction.predictor import Predictor
 

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from gsparc.maps.area import Grid
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import Answer, ask
 from gsparc.view.building import (
     ERRORS,
@@ -32,7 +33,7 @@ from gsparc.view.panel import response_db, spectrum_image, tones_mhz
 from gsparc.view.plane import Plane, beyond_distance, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
 from gsparc.view.reasons import ENDS, answer_markdown, legend_html, reasons
-from gsparc.view.scene import EXTENT, Legend, Points
+from gsparc.view.scene import EXTENT, Points
 from gsparc.view.server.draw import draw, draw_scene, first_view, floor
 from gsparc.view.site_view import SiteView
 
@@ -71,8 +72,7 @@ class Session:
         self.sphere = view.sphere(self.station)
         self.made: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # layers of a map, as they are chosen
         for grid, one in view.layers:
-            legend = Legend(one.label, *one.range(), one.colours)
-            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, legend
+            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
         self._draw_still()
         first_view(client.camera)
         self._panel()

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from gsparc.physics.waves import LIGHT
+from gsparc.data.schema import LIGHT
 from gsparc.prediction.along import deepmimo
 from gsparc.prediction.export import Paths
 

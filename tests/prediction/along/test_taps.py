@@ -14,8 +14,8 @@ from campaigns import compose
 import gsparc
 from gsparc.commands import export
 from gsparc.data.raw import Raw, read_raw, write_raw
+from gsparc.data.schema import LIGHT
 from gsparc.models import checkpoint
-from gsparc.physics.waves import LIGHT
 from gsparc.prediction.along import emulators
 from gsparc.prediction.along.taps import Trajectory, fitted
 from gsparc.prediction.export import Paths
