@@ -108,3 +108,8 @@ def on_disk(dataset: h5py.Dataset) -> OnDisk:
     for part in blocks(dataset):
         copy[part] = dataset[part]
     return copy
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """Numbers (n,) int64 of at most `most` of `count` things in order, evenly spread from first to last."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
-from gsparc.data.schema import Site
-from gsparc.maps.making import levels_at
+from gsparc.maps.making import levels_at, local_of
 from gsparc.maps.promise import Promise
 from gsparc.models.method import HasProcess
 from gsparc.models.powers.settings import fit_powers
@@ -46,8 +46,8 @@ class ErrorCovariance:
 
     def gains(self, targets: np.ndarray) -> np.ndarray:
         """What a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
-        told = (self.weight * targets) @ self.covariance**2
-        return told / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
+        explained = (self.weight * targets) @ self.covariance**2
+        return explained / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
 
     def variances(self) -> np.ndarray:
         """Of a measurement's error at each place (S,), as held-out blocks scale it."""
@@ -61,14 +61,9 @@ def unknown_of(
     promise: Promise | None,
     other_end: Sequence[float] | None = None,
 ) -> list[ErrorCovariance]:
-    """Of every station, as the model's own process says, or one fitted to what the model predicts.
+    """At world places (S, 3) [m] of every station, by the model's process, or one of what it predicts.
 
-    Args:
-        predictor: of powers.
-        places: (S, 3) world [m].
-        stations: names; [""] where there is one.
-        promise: evidence of held-out blocks; None: variances as the model states them.
-        other_end: see `map_of`.
+    Held-out blocks of `promise` scale the variances.
 
     Raises:
         DataError: the model has neither a process nor known places.
@@ -80,8 +75,9 @@ def unknown_of(
         process = asking.method.process() if isinstance(asking.method, HasProcess) else None
         if process is None:
             process = _stand_in(asking, promise, number)
-        local = _queries(asking, places, other_end, process.places.shape[1])
-        covariance = posterior(process, local)
+        local = local_of(asking.site, places, other_end, process.places.shape[1] == 6)
+        assert isinstance(process.posterior, Exact)
+        covariance = process.posterior.covariance(torch.from_numpy(local)).numpy()
         noise = process.kernel.amplitude * process.kernel.noise
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
@@ -97,24 +93,14 @@ def unknown_of(
 
 
 def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
-    """The same where nothing was measured: shadowing of one length about a level nobody knows.
-
-    Args:
-        places: (S, 3) [m].
-        length_m: over which powers are alike; None: `SHARE_OF_SIDE` of the longer side.
+    """The same where nothing was measured: shadowing about a level nobody knows, alike over
+    `length_m`, else `SHARE_OF_SIDE` of the longer side of places (S, 3) [m].
     """
     length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)
     variance = SHADOWING_DB**2
     at = torch.from_numpy(places)
     prior = variance * (Kernel.of_one(length, NOISE).between(at, at) + 1)
     return [ErrorCovariance(prior.numpy(), variance * NOISE, np.ones(len(places)))]
-
-
-def posterior(process: PowerProcess, places: np.ndarray) -> np.ndarray:
-    """Covariance (S, S) [dB^2] of the power at places (S, D), given what the process knows."""
-    exact = process.posterior
-    assert isinstance(exact, Exact)
-    return exact.covariance(torch.from_numpy(places)).numpy()
 
 
 def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerProcess:
@@ -127,7 +113,7 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     own = promise.known[promise.station == number]
     if not len(own):
         own = promise.known
-    own = own[np.linspace(0, len(own) - 1, min(len(own), LEARNED)).astype(int)]
+    own = own[evenly(len(own), LEARNED)]
     if own.shape[1] == 6:
         raise DataError(f"{asking.method.name} states no covariance; plan for models of one moving end")
     world = own + asking.site.origin
@@ -135,17 +121,3 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     good = np.isfinite(level)
     rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
     return fit_powers(rows, asking.site, "constant")[0].exact()
-
-
-def _queries(asking: Predictor, places: np.ndarray, other: Sequence[float] | None, width: int) -> np.ndarray:
-    """Local places (S, D) as the process has them."""
-    site: Site = asking.site
-    local = places - site.origin
-    if width == 3:
-        return local
-    still = site.static_position
-    if still is None and other is None:
-        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    still = np.asarray(other, np.float64) - site.origin if still is None else still
-    both = np.broadcast_to(still, local.shape), local
-    return np.hstack(both[::-1] if site.static_end == "rx" else both)

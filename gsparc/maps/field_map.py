@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,10 +18,8 @@ from gsparc.data.links.georeference import Georeference
 from gsparc.maps.area import Grid
 
 REFUSED = -1  # of `best_server`
-ARRAYS = (
-    "power_db", "lower_db", "upper_db", "expected_error_db", "best_server", "server_chance", "sinr_db",
-    "outage",
-)  # fmt: skip
+OF_STATIONS = ("power_db", "lower_db", "upper_db", "expected_error_db")
+ARRAYS = (*OF_STATIONS, "sinr_db", "outage", "best_server", "server_chance")
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class FieldMap:
         sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
         outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
         share: of measurements that the intervals hold; the field alone lies in them more often.
-        calibrated: whether held-out blocks say so; else the model's own deviations alone.
+        calibrated: whether arrays-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
         extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`.
         places: (n, 2) where was measured, world [m].
@@ -81,6 +79,13 @@ class FieldMap:
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)
 
+    def layer(self, name: str) -> np.ndarray:
+        """One of `ARRAYS` (ny, nx), of the strongest station; NaN where refused."""
+        if name == "best_server":
+            return np.where(self.best_server == REFUSED, np.nan, self.best_server)
+        values = getattr(self, name)
+        return self.strongest(values) if name in OF_STATIONS else values
+
     def save(self, path: str | Path) -> None:
         """Write as npz, whole or not at all."""
         arrays = {
@@ -101,42 +106,45 @@ class FieldMap:
         """
         try:
             with np.load(path, allow_pickle=False) as stored:
-                held = {name: stored[name] for name in stored.files}
-            x, y, inside = held.pop("x"), held.pop("y"), held.pop("inside")
+                arrays = {name: stored[name] for name in stored.files}
+            x, y, inside = arrays.pop("x"), arrays.pop("y"), arrays.pop("inside")
             step = float(x[1] - x[0]) if len(x) > 1 else float(y[1] - y[0]) if len(y) > 1 else 1.0
-            grid = Grid(x, y, float(held.pop("height")), step, inside)
-            names = tuple(str(name) for name in held.pop("stations"))
-            facts: dict[str, Any] = {name: held.pop(name) for name in ARRAYS}
+            grid = Grid(x, y, float(arrays.pop("height")), step, inside)
+            names = tuple(str(name) for name in arrays.pop("stations"))
+            facts: dict[str, Any] = {name: arrays.pop(name) for name in ARRAYS}
             for name, kind in (("share", float), ("calibrated", bool), ("threshold_db", float)):
-                facts[name] = kind(held.pop(name))
+                facts[name] = kind(arrays.pop(name))
         except FileNotFoundError:
             raise DataError(f"map={path}: no such file; expected map.npz of gsparc map") from None
         except (KeyError, ValueError, OSError, EOFError, BadZipFile):
             raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
-        return cls(grid=grid, stations=names, extra=held, **facts)
+        return cls(grid=grid, stations=names, extra=arrays, **facts)
 
     def figures(self) -> dict[str, float | int | None]:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""
-        told = self.grid.inside & ~self.refused
-        best = self.strongest(self.power_db)[told]
-        count = int(told.sum())
+        known = self.grid.inside & ~self.refused
 
-        def mean(values: np.ndarray) -> float | None:
-            known = values[np.isfinite(values)]
-            return float(known.mean()) if len(known) else None
+        def of(layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean) -> float | None:
+            values = layer[known & np.isfinite(layer)]
+            return float(reduced(values)) if len(values) else None
 
-        width = self.strongest(self.upper_db - self.lower_db)[told]
+        power = self.layer("power_db")
         found = {
             "cells": int(self.grid.inside.sum()), "refused": int(self.refused.sum()),
             "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
-            "lowest_db": float(best.min()) if count else None,
-            "highest_db": float(best.max()) if count else None,
-            "width_db": mean(width),
-            "expected_error_db": mean(self.strongest(self.expected_error_db)[told]),
-            "threshold_db": self.threshold_db, "outage": mean(self.outage[told]),
-            "sinr_db": mean(self.sinr_db[told]), "server_unsure": mean(self.unsure[told].astype(float)),
+            "lowest_db": of(power, np.min), "highest_db": of(power, np.max),
+            "width_db": of(self.strongest(self.upper_db - self.lower_db)),
+            "expected_error_db": of(self.layer("expected_error_db")), "threshold_db": self.threshold_db,
+            "outage": of(self.outage), "sinr_db": of(self.sinr_db), "server_unsure": of(1.0 * self.unsure),
         }  # fmt: skip
         return {f"map/{name}": value for name, value in found.items()}
+
+
+def empty(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:
+    """`ARRAYS` of a map (ny, nx) about which nothing is said yet."""
+    shapes = {name: (stations, *shape) if name in OF_STATIONS else shape for name in ARRAYS}
+    values = {name: np.full(size, np.nan, np.float32) for name, size in shapes.items()}
+    return values | {"best_server": np.full(shape, REFUSED, np.int16)}
 
 
 def best_server(power_db: np.ndarray) -> np.ndarray:
@@ -216,18 +224,18 @@ def loads(given: float | Sequence[float] | Mapping[str, float], stations: Sequen
     return np.broadcast_to(values, (len(stations),))
 
 
-def geotiff_wanted(asked: bool | None, origin: Georeference | None) -> bool:
+def geotiff_wanted(wanted: bool | None, origin: Georeference | None) -> bool:
     """Whether a GeoTIFF is written; None: where it can be.
 
     Raises:
         DataError: it is asked for, and cannot be.
     """
     there = find_spec("rasterio") is not None
-    if asked and origin is None:
+    if wanted and origin is None:
         raise DataError("geotiff=true: positions were in metres about an unknown origin, not in degrees")
-    if asked and not there:
+    if wanted and not there:
         raise DataError("geotiff=true: needs rasterio; pip install 'gsparc[maps]'")
-    return there and origin is not None and asked is not False
+    return there and origin is not None and wanted is not False
 
 
 def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> None:
@@ -240,13 +248,7 @@ def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> No
     import rasterio
     from rasterio.transform import from_origin
 
-    best = np.where(found.best_server == REFUSED, np.nan, found.best_server.astype(np.float32))
-    bands = {name: found.strongest(getattr(found, name)) for name in ("power_db", "lower_db", "upper_db")}
-    bands |= {
-        "expected_error_db": found.strongest(found.expected_error_db), "sinr_db": found.sinr_db,
-        "outage": found.outage, "best_server": best,
-        "server_chance": found.server_chance, **found.extra,
-    }  # fmt: skip
+    bands = {**{name: found.layer(name) for name in ARRAYS}, **found.extra}
     if len(found.stations) > 1:
         bands |= {
             f"power_db {name}": power for name, power in zip(found.stations, found.power_db, strict=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError, reason
 from gsparc.data.links.georeference import Georeference
 
-CORNERS = 3  # of a polygon, at least
 SPECK = 1e-3  # of a site's width, that nobody draws: in degrees a site is 1e-5 as wide as in metres
 
 
@@ -47,7 +47,7 @@ class Shapes:
 
 
 def read_shapes(
-    path: str | Path, key: str, origin: Georeference | None, wanted: str = "polygon", site_m: float = 0.0
+    path: str | Path, key: str, origin: Georeference | None, lines_too: bool = False, site_m: float = 0.0
 ) -> Shapes:
     """Polygons and lines of a file; coordinates are degrees where the model knows its place on Earth.
 
@@ -55,11 +55,11 @@ def read_shapes(
         path: `*.geojson` or `*.json`.
         key: setting that named it, for messages.
         origin: of the model's metres; None: the file's coordinates are metres themselves.
-        wanted: `polygon`, `line` or `either`, at least one of which must be there.
+        lines_too: whether lines will do where there are no polygons.
         site_m: width of the site [m], of which everything drawn must not be a speck: it is in degrees then.
 
     Raises:
-        DataError: no file, no GeoJSON, nothing of what is wanted, a shape without extent, or degrees.
+        DataError: no file, no GeoJSON, no such shapes, one without extent, or degrees.
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -69,7 +69,9 @@ def read_shapes(
         raise DataError(f"{key}={path}: not readable as GeoJSON ({reason(error)})") from None
     polygons: list[tuple[np.ndarray, ...]] = []
     lines: list[np.ndarray] = []
-    for number, geometry in enumerate(_geometries(content, f"{key}={path}")):
+    if not isinstance(content, dict) or "type" not in content:
+        raise DataError(f"{key}={path}: not GeoJSON; expected an object with a type")
+    for number, geometry in enumerate(_geometries(content)):
         where = f"{key}={path}, geometry {number}"
         kind, parts = geometry.get("type"), geometry.get("coordinates")
         if kind in ("Polygon", "MultiPolygon"):
@@ -78,10 +80,8 @@ def read_shapes(
         elif kind in ("LineString", "MultiLineString"):
             for line in [parts] if kind == "LineString" else parts or []:
                 lines.append(_points(line, where, origin, 2))
-    if not polygons and wanted != "line" and not (lines and wanted == "either"):
+    if not polygons and not (lines and lines_too):
         raise DataError(f"{key}={path}: holds no polygon; draw the area as a Polygon or MultiPolygon")
-    if not lines and wanted == "line":
-        raise DataError(f"{key}={path}: holds no line; draw corridors as LineString or MultiLineString")
     found = Shapes(tuple(polygons), tuple(lines))
     low, high = found.bounds()
     if origin is None and (high - low).max() < SPECK * site_m:
@@ -92,22 +92,18 @@ def read_shapes(
     return found
 
 
-def _geometries(content: Any, where: str) -> list[dict[str, Any]]:
-    if not isinstance(content, dict) or "type" not in content:
-        raise DataError(f"{where}: not GeoJSON; expected an object with a type")
-    if content["type"] == "FeatureCollection":
-        inner = [one.get("geometry") for one in content.get("features") or [] if isinstance(one, dict)]
-    elif content["type"] == "Feature":
-        inner = [content.get("geometry")]
-    elif content["type"] == "GeometryCollection":
-        inner = list(content.get("geometries") or [])
-    else:
-        inner = [content]
-    return [one for one in inner if isinstance(one, dict)]
+def _geometries(content: Any) -> Iterator[dict[str, Any]]:
+    """Geometries of a file, those of features and collections one after another."""
+    if isinstance(content, dict):
+        inner = [content[key] for key in ("features", "geometries", "geometry") if key in content]
+        if not inner:
+            yield content
+        for part in (one for group in inner for one in (group if isinstance(group, list) else [group])):
+            yield from _geometries(part)
 
 
 def _ring(ring: Any, where: str, origin: Georeference | None) -> np.ndarray:
-    places = _points(ring, where, origin, CORNERS)
+    places = _points(ring, where, origin, 3)
     following = np.roll(places, -1, axis=0)
     area = 0.5 * abs(float(np.sum(places[:, 0] * following[:, 1] - following[:, 0] * places[:, 1])))
     if not area > 0:

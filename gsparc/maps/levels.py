@@ -11,22 +11,26 @@ from gsparc.models.method import Prediction
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
 
 
-def predicted(said: Prediction, kind: Kind, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def predicted(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Level and its standard deviation (B,) float64 [dB]; NaN where no power is predicted.
 
     The power of a channel is its mean over antennas and subcarriers, expected: |mean|^2 + error variance.
     Its deviation takes the error for one complex normal variable shared by all entries, which overstates it.
 
     Args:
-        said: a prediction; its variance is of the entries.
+        prediction: a prediction; its variance is of the entries.
         kind: `rssi` or `csi`.
-        scale: of stored targets; 1 where `said` is in physical units.
+        scale: of stored targets; 1 where `prediction` is in physical units.
 
     Returns:
         The deviation is 1 dB everywhere where the method has no variance.
     """
-    mean = said.mean.detach().cpu().numpy().reshape(len(said.mean), -1)
-    variance = None if said.variance is None else said.variance.detach().cpu().double().numpy() * scale**2
+    mean = prediction.mean.detach().cpu().numpy().reshape(len(prediction.mean), -1)
+    variance = (
+        None
+        if prediction.variance is None
+        else prediction.variance.detach().cpu().double().numpy() * scale**2
+    )
     level, spread = np.full(len(mean), np.nan), np.full(len(mean), np.nan)
     if kind == "rssi":
         power = mean[:, 0].astype(np.float64) * scale

@@ -18,7 +18,7 @@ from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.maps.area import Grid, grid_of
-from gsparc.maps.field_map import FieldMap, best_server, loads, server_chance, sinr
+from gsparc.maps.field_map import FieldMap, best_server, empty, loads, server_chance, sinr
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.intervals import Calibration
 from gsparc.maps.levels import MAPPED, predicted
@@ -30,6 +30,7 @@ from gsparc.prediction.predictor import Predictor
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
 BANDS = 1 << 16  # cells at a time of what follows from predictions
+OTHER_END = "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"
 
 
 def map_of(
@@ -79,64 +80,78 @@ def map_of(
     promise = stored_promise(predictor.extra) if promise == "stored" else promise
     names, notes = answering(predictor, stations, promise)
     grid = grid_of(site, area, height_m, step_m, plan, len(names))
-    share_of = loads(load, names)
+    load_of = loads(load, names)
     if dry:
         first = np.zeros_like(grid.inside)
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
-    calibration = None if promise is None else promise.calibration(share)
-    arrays = [np.full((len(names), *grid.shape), np.nan, np.float32) for _ in range(4)]
+    calibration = own_deviations(share) if promise is None else promise.calibration(share)
+    values = empty(len(names), grid.shape)
     stride = _stride(grid, promise, tolerance_db)
-    told = 0
-    numbers = [0 if site.stations is None else site.stations.name.index(name) for name in names]
-    every = np.flatnonzero(grid.inside)
-    for layer, (name, number) in enumerate(zip(names, numbers, strict=True)):
-        asking = predictor if site.stations is None else predictor.at(name)
-        ask = _asker(asking, grid, other_end, f" of {name}" if name else "")
-        (mean, spread), count = refined(ask, grid.inside, stride, tolerance_db)
-        told += count
-        for cells in _chunks(every, BANDS):
-            level, wide = (values.reshape(-1)[cells].astype(np.float64) for values in (mean, spread))
-            if promise is None or calibration is None:
-                half, wrong = norm.ppf((1 + share) / 2) * wide, wide
-            else:
-                far = promise.distance(_local(grid.places(cells), other_end, site), number)
-                own = np.full(len(far), number)
-                half, wrong = calibration.interval(wide, far, own), calibration.expected_error(wide, far, own)
-            level = np.where(np.isfinite(half), level, np.nan)
-            said = level, level - half, level + half, np.where(np.isfinite(level), wrong, np.nan)
-            for array, values in zip(arrays, said, strict=True):
-                array[layer].reshape(-1)[cells] = values
-    if told < len(names) * len(every):
+    numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
+    every, computed = np.flatnonzero(grid.inside), 0
+    for row, name in enumerate(names):  # the model's own deviations, until the promise scales them
+        own = predictor if site.stations is None else predictor.at(name)
+        ask = _asker(own, grid, other_end, f" of {name}" if name else "")
+        both, count = refined(ask, grid.inside, stride, tolerance_db)
+        values["power_db"][row], values["expected_error_db"][row] = both
+        computed += count
+    if computed < len(names) * len(every):
         notes.append(
-            f"{told} of {len(names) * len(every)} predictions were made, the others interpolated "
+            f"{computed} of {len(names) * len(every)} predictions were made, the others interpolated "
             f"within about {tolerance_db:g} dB"
         )
-    power, lower, upper, error = arrays
     usual, floor = _usual(promise, numbers, noise_db)
-    over = _over_stations(power, error, share_of, noise_db, threshold_db, calibration, usual, floor)
-    best, chance, ratio, outage = over
-    if calibration is not None and not np.isfinite(power).any():
+    flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
+    for cells in _chunks(every, BANDS):
+        mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
+        far = np.zeros(mean.shape)
+        if promise is not None:
+            local = local_of(site, grid.places(cells), other_end, site.static_end is None)
+            far = np.stack([promise.distance(local, number) for number in numbers])
+        half = calibration.interval(spread, far, numbers[:, None])
+        mean = np.where(np.isfinite(half), mean, np.nan)
+        error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
+        power, error = mean.astype(np.float32), error.astype(np.float32)
+        best = best_server(power)
+        strongest = np.maximum(best, 0), np.arange(len(best))
+        part = {
+            "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
+            "best_server": best, "server_chance": server_chance(power, error, usual, floor),
+            "sinr_db": sinr(power, load_of, noise_db),
+            "outage": calibration.below(threshold_db, power[strongest], error[strongest]),
+        }  # fmt: skip
+        for name, found in part.items():
+            flat[name][..., cells] = found
+    if promise is not None and not np.isfinite(values["power_db"]).any():
         raise DataError(
             f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
             "that held-out blocks tell anything of; map where was measured, or give a larger promise.block_m"
         )
+    known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
-        grid, tuple(names), power, lower, upper, error, best, chance, ratio, outage, share,
-        calibration is not None, threshold_db, _path_layers(predictor, grid, best),
-        np.zeros((0, 2)) if promise is None else np.unique(promise.known[:, -3:-1] + site.origin[:2], axis=0),
-        _still(site, names),
-        tuple(notes),
+        grid, tuple(names), **values, share=share, calibrated=promise is not None,
+        threshold_db=threshold_db, extra=_path_layers(predictor, grid, values["best_server"]),
+        places=np.unique(known, axis=0), station_place=_still(site, names), notes=tuple(notes),
     )  # fmt: skip
 
 
+def own_deviations(share: float) -> Calibration:
+    """Intervals and errors as the model states them, everywhere."""
+    half = np.array([norm.ppf((1 + share) / 2)])
+    return Calibration(share, np.zeros(1), half, np.ones(1), None, np.inf, np.zeros(0))
+
+
 def answering(
-    predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None
+    predictor: Predictor,
+    wanted: Sequence[str | int] | None,
+    promise: Promise | None = None,
+    key: str = "stations",
 ) -> tuple[list[str], list[str]]:
-    """Names of the stations that are mapped, and what must be said of the others.
+    """Names of the stations that are mapped, and notes on the others.
 
     Those are stations that the model does not answer for, and, where something is promised, stations that it
-    never heard: what was held out tells nothing of them.
+    never heard: what was held out tells nothing of them. `key` is the setting that `wanted` comes from.
 
     Raises:
         DataError: one of them was asked for, or none is left.
@@ -145,14 +160,14 @@ def answering(
     if stations is None:
         if wanted is not None:
             raise DataError(
-                f"stations={list(wanted)}: the model of {predictor.site.name} has one; leave it out"
+                f"{key}={list(wanted)}: the model of {predictor.site.name} has no stations; leave it out"
             )
         return [""], []
     names: list[str] = []
     for one in wanted if wanted is not None else stations.name:
         number = station_number(one, stations.name, len(stations))
         if number is None:
-            raise DataError(f"stations: no station {one!r}{suggest(str(one), stations.name)}")
+            raise DataError(f"{key}: no station {one!r}{suggest(str(one), stations.name)}")
         names.append(stations.name[number])
     if not names:
         raise DataError("stations=[]: name one at least, or all")
@@ -172,8 +187,8 @@ def answering(
     return list(dict.fromkeys(names)), notes
 
 
-def _chunks(cells: np.ndarray, size: int) -> list[np.ndarray]:
-    return [cells[start : start + size] for start in range(0, len(cells), size)]
+def _chunks(rows: np.ndarray, size: int) -> list[np.ndarray]:
+    return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
 def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
@@ -205,36 +220,38 @@ def _asker(
 
 
 def levels_at(
-    predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None
+    predictor: Predictor,
+    places: np.ndarray,
+    other: Sequence[float] | None = None,
+    station: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
-    return levels_of(predictor, lambda part: ends_of(predictor.site, part, other), places)
-
-
-def levels_of(
-    predictor: Predictor, ends: Callable[[np.ndarray], dict[End, Any]], places: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same with the ends that a predictor is told of each part of the places."""
-    parts = [
-        predicted(predictor.predict(**ends(part)), predictor.site.kind)
-        for part in np.split(places, range(CHUNK, len(places), CHUNK))
-    ]
+    parts = []
+    for part in _chunks(places, CHUNK):
+        ends: dict[str, Any] = {**ends_of(predictor.site, part, other, station)}
+        parts.append(predicted(predictor.predict(**ends), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread
 
 
-def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:
-    """World places (n, 3) of the ends that a predictor is to be told.
+def ends_of(
+    site: Site, places: np.ndarray, other: Sequence[float] | None, station: np.ndarray | None = None
+) -> dict[End, np.ndarray]:
+    """World places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
+
+    `other` (3,) is the transmitter's place where both moved, `station` (3,) that of one never heard.
 
     Raises:
         DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
     """
+    if station is not None and site.static_end is not None:
+        return {site.static_end: station, site.moving_end: places}
     if site.static_end is not None:
         if other is not None:
             raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
         return {site.moving_end: places}
     if other is None:
-        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
+        raise DataError(OTHER_END)
     return {"rx": places, "tx": np.broadcast_to(place_of("other_end", other), places.shape)}
 
 
@@ -246,45 +263,24 @@ def place_of(name: str, given: Any) -> np.ndarray:
     return place
 
 
-def _local(places: np.ndarray, other: Sequence[float] | None, site: Site) -> np.ndarray:
-    """Local places (n, 3), or (n, 6) with the other end before them where both moved [m]."""
+def local_of(site: Site, places: np.ndarray, other: Sequence[float] | None, both: bool) -> np.ndarray:
+    """World places (n, 3) of the moving end as local ones, (n, 6) of transmitter and receiver if `both` [m].
+
+    Raises:
+        DataError: both are needed, and nobody says where the other end stands.
+    """
     local = places - site.origin
-    if site.static_end is not None or other is None:
+    if not both:
         return local
-    return np.hstack([np.broadcast_to(np.asarray(other) - site.origin, local.shape), local])
-
-
-def _over_stations(
-    power: np.ndarray,
-    error: np.ndarray,
-    load: np.ndarray,
-    noise_db: float | None,
-    threshold_db: float,
-    calibration: Calibration | None,
-    usual: np.ndarray,
-    floor: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Best server, the chance that it is, SINR and outage (ny, nx)."""
-    flat, wrong = (array.reshape(len(array), -1) for array in (power, error))
-    best = np.empty(flat.shape[1], np.int16)
-    chance, ratio, outage = (np.empty(flat.shape[1], np.float32) for _ in range(3))
-    for start in range(0, flat.shape[1], BANDS):
-        part = slice(start, start + BANDS)
-        best[part] = number = best_server(flat[:, part])
-        chance[part] = server_chance(flat[:, part], wrong[:, part], usual, floor)
-        ratio[part] = sinr(flat[:, part], load, noise_db)
-        cell = np.arange(len(number))
-        mean, spread = (array[:, part][np.maximum(number, 0), cell] for array in (flat, wrong))
-        if calibration is None:
-            outage[part] = norm.cdf((threshold_db - mean) / spread)
-        else:
-            outage[part] = calibration.below(threshold_db, mean, spread)
-    shape = power.shape[1:]
-    return best.reshape(shape), chance.reshape(shape), ratio.reshape(shape), outage.reshape(shape)
+    if site.static_position is None and other is None:
+        raise DataError(OTHER_END)
+    still = np.asarray(other) - site.origin if site.static_position is None else site.static_position
+    pair = np.broadcast_to(still, local.shape), local
+    return np.hstack(pair[::-1] if site.static_end == "rx" else pair)
 
 
 def _usual(
-    promise: Promise | None, numbers: Sequence[int], noise_db: float | None
+    promise: Promise | None, numbers: np.ndarray, noise_db: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and deviation (T, 2) of each station's measured levels, and its floor (T,) [dB].
 
@@ -308,8 +304,7 @@ def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str
     if not isinstance(predictor.method, HasPaths) or predictor.site.stations is not None:
         return {}
     layers = {name: np.full(grid.shape, np.nan, np.float32) for name in ("delay_spread_ns", "direction_deg")}
-    told = np.flatnonzero((best >= 0).reshape(-1))
-    for cells in _chunks(told, CHUNK):
+    for cells in _chunks(np.flatnonzero(best >= 0), CHUNK):
         try:
             found = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
         except ValueError:  # what was fitted has none

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment
-from matplotlib import colormaps
 from PIL import Image
 
+from gsparc.data.blocks import evenly
 from gsparc.data.files import whole_file
 from gsparc.evaluation.from_above import MOST_POINTS
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.pictures import Layer, class_colours
+from gsparc.maps.pictures import Layer
 
 MOST_CELLS = 600  # along a side: the page shows every n-th cell of larger maps
 LEVELS = 65_534  # of a value; 65535 is no value
@@ -34,20 +34,11 @@ def write_page(
     lines: Sequence[str],
     plan: FloorPlan | None,
 ) -> None:
-    """Write a page that needs nothing but itself.
-
-    Args:
-        path: HTML file.
-        found: the map.
-        drawn: its layers.
-        title: of the page.
-        lines: what a reader must know.
-        plan: beneath the map.
-    """
+    """Write an HTML page of layers that needs nothing but itself; `lines` are what a reader must know."""
     every = max(1, -(-max(found.grid.shape) // MOST_CELLS))
     text = files("gsparc.maps").joinpath("page.html.j2").read_text(encoding="utf-8")
     left, right, low, high = found.grid.extent
-    few = found.places[np.linspace(0, len(found.places) - 1, min(len(found.places), MOST_POINTS)).astype(int)]
+    few = found.places[evenly(len(found.places), MOST_POINTS)]
     stations = [
         {"name": name, "x": float(x), "y": float(y)}
         for name, (x, y) in zip(found.stations, found.station_place, strict=True)
@@ -73,18 +64,13 @@ def _encoded(layer: Layer, every: int) -> dict[str, Any]:
     scale = (most - least) / LEVELS or 1.0
     code = np.full(values.shape, NOTHING, np.uint16)
     code[known] = np.round((values[known] - least) / scale).astype(np.uint16)
-    low, high = layer.range()
-    if layer.words:
-        low, high = -0.5, len(layer.words) - 0.5
-        colours = class_colours(len(layer.words))
-    else:
-        colours = colormaps[layer.colours](np.linspace(0, 1, 256))
     return {
-        "name": layer.name, "label": layer.label, "words": list(layer.words), "ny": values.shape[0],
-        "nx": values.shape[1], "least": least, "scale": scale, "low": low, "high": high,
+        "name": layer.name, "label": layer.legend.label, "words": list(layer.words), "ny": values.shape[0],
+        "nx": values.shape[1], "least": least, "scale": scale,
+        "low": layer.legend.low, "high": layer.legend.high,
         "data": base64.b64encode(code.astype("<u2").tobytes()).decode(),
         "unsure": None if layer.unsure is None else _bits(layer.unsure[0][::every, ::every]),
-        "colours": (colours[:, :3] * 255).round().astype(int).tolist(),
+        "colours": (layer.table()[:, :3] * 255).round().astype(int).tolist(),
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import ListedColormap
 from matplotlib.transforms import Affine2D
 
 from gsparc.evaluation.drawing import panels, save
@@ -23,16 +23,47 @@ from gsparc.evaluation.from_above import (
     scale_bar,
 )
 from gsparc.maps.area import Grid
-from gsparc.maps.field_map import REFUSED, FieldMap
+from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.placing import Placing
 from gsparc.maps.planning import Plan
 from gsparc.maps.promise import Promise
 from gsparc.prediction.predictor import Predictor
 
+GREY = (170, 170, 170)  # of values that are not known
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
 UNSURE = "hatched: less likely than not the strongest and above its floor"
+
+
+@dataclass(frozen=True)
+class Legend:
+    """What colours mean: from `low` to `high` of `label`, in a matplotlib colour map."""
+
+    label: str
+    low: float
+    high: float
+    colours: str = "viridis"
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Colours (..., 3) uint8 of values (...); grey where they are not finite."""
+        with np.errstate(invalid="ignore"):
+            share = np.clip((values - self.low) / max(self.high - self.low, 1e-30), 0, 1)
+        known = np.isfinite(values)
+        found = np.round(255 * colormaps[self.colours](np.where(known, share, 0.0))[..., :3]).astype(np.uint8)
+        found[~known] = GREY
+        return found
+
+    @classmethod
+    def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:
+        """From the 1 to the 99 % quantile of those values that are finite."""
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+        return cls(label, float(low), float(high if high > low else low + 1.0), colours)
+
+    def strip(self) -> np.ndarray:
+        """Colours (16, 3) uint8 from low to high."""
+        return self.of(np.linspace(self.low, self.high, 16))
 
 
 @dataclass(frozen=True)
@@ -41,64 +72,54 @@ class Layer:
 
     Attributes:
         name: of its file and its button.
-        label: of the colour bar, with the unit.
         values: (ny, nx) float, NaN where nothing is said.
-        colours: a matplotlib colour map.
-        limits: of the colours; None: the 1 and 99 % quantiles.
+        legend: what its colours mean, with the unit.
         words: names of whole numbers, for a layer of classes.
         unsure: (ny, nx) bool, cells that are hatched, and why; None: none.
     """
 
     name: str
-    label: str
     values: np.ndarray
-    colours: str = "viridis"
-    limits: tuple[float, float] | None = None
+    legend: Legend
     words: tuple[str, ...] = ()
     unsure: tuple[np.ndarray, str] | None = None
 
-    def range(self) -> tuple[float, float]:
-        """Of the colours."""
-        if self.limits is not None:
-            return self.limits
-        known = self.values[np.isfinite(self.values)]
-        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
-        return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
+    def table(self) -> np.ndarray:
+        """Colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
+        if not self.words:
+            return colormaps[self.legend.colours](np.linspace(0, 1, 256))
+        count = len(self.words)
+        return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
 
 
 def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
-    """Every layer of a map that says something; of several stations, also the power of each.
-
-    Args:
-        found: the map.
-        unit: of powers: `dBm` where they are.
-    """
+    """Every layer of a map that says something; of several stations, also the power of each, in `unit`."""
     several = len(found.stations) > 1
     of = " of the strongest station" if several else ""
-    yield Layer("power", f"received power{of} [{unit}]", found.strongest(found.power_db))
+    layer = found.layer("power_db")
+    yield Layer("power", layer, Legend.over(f"received power{of} [{unit}]", layer))
     if several:
-        values = np.where(found.best_server == REFUSED, np.nan, found.best_server.astype(float))
         doubt = (found.unsure, UNSURE) if found.unsure.any() else None
-        yield Layer("best_server", "strongest station", values, words=found.stations, unsure=doubt)
+        legend = Legend("strongest station", -0.5, len(found.stations) - 0.5)
+        yield Layer("best_server", found.layer("best_server"), legend, found.stations, doubt)
     if np.isfinite(found.sinr_db).any():
-        yield Layer("sinr", "signal over interference and noise [dB]", found.sinr_db)
-    level = f"{found.threshold_db:g} {unit}"
-    yield Layer("outage", f"probability of less than {level}", found.outage, "magma_r", (0.0, 1.0))
-    error = found.strongest(found.expected_error_db)
-    yield Layer("expected_error", "expected error [dB]", error, "cividis")
-    width = found.strongest(found.upper_db - found.lower_db)
-    yield Layer("width", f"width of the {found.share:.0%} interval [dB]", width, "cividis")
-    for name, label, colours, limits in (
-        ("delay_spread_ns", "delay spread [ns]", "plasma", None),
-        ("direction_deg", "azimuth of the strongest path [degrees]", "twilight", (-180.0, 180.0)),
-    ):
-        if name in found.extra:
-            yield Layer(name, label, found.extra[name], colours, limits)
-    if several:
-        for number, name in enumerate(found.stations):
-            values = found.power_db[number]
-            if np.isfinite(values).any():
-                yield Layer(f"power {name}", f"received power of {name} [{unit}]", values)
+        label = "signal over interference and noise [dB]"
+        yield Layer("sinr", found.sinr_db, Legend.over(label, found.sinr_db))
+    label = f"probability of less than {found.threshold_db:g} {unit}"
+    yield Layer("outage", found.outage, Legend(label, 0.0, 1.0, "magma_r"))
+    error, width = found.layer("expected_error_db"), found.strongest(found.upper_db - found.lower_db)
+    yield Layer("expected_error", error, Legend.over("expected error [dB]", error, "cividis"))
+    label = f"width of the {found.share:.0%} interval [dB]"
+    yield Layer("width", width, Legend.over(label, width, "cividis"))
+    if "delay_spread_ns" in found.extra:
+        layer = found.extra["delay_spread_ns"]
+        yield Layer("delay_spread_ns", layer, Legend.over("delay spread [ns]", layer, "plasma"))
+    if "direction_deg" in found.extra:
+        legend = Legend("azimuth of the strongest path [degrees]", -180.0, 180.0, "twilight")
+        yield Layer("direction_deg", found.extra["direction_deg"], legend)
+    for name, layer in zip(found.stations, found.power_db, strict=True) if several else ():
+        if np.isfinite(layer).any():
+            yield Layer(f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer))
 
 
 def file_name(layer: Layer) -> str:
@@ -107,15 +128,7 @@ def file_name(layer: Layer) -> str:
 
 
 def draw_layer(found: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
-    """Save one layer.
-
-    Args:
-        found: the map.
-        layer: of it.
-        path: PNG file.
-        title: above.
-        plan: beneath.
-    """
+    """Save one layer as PNG, over a floor plan."""
     left, right, low, high = found.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
@@ -123,20 +136,13 @@ def draw_layer(found: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     nothing = np.where(found.refused, 1.0, np.nan)
     grey = ListedColormap(["0.82"])
     axis.imshow(nothing, origin="lower", extent=found.grid.extent, cmap=grey, zorder=1, alpha=0.6)
+    legend, known = layer.legend, layer.values[np.isfinite(layer.values)]
+    limits = {"vmin": legend.low, "vmax": legend.high}
+    drawn = _cells(axis, found.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
+    ends = "both" if ((known < legend.low) | (known > legend.high)).any() else "neither"
+    bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.words:
-        count = len(layer.words)
-        norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
-        drawn = _cells(
-            axis, found.grid, layer.values, plan, cmap=ListedColormap(class_colours(count)), norm=norm
-        )
-        bar = figure.colorbar(drawn, ax=axis, ticks=np.arange(count), shrink=0.85, pad=0.02)
-        bar.ax.set_yticklabels(layer.words)
-    else:
-        limits = dict(zip(("vmin", "vmax"), layer.range(), strict=True))
-        drawn = _cells(axis, found.grid, layer.values, plan, cmap=layer.colours, **limits)
-        ends = "neither" if layer.limits else "both"
-        bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends)
-    bar.set_label(layer.label)
+        bar.set_ticks(list(range(len(layer.words))), labels=layer.words)
     if layer.unsure is not None:
         _hatch(axis, found, *layer.unsure)
     bounded(axis, (left, low), (right, high), title=title)
@@ -169,7 +175,7 @@ def draw_plan(axis: Any, plan: FloorPlan) -> None:
     """The floor plan, where it lies."""
     height, width = plan.image.shape[:2]
     a, b, c, d, e, f = plan.matrix()
-    turn = Affine2D(np.array([[a, c, e], [b, d, f], [0, 0, 1]])) + axis.transData
+    turn = Affine2D.from_values(a, b, c, d, e, f) + axis.transData
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 
@@ -184,11 +190,6 @@ def draw_places(axis: Any, found: FieldMap) -> None:
     if 1 < len(known) <= NAMED:
         for where, name in zip(known[inside], np.array(found.stations)[inside], strict=True):
             annotate(axis, name, where)
-
-
-def class_colours(count: int) -> np.ndarray:
-    """Colours (count, 4) of a layer of classes."""
-    return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
 
 
 def draw_plan_picture(

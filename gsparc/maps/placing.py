@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.stats import norm
 
+from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
-from gsparc.data.schema import End, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.maps.area import Grid
 from gsparc.maps.intervals import Evidence
-from gsparc.maps.making import levels_of, map_of
+from gsparc.maps.making import levels_at, map_of
 from gsparc.maps.planning import coarse_grid, walkable_places
 from gsparc.maps.promise import Promise, evidence_of, without
 from gsparc.models.method import Method
@@ -23,7 +24,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
 Goal = Literal["coverage", "worst"]
-GOALS = ("coverage", "worst")
+GOALS = get_args(Goal)
 DECILE = 0.1
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
@@ -187,14 +188,13 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         every = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:
         every = grid.places()
-    kept = every[np.unique(np.linspace(0, len(every) - 1, min(count, len(every))).astype(int))]
-    return np.column_stack([kept[:, :2], np.full(len(kept), height)])
+    few = every[evenly(len(every), count)]
+    return np.column_stack([few[:, :2], np.full(len(few), height)])
 
 
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] of a station at `place` (3,) in cells (n, 3)."""
-    static: End = predictor.site.static_end or "tx"
-    level, spread = levels_of(predictor, lambda part: {static: place, predictor.site.moving_end: part}, cells)
+    level, spread = levels_at(predictor, cells, station=place)
     return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 

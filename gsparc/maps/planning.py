@@ -181,7 +181,7 @@ def coarse_grid(
 def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
     """Places (n, 3) in polygons or along lines of a file."""
     left, right, south, north = grid.extent
-    shapes: Shapes = read_shapes(path, key, origin, "either", max(right - left, north - south))
+    shapes: Shapes = read_shapes(path, key, origin, True, max(right - left, north - south))
     found = [np.zeros((0, 2))]
     if shapes.polygons:
         low, high = (np.array(v) for v in Shapes(shapes.polygons, ()).bounds())
@@ -232,19 +232,17 @@ def greedy(
             why = "no place is left" if not free.any() else "no other place fits in the walk"
             return chosen, expected, f"{why} after {len(chosen)} places"
         best = int(np.where(possible, gains, -np.inf).argmax())
-        kept = [one.covariance.copy() for one in unknown] if least_gain_db > 0 else []
+        left = error**2 - gains[best] / (len(unknown) * wanted.sum())
+        gain = error - float(np.sqrt(max(left, 0)))
+        if gain < least_gain_db:
+            return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
         for one in unknown:
             one.measured(best)
-        after = _expected(unknown, wanted)
-        if error - after < least_gain_db:
-            for one, before in zip(unknown, kept, strict=True):
-                one.covariance = before
-            gain = error - after
-            return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
+        error = _expected(unknown, wanted)
         chosen.append(best)
-        expected.append(after)
+        expected.append(error)
         tour.add(places[best])
-        free[best], error = False, after
+        free[best] = False
     return chosen, expected, ""
 
 

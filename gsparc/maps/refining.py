@@ -25,18 +25,24 @@ def refined(ask: Ask, inside: np.ndarray, stride: int, tolerance: float) -> tupl
         tolerance: largest error of interpolation that is looked for.
     """
     ny, nx = inside.shape
+
+    def sampled(chosen: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Values (C, r, c) float64 of the `chosen` (r, c) points of a lattice, NaN elsewhere."""
+        row, column = np.nonzero(chosen)
+        exact = ask(rows[row] * nx + columns[column])
+        values = np.full((exact.shape[1], *chosen.shape), np.nan)
+        values[:, chosen] = exact.T
+        return values
+
     stride = min(stride, _largest(min(ny, nx)))
     if stride < 2:
-        cells = np.flatnonzero(inside)
-        values = ask(cells)
-        found = np.full((values.shape[1], ny * nx), np.nan, np.float32)
-        found[:, cells] = values.T
-        return found.reshape(-1, ny, nx), len(cells)
+        return sampled(inside, np.arange(ny), np.arange(nx)).astype(np.float32), int(inside.sum())
     step = 2 * stride
     near = maximum_filter(inside, 2 * step + 1)  # corners of every lattice square that holds a cell
     rows, columns = _nodes(ny, step), _nodes(nx, step)
-    values, count = _first(ask, near, rows, columns)
-    error = np.zeros(values.shape[1:])
+    first = near[np.ix_(rows, columns)]
+    values, count = sampled(first, rows, columns), int(first.sum())
+    error = np.zeros(first.shape)
     level = 1
     while step > 1:
         step //= 2
@@ -48,12 +54,11 @@ def refined(ask: Ask, inside: np.ndarray, stride: int, tolerance: float) -> tupl
         if level >= WHOLE_LEVELS:
             new &= ~(bound <= tolerance)  # NaN: never tried
         rows, columns = finer
-        told = _asked(ask, new, rows, columns, nx)
+        exact = sampled(new, rows, columns)
         count += int(new.sum())
-        missed = np.zeros(new.shape)
-        missed[new] = np.nan_to_num(np.abs(told - guess[:, new]), nan=np.inf).max(axis=0)
-        guess[:, new] = told
-        values, error = guess, maximum_filter(np.fmax(missed, np.where(new, 0, bound)), 3)
+        missed = np.nan_to_num(np.abs(exact - guess), nan=np.inf).max(axis=0)
+        values = np.where(new, exact, guess)
+        error = maximum_filter(np.fmax(np.where(new, missed, bound), 0), 3)
         level += 1
     return np.where(inside, values, np.nan).astype(np.float32), count
 
@@ -69,20 +74,6 @@ def _nodes(count: int, step: int) -> np.ndarray:
 
 def _halved(nodes: np.ndarray) -> np.ndarray:
     return np.unique(np.concatenate([nodes, (nodes[:-1] + nodes[1:]) // 2]))
-
-
-def _first(ask: Ask, near: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, int]:
-    new = near[np.ix_(rows, columns)]
-    told = _asked(ask, new, rows, columns, near.shape[1])
-    values = np.full((len(told), *new.shape), np.nan)
-    values[:, new] = told
-    return values, int(new.sum())
-
-
-def _asked(ask: Ask, new: np.ndarray, rows: np.ndarray, columns: np.ndarray, nx: int) -> np.ndarray:
-    """Values (C, n) at the lattice points `new`."""
-    row, column = np.nonzero(new)
-    return ask(rows[row] * nx + columns[column]).T.astype(np.float64)
 
 
 def _between(

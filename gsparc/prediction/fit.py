@@ -93,5 +93,5 @@ def _learned_from(data: Measurements, share: float, seed: int) -> Fold:
     rows = np.arange(len(data))
     places, which = np.unique(rows if data.place is None else data.place, return_inverse=True)
     drawn = np.random.default_rng(seed).permutation(len(places))[: round(share * len(places))]
-    held = np.isin(which.reshape(-1), drawn)
-    return Fold(rows[~held], rows[held], rows[:0])
+    validates = np.isin(which.reshape(-1), drawn)
+    return Fold(rows[~validates], rows[validates], rows[:0])

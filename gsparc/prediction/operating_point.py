@@ -55,7 +55,7 @@ def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -
     checkpoint.amend(path, {KEY: {"points": [asdict(point) for point in stored], "measured": measured}})
 
 
-def kept(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
+def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
     """The points in a checkpoint's `extra`, none when it was never swept."""
     found = extra.get(KEY) or {"points": [], "measured": {}}
     points = [Operating(**{**point, "figure": tuple(point["figure"])}) for point in found["points"]]
@@ -74,17 +74,12 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
 
     Sets torch's number of threads to the point's.
 
-    Args:
-        method: as stored.
-        stored: its checkpoint.
-        budget_ms: for one query end to end [ms].
-
     Raises:
         ValueError: the budget is no positive number, or nothing fits; the fastest point is named.
     """
     if not (isinstance(budget_ms, (int, float)) and math.isfinite(budget_ms) and budget_ms > 0):
         raise ValueError(f"budget_ms={budget_ms!r}: a positive number of milliseconds is needed")
-    points, measured = kept(stored.extra)
+    points, measured = stored_points(stored.extra)
     advice = "" if points else f"; `gsparc tradeoff ckpt={stored.path}` finds faster ways to answer"
     if not points:
         points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,6 +28,15 @@ if TYPE_CHECKING:
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
 COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
+
+
+class Query(NamedTuple):
+    """Both ends (B, 3) in local coordinates, whether one position was given, and whether torch was."""
+
+    tx: Tensor
+    rx: Pose
+    single: bool
+    as_torch: bool
 
 
 class Predictor:
@@ -164,27 +173,24 @@ class Predictor:
         """
         if grad:
             return self._followed(self._whole, tx, rx)[0]
-        asked, pose, _, _ = self._ends(tx, rx)
-        said = _predicted(self._whole, asked, pose)
-        sure, scale = None, self.site.target_scale
-        if said.confidence is not None or (self.kind or self.trusted.kind) not in (None, "learned"):
-            places = self.site.moving(asked, pose).double().numpy()
-            sure = torch.from_numpy(self.trusted.confidence(said, places, self.kind))
+        query = self._query(tx, rx)
+        own = _predicted(self._whole, query)
+        scale = self.site.target_scale
         # In float64: squares of powers in watts are beyond float32.
-        variance = None if said.variance is None else said.variance.double() * scale**2
-        return Prediction(said.mean * scale, sure, variance)
+        variance = None if own.variance is None else own.variance.double() * scale**2
+        return Prediction(own.mean * scale, self._confidence(own, query), variance)
 
     def cycling(self, places: np.ndarray) -> Call:
         """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time.
 
         Of several stations the first that the model answers for is asked.
         """
-        asked = self
+        predictor = self
         for name in () if self.site.stations is None else self.site.stations.name:
             with suppress(ValueError):
-                asked = self.at(name)
+                predictor = self.at(name)
                 break
-        ask = getattr(asked, self.site.kind)
+        ask = getattr(predictor, self.site.kind)
         return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
 
     def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
@@ -226,9 +232,9 @@ class Predictor:
             channel = export.uplink_channels(self.method, self.site, uplink, frequency_hz)
             found = export.on_grid(channel, self.site, None, symbols)
             return found if isinstance(uplink, Tensor) else found.numpy()
-        asked = torch.as_tensor(self._ask("csi", tx, rx))
-        asked = asked[None] if asked.ndim == 2 else asked
-        found = export.on_grid(asked, self.site, frequency_hz, symbols)
+        channel = torch.as_tensor(self._ask("csi", tx, rx))
+        channel = channel[None] if channel.ndim == 2 else channel
+        found = export.on_grid(channel, self.site, frequency_hz, symbols)
         return found if any(isinstance(end, Tensor) for end in (tx, rx)) else found.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
@@ -242,8 +248,8 @@ class Predictor:
 
         if uplink is not None:
             return export.uplink_paths(self.method, self.site, uplink)
-        asked, pose, _, _ = self._ends(tx, rx)
-        return export.placed_paths(self._whole, self.site, asked, pose)
+        query = self._query(tx, rx)
+        return export.placed_paths(self._whole, self.site, query.tx, query.rx)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
         """Received power (B, 1) float32, linear, in the physical units of the measurements."""
@@ -274,19 +280,17 @@ class Predictor:
         """
         from gsparc.locate import locator, snapshots
 
-        heard, unknown = (
-            snapshots.of_values(self.site, values, silent),
-            locator.Unknown(phase_known, offset_db),
-        )
+        heard = snapshots.of_values(self.site, values, silent)
+        unknown = locator.Unknown(phase_known, offset_db)
         low_high = self.site.moving_box[:, :3] + self.site.origin
         places = low_high if where is None else np.atleast_2d(_positions("where", where))
-        asked = (places.tobytes(), unknown, share)
-        if asked not in self._locators:
+        key = (places.tobytes(), unknown, share)
+        if key not in self._locators:
             cells = locator.cover(places - self.site.origin, locator.MOST, where is not None)
             field = locator.SiteField(self.method, self.site)
             trust = locator.restored(self.extra, unknown, share)
-            self._locators[asked] = locator.Locator(field, cells, unknown, trust, share)
-        return [locator.in_world(one, self.site.origin) for one in self._locators[asked].locate(heard)]
+            self._locators[key] = locator.Locator(field, cells, unknown, trust, share)
+        return [locator.in_world(one, self.site.origin) for one in self._locators[key].locate(heard)]
 
     def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """How sure the model is, (B,) float32 in [0, 1], larger is surer.
@@ -297,8 +301,7 @@ class Predictor:
         Raises:
             ValueError: the method has no confidence of that kind.
         """
-        sure, single, like = self._sure(tx, rx, uplink)
-        return _returned(sure, single, like)
+        return _returned(*self._sure(tx, rx, uplink))
 
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """Whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
@@ -316,25 +319,31 @@ class Predictor:
             raise ValueError(
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
             )
-        sure, single, like = self._sure(tx, rx, uplink)
-        good = sure >= self.trusted.threshold
-        good = good[0] if single else good
-        return good if like else (bool(good) if good.ndim == 0 else good.numpy())
+        sure, single, as_torch = self._sure(tx, rx, uplink)
+        good = _returned(sure >= self.trusted.threshold, single, as_torch)
+        return bool(good) if single and not as_torch else good
 
     def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
-        """Confidences (B,), whether one was asked for, and whether torch was given."""
+        """Confidences (B,), whether one was wanted, and whether torch was given."""
         if uplink is not None:
             from gsparc.prediction import export
 
-            said = export.judged(self.method, self.site, uplink)
-            single, like, places = np.ndim(uplink) == 2, isinstance(uplink, Tensor), None
+            sure = self._confidence(export.judged(self.method, self.site, uplink), None)
+            single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
-            asked, pose, single, like = self._ends(tx, rx)
-            said = _predicted(self._whole, asked, pose)
-            places = self.site.moving(asked, pose).double().numpy()
-        if said.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
+            query = self._query(tx, rx)
+            sure = self._confidence(_predicted(self._whole, query), query)
+            single, as_torch = query.single, query.as_torch
+        if sure is None:
             raise ValueError(f"{self.method.name} has no confidence")
-        return torch.from_numpy(self.trusted.confidence(said, places, self.kind)), single, like
+        return sure, single, as_torch
+
+    def _confidence(self, own: Prediction, query: Query | None) -> Tensor | None:
+        """Of the method's own predictions (B,), of the kind that is wanted; None where it has none."""
+        if own.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
+            return None
+        places = None if query is None else self.site.moving(query.tx, query.rx).double().numpy()
+        return torch.from_numpy(self.trusted.confidence(own, places, self.kind))
 
     def _ask(self, kind: Kind, tx: Any, rx: Any, grad: bool = False) -> Any:
         if self.site.kind != kind:
@@ -345,13 +354,13 @@ class Predictor:
         if grad:
             found, single = self._followed(self.method, tx, rx)
             return found.mean[0] if single else found.mean
-        asked, pose, single, like = self._ends(tx, rx)
-        mean = _predicted(self.method, asked, pose).mean
+        query = self._query(tx, rx)
+        mean = _predicted(self.method, query).mean
         scale = self.site.target_scale
-        return _returned(mean if scale == 1 else mean * scale, single, like)
+        return _returned(mean if scale == 1 else mean * scale, query.single, query.as_torch)
 
     def _followed(self, method: Method, tx: Any, rx: Any) -> tuple[Prediction, bool]:
-        """Moments that autograd follows, and whether one position was asked for; see the class."""
+        """Moments that autograd follows, and whether one position was given; see the class."""
         problem = method.gradient_problem()
         if problem is not None:
             raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
@@ -367,26 +376,28 @@ class Predictor:
             raise ValueError("grad=True: torch.vmap is not followed; give all positions at once, (B, 3)")
         if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
             raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
-        asked, pose, single, _ = self._ends(tx, rx, torch.float64)
+        query = self._query(tx, rx, torch.float64)
         origin = torch.from_numpy(np.asarray(self.site.origin, np.float64))
-        local = {end: (value.cpu().double() - origin).expand(len(asked), 3) for end, value in ends.items()}
-        at = Pose(local.get("rx", pose.position), pose.rotation)
-        with suited_threads(method, len(asked)):
+        local = {end: (value.cpu().double() - origin).expand(len(query.tx), 3) for end, value in ends.items()}
+        at = Pose(local.get("rx", query.rx.position), query.rx.rotation)
+        with suited_threads(method, len(query.tx)):
             if transforming() and method not in self._prepared:  # what it keeps must not be a transform's
                 self._prepared.append(method)
                 with torch._C._DisableFuncTorch(), torch.no_grad():
-                    method.predict(asked, pose)
-            found = method.predict(local.get("tx", asked), at)
+                    method.predict(query.tx, query.rx)
+            found = method.predict(local.get("tx", query.tx), at)
         dtype = torch.float32
         for value in ends.values():
             dtype = torch.promote_types(dtype, value.dtype)
         scale, own = self.site.target_scale, (self.kind or self.trusted.kind) in (None, "learned")
         mean = (found.mean * scale).to(dtype.to_complex() if found.mean.is_complex() else dtype)
         sure = None if found.confidence is None or not own else found.confidence.to(dtype)
-        return Prediction(mean, sure, None if found.variance is None else found.variance * scale**2), single
+        return Prediction(
+            mean, sure, None if found.variance is None else found.variance * scale**2
+        ), query.single
 
-    def _ends(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pose, bool, bool]:
-        """Both ends in local coordinates, whether one position was asked for, and whether torch was given."""
+    def _query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Query:
+        """Both ends as they were given, checked."""
         given = rx.position if isinstance(rx, Pose) else rx
         places = {
             end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
@@ -398,8 +409,8 @@ class Predictor:
         single = all(place.ndim == 1 for place in places.values())
         common = self._still is not None and len(places) == 1 and dtype == torch.float32
         if self._still is not None and common:  # with nothing to look up
-            asked = _float(np.atleast_2d(places[moving] - self.site.origin))
-            return asked, self._still, single, isinstance(tx, Tensor)
+            sender = _float(np.atleast_2d(places[moving] - self.site.origin))
+            return Query(sender, self._still, single, isinstance(tx, Tensor))
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
         count = max(len(place) for place in local.values())
         for end, place in local.items():
@@ -413,8 +424,8 @@ class Predictor:
             positions = np.broadcast_to(ends["rx"], (count, 3))
             turned = np.broadcast_to(rotation, (count, 3, 3))
             pose = Pose(_float(positions, dtype), _float(turned, dtype))
-        asked = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        return asked, pose, single, any(isinstance(v, Tensor) for v in (tx, given))
+        sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
+        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, given)))
 
     def _still_pose(self) -> Pose | None:
         """The pose of a receiver that never moved, made once; None for any other site."""
@@ -449,9 +460,9 @@ class Predictor:
 
 
 @torch.no_grad()
-def _predicted(method: Method, tx: Tensor, rx: Pose) -> Prediction:
-    with suited_threads(method, len(tx)):
-        return method.predict(tx, rx)
+def _predicted(method: Method, query: Query) -> Prediction:
+    with suited_threads(method, len(query.tx)):
+        return method.predict(query.tx, query.rx)
 
 
 def usual_heights(site: Site) -> dict[End, float]:

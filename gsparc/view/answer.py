@@ -62,11 +62,7 @@ class Rays:
 
 
 def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
-    """Ask about one place (two where both ends move).
-
-    Args:
-        predictor: of one station where there are several.
-        ends: world places (3,) [m] of the ends that move.
+    """Predict at world places (3,) [m] of the ends that move, of one station where there are several.
 
     Raises:
         ValueError: a place that cannot be.
@@ -75,17 +71,17 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
     start = time.perf_counter()
     mean = np.asarray(getattr(predictor, kind)(**ends))
     query_ms = (time.perf_counter() - start) * 1e3
-    asked: dict[str, Any] = {end: np.atleast_2d(place) for end, place in ends.items()}
-    said = predictor.predict(**asked)
+    query: dict[str, Any] = {end: np.atleast_2d(place) for end, place in ends.items()}
+    prediction = predictor.predict(**query)
     still: dict[str, np.ndarray] = {}
     if site.static_end is not None and site.static_position is not None:
         still[site.static_end] = site.static_position + site.origin
     level = spread = None
     if kind != "spectrum":
-        level, spread = (float(value[0]) for value in predicted(said, kind))
+        level, spread = (float(value[0]) for value in predicted(prediction, kind))
     return Answer(
         {**still, **ends}, query_ms, level, spread,
-        None if said.confidence is None else float(said.confidence[0]),
+        None if prediction.confidence is None else float(prediction.confidence[0]),
         mean if kind == "spectrum" else None, mean if kind == "csi" else None,
         _strongest(mean, site) if kind == "spectrum" else None, _rays(predictor, ends),
     )  # fmt: skip
@@ -125,7 +121,7 @@ def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> 
     """
     gain = gain.astype(np.complex128)
     left = np.argsort(-(np.abs(gain) ** 2).mean(axis=0))
-    kept, power = [], []
+    firsts, power = [], []
     while len(left):
         first = left[0]
         alike = left == first
@@ -133,11 +129,11 @@ def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> 
             alike |= (np.abs(delay_ns[left] - delay_ns[first]) < SAME_NS) & (
                 towards[left] @ towards[first] > SAME_COSINE
             )
-        kept.append(first)
+        firsts.append(first)
         power.append(float((np.abs(gain[:, left[alike]].sum(axis=1)) ** 2).mean()))
         left = left[~alike]
     level = np.array(power)
     order = np.argsort(-level)
     order = order[level[order] > level.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
-    chosen = np.array(kept, np.int64)[order]
+    chosen = np.array(firsts, np.int64)[order]
     return Rays(10 * np.log10(level[order]), delay_ns[chosen], None if towards is None else towards[chosen])

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gsparc.data.schema import Site
+from gsparc.data.blocks import evenly
+from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
-from gsparc.data.walls import SceneWalls
+from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.levels import MAPPED
+from gsparc.maps.pictures import Legend
 from gsparc.models.method import HasGaussians
 from gsparc.ops import Pose
 from gsparc.view.answer import SILENT_DB, Answer
-from gsparc.view.scene import EXTENT, Faces, Frame, Legend, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.view.crossed import fans
+from gsparc.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
 from gsparc.view.viewed import Measured, Viewed
 
 log = logging.getLogger(__name__)
@@ -57,14 +60,7 @@ class Given:
 
 
 def build(viewed: Viewed, given: Given, station: str | None, measured: Measured | None) -> Scene:
-    """Everything that stands still, seen from one station.
-
-    Args:
-        viewed: the model.
-        given: what else is known.
-        station: whose measurements and Gaussians are drawn.
-        measured: of that station.
-    """
+    """Everything that stands still, with the measurements and the Gaussians of one station."""
     shown = [viewed.box()]  # where was measured, and the ends that stand
     shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
     if viewed.site.static_end is None:
@@ -88,20 +84,20 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
             named = len(viewed.stations) <= MOST_NAMES or name == station
             text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
             parts.append(Mark(f"station {name or ''}".strip(), place, text))
-    objects = viewed.asked(station).method.objects()
+    objects = viewed.predictor_of(station).method.objects()
     origin = viewed.site.origin
     parts += [
-        _plane_faces(f"mirror {number}", plane, frame.middle - origin, origin, extent)
+        _mesh(f"mirror {number}", [_square(plane, frame.middle - origin, extent) + origin], MIRROR, 0.12)
         for number, plane in enumerate(objects.planes)
     ]
-    parts += [_box_faces(f"box {number}", box) for number, box in enumerate(objects.boxes + origin)]
+    parts += _boxes("box", objects.boxes + origin)
     cloud = cloud_of(viewed, station, measured)
     if cloud is not None:
         parts += _cloud_parts(cloud, legends, extent)
     hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
-    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
-    edge = _corners(viewed.box())[np.array(pairs)]
-    parts.append(Lines("box of measurements", edge, np.full((len(pairs), 3), 150, np.uint8)))
+    faces = np.array(box_faces(*viewed.box()))
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
+    parts.append(Lines("box of measurements", sides, np.full((len(sides), 3), 150, np.uint8)))
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
@@ -120,7 +116,7 @@ def ground_of(viewed: Viewed, given: Given) -> float:
 
 
 def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
-    chosen = np.linspace(0, len(measured.places) - 1, min(len(measured.places), MOST_POINTS)).astype(int)
+    chosen = evenly(len(measured.places), MOST_POINTS)
     places, values = measured.places[chosen], measured.values[chosen]
     size = dot_size(places, extent)
     legends[VALUES] = Legend.over(measured.label, values)
@@ -168,7 +164,7 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
 @torch.no_grad()
 def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
     """Gaussians in world coordinates: those that are rendered, or those that paths lose power in."""
-    predictor = viewed.asked(station)
+    predictor = viewed.predictor_of(station)
     method, site = predictor.method, predictor.site
     if isinstance(method, HasGaussians):
         try:
@@ -203,41 +199,33 @@ def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]
     return fixed.expand(len(moving), 3), Pose(moving, turn.expand(len(moving), 3, 3))
 
 
-def _plane_faces(name: str, plane: np.ndarray, middle: np.ndarray, origin: np.ndarray, reach: float) -> Faces:
-    """A square of a mirror plane around the foot of the site's middle."""
-    normal = plane[:3] / np.linalg.norm(plane[:3])
-    foot = middle - (normal @ middle - plane[3] / np.linalg.norm(plane[:3])) * normal
+def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:
+    """Corners (4, 3) of a square of a plane (4,) around the foot of a place (3,)."""
+    length = np.linalg.norm(plane[:3])
+    normal = plane[:3] / length
+    foot = middle - (normal @ middle - plane[3] / length) * normal
     one = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
     one /= np.linalg.norm(one)
     two = np.cross(normal, one)
-    half = reach / 2
-    corners = foot + half * np.array([-one - two, one - two, one + two, two - one]) + origin
-    return Faces(name, corners, np.array([[0, 1, 2], [0, 2, 3]]), MIRROR, 0.12)
+    return foot + side / 2 * np.array([-one - two, one - two, one + two, two - one])
 
 
-def _box_faces(name: str, box: np.ndarray) -> Faces:
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Faces(name, _corners(box), triangles, BOX, 0.35)
-
-
-def _corners(box: np.ndarray) -> np.ndarray:
-    """(8, 3) of a box (2, 3), z running first."""
-    return np.array(list(product(*box.T)))
+def _mesh(name: str, faces: Sequence[np.ndarray], colour: tuple[int, int, int], opacity: float) -> Faces:
+    """Flat faces (C, 3) as triangles."""
+    triangles = fans(faces)
+    return Faces(
+        name, triangles.reshape(-1, 3), np.arange(triangles.size // 3).reshape(-1, 3), colour, opacity
+    )
 
 
 def walls_faces(walls: SceneWalls) -> list[Part]:
     """Known walls as one mesh, and boxes."""
-    vertices, triangles, count = [], [], 0
-    for face in walls.faces:
-        vertices.append(face)
-        triangles += [[count, count + i, count + i + 1] for i in range(1, len(face) - 1)]
-        count += len(face)
-    parts: list[Part] = []
-    if triangles:
-        parts.append(Faces("walls", np.concatenate(vertices), np.array(triangles), WALL, 0.4))
-    parts += [_box_faces(f"known box {number}", box) for number, box in enumerate(walls.boxes)]
-    return parts
+    parts: list[Part] = [_mesh("walls", walls.faces, WALL, 0.4)] if walls.faces else []
+    return parts + _boxes("known box", walls.boxes)
+
+
+def _boxes(name: str, boxes: np.ndarray) -> list[Part]:
+    return [_mesh(f"{name} {number}", box_faces(*box), BOX, 0.35) for number, box in enumerate(boxes)]
 
 
 @dataclass(frozen=True)
@@ -283,7 +271,7 @@ def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     paths, receiver = answer.paths, answer.ends.get("rx")
     if paths is None or paths.towards is None or receiver is None:
         return None
-    length = paths.delay_ns * 0.299792458
+    length = paths.delay_ns * 1e-9 * LIGHT
     shown = np.minimum(length, REACH * extent)
     ends = receiver + paths.towards * shown[:, None]
     colours = PATHS.of(paths.gain_db - paths.gain_db.max(initial=-np.inf))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,10 +30,8 @@ class Obstacles:
     @classmethod
     def of(cls, walls: SceneWalls) -> Obstacles:
         """What is known of a scene."""
-        fans = [face[[0, i, i + 1]] for face in walls.faces for i in range(1, len(face) - 1)]
         count = np.array([len(face) - 2 for face in walls.faces], np.int64)
-        triangles = np.array(fans).reshape(-1, 3, 3)
-        return cls(triangles, np.repeat(np.arange(len(count)), count), walls.boxes)
+        return cls(fans(walls.faces), np.repeat(np.arange(len(count)), count), walls.boxes)
 
     def crossed(self, start: np.ndarray, end: np.ndarray) -> int:
         """Walls and boxes that the line between two places (3,) [m] passes; both sides of one count once."""
@@ -66,6 +65,12 @@ class Obstacles:
         enter, leave = np.nanmax(edges.min(1), axis=1), np.nanmin(edges.max(1), axis=1)
         hit = (np.maximum(enter, 0) < np.minimum(leave, 1)) & np.isfinite(leave)
         return np.asarray(np.maximum(enter, 0)[hit])
+
+
+def fans(faces: Sequence[np.ndarray]) -> np.ndarray:
+    """Triangles (T, 3, 3) of flat faces (C, 3), each a fan about its first corner."""
+    triangles = [face[[0, i, i + 1]] for face in faces for i in range(1, len(face) - 1)]
+    return np.array(triangles).reshape(-1, 3, 3)
 
 
 def crossed_losses(objects: SiteObjects, start: np.ndarray, end: np.ndarray) -> np.ndarray:

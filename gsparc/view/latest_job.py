@@ -35,10 +35,10 @@ class LatestJobQueue:
             self._jobs[key] = urgent, job
             self._wake.notify_all()
 
-    def forget(self, of: Callable[[Hashable], bool]) -> None:
-        """Drop the jobs of keys for which this holds."""
+    def forget(self, client: Hashable) -> None:
+        """Drop the jobs whose keys begin with a client."""
         with self._wake:
-            for key in [key for key in self._jobs if of(key)]:
+            for key in [key for key in self._jobs if isinstance(key, tuple) and key[0] == client]:
                 del self._jobs[key]
                 self._begun.pop(key, None)
 

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.blocks import evenly
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import logarithmic, panels
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import Answer
 from gsparc.view.reasons import Usual
-from gsparc.view.scene import Legend
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
 MOST_LINES = 4  # antennas whose responses are drawn
@@ -19,19 +20,16 @@ MOST_DOTS = 1500  # measured levels that are drawn
 FLOOR_DB = -60.0  # below the largest entry of a channel, where its response ends
 
 
-def spectrum_image(spectrum: np.ndarray, least_width: int = 360) -> np.ndarray:
-    """A spectrum (H, W) as (h, w, 3) uint8: azimuth to the right, elevation upwards."""
-    times = max(1, -(-least_width // spectrum.shape[1]))
+def spectrum_image(spectrum: np.ndarray) -> np.ndarray:
+    """A spectrum (H, W) as (h, w, 3) uint8, at least 360 wide: azimuth to the right, elevation upwards."""
+    times = max(1, -(-360 // spectrum.shape[1]))
     return np.repeat(np.repeat(SPECTRUM.of(spectrum[::-1]), times, axis=0), times, axis=1)
 
 
 def response_db(response: np.ndarray) -> np.ndarray:
     """Lines [dB] of a channel (A, K): of at most `MOST_LINES` antennas (a, K); the mean (A,) of one tone."""
     power = np.abs(response).astype(np.float64) ** 2
-    if power.shape[1] == 1:
-        power = power[:, 0]
-    else:
-        power = power[np.linspace(0, len(power) - 1, min(len(power), MOST_LINES)).astype(int)]
+    power = power[:, 0] if power.shape[1] == 1 else power[evenly(len(power), MOST_LINES)]
     return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
 
 
@@ -77,7 +75,7 @@ def _draw_level(axis: Any, answer: Answer, known: Usual | None, unit: str) -> No
         return
     ends = list(answer.ends.values())
     if len(known.distance_m) and len(ends) == 2:
-        few = np.linspace(0, len(known.level_db) - 1, min(len(known.level_db), MOST_DOTS)).astype(int)
+        few = evenly(len(known.level_db), MOST_DOTS)
         axis.plot(known.distance_m[few], known.level_db[few], ".", ms=3, color="0.7", label="measured")
         far = np.geomspace(known.distance_m.min(), known.distance_m.max(), 50)
         axis.plot(far, known.at(far), color="0.3", label="distance alone")

@@ -10,9 +10,10 @@ import numpy as np
 
 from gsparc.maps.area import Grid
 from gsparc.maps.making import levels_at
+from gsparc.maps.pictures import Legend
 from gsparc.prediction.predictor import Predictor
 from gsparc.view.reasons import Usual
-from gsparc.view.scene import Legend, Sheet
+from gsparc.view.scene import Sheet
 
 FIRST = 400  # cells of the first, coarsest picture, about
 STEP_S = 0.03  # of a step: what a drag waits for [s]
@@ -49,10 +50,7 @@ def refining(
 ) -> Iterator[Plane | None]:
     """Planes of ever smaller strides; None between them, about every `STEP_S`.
 
-    Args:
-        predictor: of one station where there are several.
-        grid: the cells.
-        other: (3,) world place of the transmitter where both ends move [m].
+    `other` (3,) is the transmitter's world place [m] where both ends move.
     """
     ny, nx = grid.shape
     level = np.full(grid.shape, np.nan)
@@ -83,10 +81,9 @@ def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
 
 
 def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:
-    """A picture of values (ny, nx) over the cells, clear where they are not finite.
+    """A picture of values (ny, nx) over the cells, clear where they are not finite, `beneath` [m] lower.
 
-    Args:
-        beneath: [m] lower than it is: half a dot where dots of the same height are to be seen whole.
+    Half a dot lower, dots of the same height are seen whole.
     """
     clear = np.where(np.isfinite(values), round(255 * OPACITY), 0)[..., None].astype(np.uint8)
     image = np.concatenate([legend.of(values), clear], axis=-1)
@@ -98,10 +95,9 @@ def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: fl
 
 
 def weakest(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
-    """World place (3,) [m] of the cell of least power; None where there is none.
+    """World place (3,) [m] of the cell of least power, `APART` of the plane's width from places `seen` (3,).
 
-    Args:
-        seen: places (3,) that it is to be `APART` of the plane's width from.
+    None where there is none.
     """
     level = np.where(plane.grid.inside, plane.level_db, np.nan)
     left, right, low, high = plane.grid.extent

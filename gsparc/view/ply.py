@@ -24,14 +24,9 @@ LEAST_SHARE = 1e-6  # of opacities, whose logits are
 
 
 def write_ply(path: str | Path, cloud: GaussianCloud, colours: np.ndarray) -> None:
-    """Write N Gaussians, whole or not at all.
+    """Write N Gaussians in colours (N, 3) uint8, whole or not at all.
 
     >>> write_ply("gaussians.ply", cloud, colours)
-
-    Args:
-        path: of the file.
-        cloud: logarithms of its scales and logits of its opacities are stored.
-        colours: (N, 3) uint8.
 
     Raises:
         DataError: there are none, or one is not finite.

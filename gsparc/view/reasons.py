@@ -10,10 +10,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.site_objects import SiteObjects
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import SILENT_DB, Answer, azimuth_elevation
 from gsparc.view.building import SURFACES
 from gsparc.view.crossed import Obstacles, crossed_losses
-from gsparc.view.scene import Faces, Legend, Part
+from gsparc.view.scene import Faces, Part
 
 NEAREST_M = 0.1  # where a distance law ends
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
@@ -86,20 +87,14 @@ class Surroundings:
 
 
 def reasons(answer: Answer, moving: str, about: Surroundings) -> list[str]:
-    """Why the level is what it is, one line each.
-
-    Args:
-        answer: at a place.
-        moving: the end that was dragged.
-        about: what is known there.
-    """
+    """Why the level is what it is, one line each; `moving` is the end that was dragged."""
     here, there = answer.ends[moving], answer.ends.get("rx" if moving == "tx" else "tx")
-    said = _among(answer, about.values)
+    lines = _among(answer, about.values)
     if there is not None:
-        said += _between(answer, here, there, about)
+        lines += _between(answer, here, there, about)
     if about.usual is not None:
-        said.append(_nearest(answer, here, about.usual.tree))
-    return said + _paths(answer)
+        lines.append(_nearest(answer, here, about.usual.tree))
+    return lines + _paths(answer)
 
 
 def _among(answer: Answer, values: np.ndarray) -> list[str]:
@@ -114,31 +109,31 @@ def _among(answer: Answer, values: np.ndarray) -> list[str]:
 
 def _between(answer: Answer, here: np.ndarray, there: np.ndarray, about: Surroundings) -> list[str]:
     known, far = about.usual, float(np.linalg.norm(here - there))
-    said, weak = [f"{far:.3g} m from the other end"], False
+    lines, weak = [f"{far:.3g} m from the other end"], False
     if known is not None and answer.level_db is not None and np.isfinite(known.at_one):
         plain = float(known.at(far))
         gap = answer.level_db - plain
         weak = gap < -known.spread_db
         how = "weaker" if weak else "stronger" if gap > known.spread_db else "as usual"
-        said.append(
+        lines.append(
             f"distance alone: {plain:.1f} {about.unit}; here {abs(gap):.1f} dB "
             f"{'less' if gap < 0 else 'more'} ({how}, measured levels spread {known.spread_db:.1f} dB)"
         )
     if about.walls is not None:
         walls = about.walls.crossed(here, there)
-        said.append(
+        lines.append(
             f"the straight path crosses {walls or 'no'} {'wall or box' if walls == 1 else 'walls or boxes'}"
         )
     if len(about.objects.means):
         crossed = crossed_losses(about.objects, here - about.origin, there - about.origin)
         strong = crossed[np.abs(crossed) >= LEAST_LOSS_DB]
         word = "Gaussian that takes" if len(strong) == 1 else "Gaussians that take"
-        said.append(f"the straight path crosses {len(strong)} {word} {crossed.sum():.1f} dB by the model")
+        lines.append(f"the straight path crosses {len(strong)} {word} {crossed.sum():.1f} dB by the model")
     elif weak and about.walls is None and answer.paths is None:
-        said.append(
+        lines.append(
             "what takes the rest is not known: this model holds no obstacles, and no walls=FILE is given"
         )
-    return said
+    return lines
 
 
 def _nearest(answer: Answer, here: np.ndarray, tree: cKDTree) -> str:
@@ -160,7 +155,7 @@ def _paths(answer: Answer) -> list[str]:
     more = ""
     if rays.towards is not None:
         more = " from azimuth {:.0f}°, elevation {:.0f}°".format(*azimuth_elevation(rays.towards[0]))
-    said = [
+    lines = [
         f"{len(rays.gain_db)} paths within {SILENT_DB:g} dB; strongest {rays.gain_db[0]:.1f} dB at "
         f"{rays.delay_ns[0]:.1f} ns{more}"
     ]
@@ -168,8 +163,8 @@ def _paths(answer: Answer) -> list[str]:
         gap = answer.level_db - 10 * np.log10((10 ** (rays.gain_db / 10)).sum())
         if abs(gap) >= PHASES_DB:
             how = "cancel each other" if gap < 0 else "add up"
-            said.append(f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers")
-    return said
+            lines.append(f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers")
+    return lines
 
 
 ENDS = {"tx": "transmitter", "rx": "receiver"}
@@ -177,14 +172,14 @@ ENDS = {"tx": "transmitter", "rx": "receiver"}
 
 def headline(answer: Answer, unit: str = "dB") -> str:
     """Level and confidence in one line."""
-    said = []
+    lines = []
     if answer.level_db is not None:
         spread = "" if answer.spread_db is None else f" ± {answer.spread_db:.1f}"
-        said.append(f"{answer.level_db:.1f}{spread} {unit}")
+        lines.append(f"{answer.level_db:.1f}{spread} {unit}")
     if answer.strongest is not None:
-        said.append("strongest from azimuth {:.0f}°, elevation {:.0f}° (world)".format(*answer.strongest))
-    said.append("no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}")
-    return ", ".join(said)
+        lines.append("strongest from azimuth {:.0f}°, elevation {:.0f}° (world)".format(*answer.strongest))
+    lines.append("no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}")
+    return ", ".join(lines)
 
 
 def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:
@@ -205,7 +200,7 @@ def legend_html(legends: Iterable[Legend], surfaces: Iterable[Part] = ()) -> str
         swatch = f'<span style="background:rgb{colour};opacity:.6">&emsp;</span>'
         rows.append(f'<div style="margin:.35em .7em;font-size:.8em">{swatch} {SURFACES[colour]}</div>')
     for legend in dict.fromkeys(legends):
-        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in legend.strip(16))
+        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in legend.strip())
         rows.append(
             f'<div style="margin:.35em .7em;font-size:.8em">{html.escape(legend.label)}'
             f'<div style="height:.8em;background:linear-gradient(to right,{stops})"></div>'

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from matplotlib import colormaps
 
-GREY = (170, 170, 170)  # of values that are not known
+from gsparc.maps.pictures import Legend
+
 EXTENT = 10.0  # of a site in drawn units: near and far planes, controls and camera are then alike everywhere
 
 
@@ -104,36 +104,6 @@ class Mark:
 
 
 Part = Points | Lines | Splats | Faces | Sheet | Mark
-
-
-@dataclass(frozen=True)
-class Legend:
-    """What colours mean: from `low` to `high` of `label`, in a matplotlib colour map."""
-
-    label: str
-    low: float
-    high: float
-    colours: str = "viridis"
-
-    def of(self, values: np.ndarray) -> np.ndarray:
-        """Colours (..., 3) uint8 of values (...); grey where they are not finite."""
-        with np.errstate(invalid="ignore"):
-            share = np.clip((values - self.low) / max(self.high - self.low, 1e-30), 0, 1)
-        known = np.isfinite(values)
-        found = np.round(255 * colormaps[self.colours](np.where(known, share, 0.0))[..., :3]).astype(np.uint8)
-        found[~known] = GREY
-        return found
-
-    @classmethod
-    def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:
-        """From the 1 to the 99 % quantile of those values that are finite."""
-        known = values[np.isfinite(values)]
-        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
-        return cls(label, float(low), float(high if high > low else low + 1.0), colours)
-
-    def strip(self, count: int = 64) -> np.ndarray:
-        """Colours (count, 3) uint8 from low to high."""
-        return self.of(np.linspace(self.low, self.high, count))
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.blocks import evenly
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.levels import MAPPED
-from gsparc.maps.pictures import Layer
+from gsparc.maps.pictures import Layer, Legend
 from gsparc.view.building import VALUES, Given, Sphere, build, start_place
 from gsparc.view.crossed import Obstacles
 from gsparc.view.plane import Plane, refining
 from gsparc.view.reasons import Surroundings, usual
-from gsparc.view.scene import EXTENT, Legend, Points, Scene
+from gsparc.view.scene import EXTENT, Points, Scene
 from gsparc.view.viewed import Measured, Viewed
 
 
@@ -93,7 +94,7 @@ class SiteView:
             levels = values if viewed.site.kind in MAPPED else np.full(len(values), np.nan)
             known = usual(measured.places, levels, viewed.others(name))
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        objects, origin = viewed.asked(name).method.objects(), viewed.site.origin
+        objects, origin = viewed.predictor_of(name).method.objects(), viewed.site.origin
         faces = () if self.given.walls is None else self.given.walls.faces
         boxes = objects.boxes + origin
         if self.given.walls is not None:
@@ -126,7 +127,7 @@ class SiteView:
     def plane(self, name: str | None, grid: Grid) -> Plane:
         """Power over all of some cells, the transmitter where it first stands if both ends move."""
         other = None if self.viewed.site.static_end is not None else self.starts(name)["tx"].tolist()
-        *_, plane = refining(self.viewed.asked(name), grid, other)
+        *_, plane = refining(self.viewed.predictor_of(name), grid, other)
         assert plane is not None
         return plane
 
@@ -145,4 +146,4 @@ def walk(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
         low, high = view.viewed.box()
         return [low + (high - low) * share for share in np.linspace(0.1, 0.9, count)]
     places = measured.places
-    return list(places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)])
+    return list(places[evenly(len(places), count)])

@@ -13,13 +13,15 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from gsparc.data.blocks import evenly
 from gsparc.evaluation.drawing import panels, save
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import ask
 from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
 from gsparc.view.panel import RED, draw_answer
 from gsparc.view.plane import thinned
 from gsparc.view.reasons import ENDS, headline
-from gsparc.view.scene import Faces, Legend, Lines, Mark, Points
+from gsparc.view.scene import Faces, Lines, Mark, Points
 from gsparc.view.site_view import SiteView
 
 WIDTH, HEIGHT, DPI = 8.0, 4.4, 150  # readable at 600 pixels
@@ -30,15 +32,10 @@ FLATTEST = 0.2  # of height to width, that a flat site is drawn with
 
 
 def draw_still(view: SiteView, path: Path) -> None:
-    """Save the scene of the first station with the answer at the first place as PNG.
-
-    Args:
-        view: the model.
-        path: of the file.
-    """
+    """Save the scene of the first station with the answer at the first place as PNG."""
     name = view.viewed.stations[0]
     one, viewed = view.station(name), view.viewed
-    answer = ask(viewed.asked(name), view.starts(name))
+    answer = ask(viewed.predictor_of(name), view.starts(name))
     figure, axes = panels(WIDTH, HEIGHT, 1, 2, width_ratios=[1.6, 1.0])
     place = axes[0, 0].get_subplotspec()
     axes[0, 0].remove()
@@ -94,7 +91,7 @@ def _dots(axis: Any, part: Points, low: np.ndarray, high: np.ndarray) -> None:
     inside = np.flatnonzero(((part.places >= low) & (part.places <= high)).all(axis=1))
     if part.name not in (VALUES, GAUSSIANS, SOURCES) or not len(inside):
         return
-    few = inside[np.linspace(0, len(inside) - 1, min(len(inside), MOST_DOTS)).astype(int)]
+    few = inside[evenly(len(inside), MOST_DOTS)]
     how = {"alpha": 0.4, "s": 9} if part.name == GAUSSIANS else {"alpha": 0.9, "s": 6}
     axis.scatter(
         *part.places[few].T, c=part.colours[few] / 255, linewidths=0, depthshade=False, zorder=3, **how

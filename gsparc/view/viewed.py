@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.errors import DataError
-from gsparc.data.links.stations import station_number
+from gsparc.data.blocks import evenly
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import open_files
 from gsparc.maps import levels
+from gsparc.maps.making import answering
 from gsparc.models import loading
 from gsparc.models.reduced import reduced
 from gsparc.prediction.confidence import Trusted, trusted_of
-from gsparc.prediction.operating_point import kept
+from gsparc.prediction.operating_point import stored_points
 from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
@@ -87,8 +87,8 @@ class Viewed:
         """Ends that can be dragged."""
         return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
 
-    def asked(self, station: str | None, way: int = -1) -> Predictor:
-        """Who answers for a station."""
+    def predictor_of(self, station: str | None, way: int = -1) -> Predictor:
+        """Of a station, at one of the operating points."""
         return self.ways[way] if station is None else self.ways[way].at(station)
 
     def still(self, station: str | None) -> np.ndarray | None:
@@ -139,10 +139,10 @@ class Viewed:
             what = "received power" if data.site.kind == "rssi" else "power of a channel"
             label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
         errors = np.full(len(rows), np.nan)
-        held = np.flatnonzero(np.isin(rows, self.test))
-        held = held[np.linspace(0, len(held) - 1, min(len(held), MOST_ERRORS)).astype(int)]
-        for start in range(0, len(held), CHUNK):
-            part = held[start : start + CHUNK]
+        tested = np.flatnonzero(np.isin(rows, self.test))
+        tested = tested[evenly(len(tested), MOST_ERRORS)]
+        for start in range(0, len(tested), CHUNK):
+            part = tested[start : start + CHUNK]
             errors[part] = _errors(self.predictor, data, rows[part], values[part])
         return Measured(places, values, label, errors, error_label)
 
@@ -151,11 +151,11 @@ class Viewed:
 def _errors(predictor: Predictor, data: Measurements, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Of rows (n,): |difference of levels| [dB], or PSNR [dB] of spectra."""
     batch = data.batch(rows)
-    said = predictor.method.answer(batch)
+    prediction = predictor.method.answer(batch)
     if data.site.kind == "spectrum":
-        square = (said.mean - batch.target).square().flatten(1).mean(1).double().numpy()
+        square = (prediction.mean - batch.target).square().flatten(1).mean(1).double().numpy()
         return -10 * np.log10(np.maximum(square, LEAST_RATIO))
-    mean = replace(said, variance=None)
+    mean = replace(prediction, variance=None)
     return np.abs(levels.predicted(mean, data.site.kind, data.site.target_scale)[0] - values)
 
 
@@ -190,41 +190,17 @@ def open_viewed(
         method, stored = loading.load(path)
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
     site, trusted = stored.site, trusted_of(stored.extra)
-    points, measured = kept(stored.extra)
+    points, measured = stored_points(stored.extra)
     ways = []
     for point in sorted((point for point in points if point.settings), key=lambda point: point.p50_ms):
-        lean, whole, sure = reduced(method, point.settings, measured), method, trusted
+        lean, whole, confidence = reduced(method, point.settings, measured), method, trusted
         if point.settings.get("confidence") is False:
-            whole, sure = lean, Trusted()
-        ways.append(Predictor(lean, site, whole, point, sure, None, stored.extra))
+            whole, confidence = lean, Trusted()
+        ways.append(Predictor(lean, site, whole, point, confidence, None, stored.extra))
     complete = min((one for one in points if not one.settings), key=lambda one: one.p50_ms, default=None)
     ways.append(Predictor(method, site, point=complete, trusted=trusted, extra=stored.extra))
-    return Viewed(
-        str(path), tuple(ways), data, test, _stations(ways[-1], station), tuple(notes),
-        unit or site.level_unit,
-    )  # fmt: skip
-
-
-def _stations(predictor: Predictor, wanted: str | int | None) -> tuple[str | None, ...]:
-    stations = predictor.site.stations
-    if stations is None:
-        if wanted is not None:
-            raise DataError(
-                f"station={wanted}: the model of {predictor.site.name} has no stations; leave it out"
-            )
-        return (None,)
-    if wanted is not None:
-        number = station_number(wanted, stations.name, len(stations))
-        if number is None:
-            raise DataError(f"station={wanted}: there is none; there are {', '.join(stations.name)}")
-        return (stations.name[number],)
-    found = []
-    for name in stations.name:
-        try:
-            predictor.at(name)
-            found.append(name)
-        except ValueError as error:
-            log.warning("%s is left out: %s", name, error)
-    if not found:
-        raise DataError("the model answers for none of its stations")
-    return tuple(found)
+    names, missing = answering(ways[-1], None if station is None else [station], key="station")
+    for note in missing:
+        log.warning(note)
+    stations = tuple(name or None for name in names)
+    return Viewed(str(path), tuple(ways), data, test, stations, tuple(notes), unit or site.level_unit)

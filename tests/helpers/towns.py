@@ -37,8 +37,11 @@ def town_file(path: Path, rows: int = 300, seed: int = 0) -> Path:
 @cache
 def town_model() -> Path:
     """A checkpoint of `gp` on half of the town's blocks."""
-    folder = Path(mkdtemp())
-    file = town_file(folder / "town.npz")
-    more = ("split=random", "model=gp", "baselines=[]", "logger=none", "threads=1")
-    train(compose("dataset=own", f"dataset.file={file}", *more), folder)
-    return folder / "model.ckpt"
+    return trained(town_file(Path(mkdtemp()) / "town.npz"), "gp", "split=random", "threads=1")
+
+
+def trained(file: Path, model: str, *more: str) -> Path:
+    """The checkpoint of a model of one's own measurements, beside their file."""
+    own = ("dataset=own", f"dataset.file='{file}'", f"model={model}", "baselines=[]", "logger=none")
+    train(compose(*own, *more), file.parent)
+    return file.parent / "model.ckpt"

@@ -17,15 +17,16 @@ from gsparc.maps.area import grid_of
 from gsparc.maps.floor_plan import read_plan
 from gsparc.maps.geojson import read_shapes
 
+SQUARE = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
 
-def geojson(path, kind="Polygon", coordinates=None):
-    square = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
-    path.write_text(json.dumps({"type": kind, "coordinates": square if coordinates is None else coordinates}))
+
+def geojson(path, coordinates=SQUARE):
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": coordinates}))
     return path
 
 
-def image(path, size=(200, 100)):
-    Image.new("RGB", size, "white").save(path)
+def image(path):
+    Image.new("RGB", (200, 100), "white").save(path)
     return path
 
 
@@ -45,7 +46,7 @@ def test_a_polygon_keeps_its_holes(tmp_path):
 def test_degrees_are_those_of_the_model(tmp_path):
     origin = Georeference(47.0, 11.0)
     square = [[[11.0, 47.0], [11.001, 47.0], [11.001, 47.001], [11.0, 47.001]]]
-    low, high = read_shapes(geojson(tmp_path / "a.json", coordinates=square), "area", origin).bounds()
+    low, high = read_shapes(geojson(tmp_path / "a.json", square), "area", origin).bounds()
     assert np.allclose(low, 0, atol=1e-6) and np.allclose(high, [76.06, 111.2], rtol=1e-3)
 
 
@@ -58,96 +59,83 @@ def test_a_plan_lies_where_its_two_points_say(tmp_path):
     assert grid.inside.sum() == 200
 
 
-SPOILT_AREAS = {
-    "x1 must be above": [3, 0, 1, 2],
-    "expected \\[x0,y0,x1,y1\\]": [1, 2, 3],
-    "no coordinate in metres": [0, 0, 1e9, 1],
-    "no such file": "missing.geojson",
-    "or a \\*.geojson file": "area.txt",
-    "expected \\[x0,y0,x1,y1\\] in": [0, 0, "nan", 1],
-}
-
-
-@pytest.mark.parametrize("said", SPOILT_AREAS)
-def test_spoilt_areas(said):
+def refused(said, call, *given, **how):
+    """In one line."""
     with pytest.raises(DataError, match=said) as caught:
-        grid_of(None, SPOILT_AREAS[said], 1.5, 0.5)
+        call(*given, **how)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("said", "how"),
     [
-        ('{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}', "empty polygon"),
-        ('{"type": "Polygon", "coordinates": []}', "no polygon|corners"),
-        ('{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}', "pairs of numbers"),
-        ('{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}', "no polygon"),
-        ('{"type": "FeatureCollection", "features": []}', "no polygon"),
-        ("not json", "not readable"),
-        ("[1, 2]", "not GeoJSON"),
-        ('{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}', "NaN"),
+        ("x1 must be above", {"area": [3, 0, 1, 2]}),
+        (r"expected \[x0,y0,x1,y1\]", {"area": [1, 2, 3]}),
+        ("no coordinate in metres", {"area": [0, 0, 1e9, 1]}),
+        ("no such file", {"area": "missing.geojson"}),
+        (r"or a \*.geojson file", {"area": "area.txt"}),
+        (r"expected \[x0,y0,x1,y1\] in", {"area": [0, 0, "nan", 1]}),
+        ("nothing says where", {"area": None}),
+        ("above 0", {"step_m": 0}),
+        ("above 0", {"step_m": -1.0}),
+        ("memory", {"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}),
+        ("finite", {"height_m": float("nan")}),
     ],
 )
-def test_spoilt_polygons(tmp_path, content, said):
+def test_spoilt_grids(said, how):
+    refused(said, grid_of, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
+
+
+@pytest.mark.parametrize(
+    ("said", "content"),
+    [
+        ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
+        ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
+        ("pairs of numbers", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
+        ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
+        ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
+        ("no polygon", '{"type": "FeatureCollection", "features": []}'),
+        ("not readable", "not json"),
+        ("not GeoJSON", "[1, 2]"),
+    ],
+)
+def test_spoilt_polygons(tmp_path, said, content):
     path = tmp_path / "a.geojson"
     path.write_text(content)
-    with pytest.raises(DataError, match=said) as caught:
-        grid_of(None, str(path), 1.5, 0.5)
-    assert "\n" not in str(caught.value)
+    refused(said, grid_of, None, str(path), 1.5, 0.5)
 
 
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("said", "points", "content"),
     [
-        ({"step_m": 0}, "above 0"),
-        ({"step_m": -1.0}, "above 0"),
-        ({"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}, "memory"),
-        ({"height_m": float("nan")}, "finite"),
-        ({"area": None}, "nothing says where"),
+        ("has no scale", None, None),
+        ("two points", [[0, 0, 0, 0]], None),
+        ("two points", [[0, 0, 1, "x"], [50, 50, 1, 1]], None),
+        ("no scale", [[5, 5, 0, 0], [5, 5, 9, 9]], None),
+        ("one place", [[0, 0, 1, 1], [50, 50, 1, 1]], None),
+        ("not an image", [[0, 0, 0, 0], [9, 9, 9, 9]], "hello"),
+        ("no such file", None, ""),
     ],
 )
-def test_spoilt_grids(how, said):
-    with pytest.raises(DataError, match=said):
-        grid_of(None, **{"area": [0, 0, 4, 4], "height_m": 1.5, **how})
+def test_spoilt_plans(tmp_path, said, points, content):
+    path = image(tmp_path / "p.png")
+    if content is not None:
+        path.unlink()
+    if content:
+        path.write_text(content)
+    refused(said, read_plan, path, points)
 
 
 @pytest.mark.parametrize(
-    ("points", "said"),
+    ("said", "how"),
     [
-        (None, "has no scale"),
-        ([[0, 0, 0, 0]], "two points"),
-        ([[5, 5, 0, 0], [5, 5, 9, 9]], "no scale"),
-        ([[0, 0, 1, 1], [50, 50, 1, 1]], "one place"),
-        ([[0, 0, 1, "x"], [50, 50, 1, 1]], "two points"),
+        ("no station 'nord'", {"stations": ["nord"]}),
+        ("name one", {"stations": []}),
+        ("0 to 1", {"load": 1.5}),
+        ("one per station", {"load": [1, 1, 1]}),
+        ("no station 'south'", {"load": {"south": 1}}),
+        ("stood still", {"other_end": [0, 0, 1]}),
     ],
 )
-def test_spoilt_plans(tmp_path, points, said):
-    with pytest.raises(DataError, match=said):
-        read_plan(image(tmp_path / "p.png"), points)
-
-
-def test_a_plan_that_is_no_image(tmp_path):
-    (tmp_path / "p.png").write_text("hello")
-    with pytest.raises(DataError, match="not an image"):
-        read_plan(tmp_path / "p.png", [[0, 0, 0, 0], [9, 9, 9, 9]])
-    with pytest.raises(DataError, match="no such file"):
-        read_plan(tmp_path / "q.png", None)
-
-
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [
-        ({"stations": ["nord"]}, "no station 'nord'"),
-        ({"stations": []}, "name one"),
-        ({"load": 1.5}, "0 to 1"),
-        ({"load": [1, 1, 1]}, "one per station"),
-        ({"load": {"south": 1}}, "no station 'south'"),
-        ({"other_end": [0, 0, 1]}, "stood still"),
-        ({"step_m": 0}, "above 0"),
-        ({"area": [0, 0, 0, 0]}, "is empty"),
-    ],
-)
-def test_spoilt_maps(how, said):
-    with pytest.raises(DataError, match=said) as caught:
-        map_of(gsparc.load(town_model()), **{"step_m": 5.0, **how})
-    assert "\n" not in str(caught.value)
+def test_spoilt_maps(said, how):
+    refused(said, map_of, gsparc.load(town_model()), **{"step_m": 5.0, **how})

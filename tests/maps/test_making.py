@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
-from gsparc.maps.field_map import REFUSED, best_server, loads, server_chance, sinr
+from gsparc.maps.field_map import ARRAYS, REFUSED, FieldMap, best_server, loads, server_chance, sinr
 from gsparc.maps.intervals import Evidence
 from gsparc.maps.making import _usual, answering, levels_at, map_of
 from gsparc.maps.pictures import layers
@@ -121,17 +122,19 @@ def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
 
 
 def test_saved_and_read_back(predictor, tmp_path):
-    found = map_of(predictor, step_m=10.0)
-    found.save(tmp_path / "map.npz")
-    with np.load(tmp_path / "map.npz") as stored:
-        assert np.array_equal(stored["power_db"], found.power_db)
-        assert stored["stations"].tolist() == ["west", "east"] and stored["x"].shape == (found.grid.shape[1],)
-    assert found.figures()["map/cells"] == found.grid.inside.sum()
+    made = map_of(predictor, [0, 0, 80, 60], step_m=8.0)
+    made.save(tmp_path / "map.npz")
+    found = FieldMap.read(tmp_path / "map.npz")
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
+    assert found.stations == ("west", "east") and found.grid.step == pytest.approx(8.0)
+    assert made.figures()["map/cells"] == made.grid.inside.sum()
+    (tmp_path / "other.npz").write_bytes(b"no archive")
+    with pytest.raises(DataError, match="no map that can be read"):
+        FieldMap.read(tmp_path / "other.npz")
 
 
 def test_spectra_have_no_power(predictor, monkeypatch):
-    from dataclasses import replace
-
     monkeypatch.setattr(predictor, "site", replace(predictor.site, kind="spectrum"))
     with pytest.raises(DataError, match="no received power"):
         map_of(predictor)

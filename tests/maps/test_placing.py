@@ -39,12 +39,6 @@ def test_the_best_place_is_far_from_those_that_serve(together, goal):
     assert (np.diff(found.goal) <= 1e-12).all() and (found.places[:, 2] == 8).all()
 
 
-def test_models_of_known_stations_say_so_in_one_line():
-    with pytest.raises(DataError, match="stations=together") as caught:
-        place_next(gsparc.load(town_model()), threshold_db=-75.0)
-    assert "\n" not in str(caught.value)
-
-
 def test_two_stations_leave_none_out(together):
     method, data, _ = together
     rows = np.arange(len(data))
@@ -52,11 +46,17 @@ def test_two_stations_leave_none_out(together):
     assert new_station_error(method, method_class("distance_law"), data, fold, FitContext()).stations == 0
 
 
-def test_spoilt_wishes(together):
-    predictor = gsparc.load(together[2])
-    with pytest.raises(DataError, match="one of coverage, worst"):
-        place_next(predictor, goal="best")
-    with pytest.raises(DataError, match="at least 1"):
-        place_next(predictor, count=0)
-    with pytest.raises(DataError, match="no such file"):
-        place_next(predictor, sites="missing.geojson")
+@pytest.mark.parametrize(
+    ("said", "how"),
+    [
+        ("one of coverage, worst", {"goal": "best"}),
+        ("at least 1", {"count": 0}),
+        ("no such file", {"sites": "missing.geojson"}),
+        ("stations=together", {}),
+    ],
+)
+def test_spoilt_wishes(together, said, how):
+    model = together[2] if how else town_model()  # whose stations are known ones alone
+    with pytest.raises(DataError, match=said) as caught:
+        place_next(gsparc.load(model), threshold_db=-75.0, **how)
+    assert "\n" not in str(caught.value)

@@ -7,18 +7,18 @@ import os
 import shutil
 import struct
 import subprocess
-import sys
 import zlib
 from functools import partial
 from pathlib import Path
 
+import campaigns
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 
 import gsparc
 from gsparc.commands import export
+from gsparc.commands.train import train
 from gsparc.models import checkpoint
 from gsparc.models.terms import EffectSettings
 from gsparc.prediction.compiled import make
@@ -69,17 +69,9 @@ def of_images(model, **settings):
 
 def of_a_real_array(real, folder):
     """The release's 160 spectra."""
-    out = folder / "rfid"
-    command = [
-        "train",
-        "dataset=rfid",
-        f"dataset.root={real}",
-        "model=gsparc",
-        "baselines=[]",
-        f"hydra.run.dir={out}",
-    ]
-    subprocess.run([sys.executable, "-m", "gsparc", *command], check=True, capture_output=True, cwd=folder)
-    return gsparc.load(out / "model.ckpt")
+    settings = ("dataset=rfid", f"dataset.root={real}", "model=gsparc", "baselines=[]", "logger=none")
+    train(campaigns.compose(*settings), folder)
+    return gsparc.load(folder / "model.ckpt")
 
 
 def built(folder, *options):
@@ -255,8 +247,7 @@ def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, m
     predictor, path, out = of_powers(60), tmp_path / "model.ckpt", tmp_path / "out"
     checkpoint.save(path, predictor.method)
     monkeypatch.setattr(export, "run_directory", lambda: tmp_path)
-    with initialize_config_module("gsparc.conf", version_base=None):
-        config = compose("export", [f"ckpt={path}", f"out={out}"])
+    config = campaigns.compose(f"ckpt={path}", f"out={out}", config="export")
     facts = export.task(config)
     assert facts["export/error"] == 0 and (out / "field.gsparc").stat().st_size == facts["export/bytes"]
     with pytest.raises(ValueError, match="is there already"):
@@ -268,11 +259,7 @@ def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, m
          f"-Wl,-rpath,{out / 'build'}", "-lm", "-o", tmp_path / "query"],
     ):  # fmt: skip
         subprocess.run(command, check=True, capture_output=True, timeout=300)
-    said = subprocess.run(
-        [tmp_path / "query", out / "field.gsparc", "110", "60", "1"],
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout
+    query = [tmp_path / "query", out / "field.gsparc", "110", "60", "1"]
+    said = subprocess.run(query, check=True, capture_output=True, text=True).stdout
     expected = float(predictor.rssi(rx=[110.0, 60, 1])[0])
     assert float(said.split("first value ")[1].split(",")[0]) == pytest.approx(expected, rel=1e-4)

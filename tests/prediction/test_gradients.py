@@ -157,6 +157,7 @@ REFUSED = {
     "mean": "same everywhere",
     "zero": "same everywhere",
     "kriging": "outside of autograd",
+    "gsparc": "footprints",
 }
 QUICK = ("gp, spectra", "complex_gp, both ends", "gp, powers, nearest rows", "gsparc, powers of stations")
 
@@ -259,9 +260,9 @@ def test_gradients_are_those_of_differences(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_forward_mode_equals_reverse_mode(name):
+def test_forward_mode_and_transforms_equal_reverse_mode(name):
     predictor, _ = fitted(name)
-    at = places(predictor)
+    at = places(predictor, 2)
     found = slopes(predictor, at)
     along = torch.randn(at.shape, generator=torch.Generator().manual_seed(2), dtype=at.dtype)
     with forward_ad.dual_level():
@@ -269,22 +270,14 @@ def test_forward_mode_equals_reverse_mode(name):
         forward = {name: forward_ad.unpack_dual(part).tangent for name, part in parts.items()}
     _, pushed = torch.func.jvp(lambda x: sums(predictor, x), (at,), (along,))
     for part, slope in found.items():
-        wanted = (slope * along).sum(1)
         for tangent in (forward[part], pushed[part]):
-            assert error(tangent, wanted) < 1e-9, part
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_transforms_equal_reverse_mode(name):
-    predictor, _ = fitted(name)
-    at = places(predictor, 2)
-    wanted = slopes(predictor, at)["mean"]
+            assert error(tangent, (slope * along).sum(1)) < 1e-9, part
 
     def total(x):
         return sums(predictor, x)["mean"].sum()
 
     for transform in (torch.func.grad, torch.func.jacrev, torch.func.jacfwd):
-        assert error(transform(total)(at), wanted) < 1e-9, transform
+        assert error(transform(total)(at), found["mean"]) < 1e-9, transform
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -326,21 +319,13 @@ def test_at_a_row_and_at_a_single_place_gradients_are_finite(name):
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_models_without_gradients_say_so(name, tmp_path):
-    data = kinds.received(tmp_path)
-    method = method_class(name)()
-    method.fit(data, make_split(data.moving, SplitSettings()).folds[0], FitContext(tmp_path))
-    with pytest.raises(
-        ValueError, match=f"grad=True: {name} has no gradients by position: .*{REFUSED[name]}"
-    ):
-        Predictor(method, data.site).rssi(rx=torch.zeros(3), grad=True)
-
-
-def test_a_moving_receiver_of_rendered_gaussians_says_so(tmp_path):
-    data = images(tmp_path, 40, "rx")
-    method = planned(*RENDERED, "model.field.count=10", "model.keep_best=false")()
+    rendered = name == "gsparc"  # of a moving receiver
+    data = images(tmp_path, 40, "rx") if rendered else kinds.received(tmp_path)
+    more = (*RENDERED, "model.field.count=10", "model.keep_best=false")
+    method = planned(*more)() if rendered else method_class(name)()
     method.fit(data, make_split(data.moving, SplitSettings()).folds[0], short(tmp_path, 2))
-    with pytest.raises(ValueError, match=r"gsparc has no gradients by position: .*footprints"):
-        Predictor(method, data.site).spectrum(rx=torch.zeros(3), grad=True)
+    with pytest.raises(ValueError, match=f"{name} has no gradients by position: .*{REFUSED[name]}"):
+        getattr(Predictor(method, data.site), data.site.kind)(rx=torch.zeros(3), grad=True)
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -360,7 +345,7 @@ def test_wrong_questions_get_clear_answers(name):
             predictor.csi(tx=at[:, :3], rx=at[:, 3:], symbols=14, grad=True)
 
 
-def test_what_a_transform_keeps_is_no_transform_s():
+def test_what_a_transform_keeps_is_no_transforms():
     predictor, _ = fitted("image_source_gp")
     again = ImageSourceGP(searches=1, search_rows=60)
     again.restore(predictor.method.site, predictor.method.state())
@@ -369,18 +354,13 @@ def test_what_a_transform_keeps_is_no_transform_s():
     assert error(slopes(fresh, at)["variance"], found) < 1e-9
 
 
-def test_the_origin_of_the_world_is_taken_away_in_float64():
+def test_the_origin_is_taken_away_in_float64_and_turns_have_no_gradient():
     predictor, _ = fitted("complex_gp")
     site, at = predictor.site, places(predictor)
     far = Predictor(predictor.method, type(site)(**{**vars(site), "origin": site.origin + UTM}))
     there = slopes(far, at + torch.from_numpy(UTM))
     for part, slope in slopes(predictor, at).items():
         assert error(there[part], slope) < 1e-6, part
-
-
-def test_turns_of_the_receiver_have_no_gradient():
-    predictor, _ = fitted("complex_gp")
-    at = places(predictor)
     pose = Pose(at, torch.eye(3, dtype=at.dtype).repeat(len(at), 1, 1).requires_grad_())
     with pytest.raises(ValueError, match="gradients are by the position of rx alone"):
         predictor.csi(rx=pose, grad=True)

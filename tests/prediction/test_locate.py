@@ -6,10 +6,10 @@ import logging
 
 import numpy as np
 import pytest
-from campaigns import compose, powers, spectra
+import towns
+from campaigns import powers, spectra
 
 import gsparc
-from gsparc.commands.train import train
 from gsparc.locate.likelihood import Trust
 from gsparc.locate.locator import kept
 from gsparc.locate.search import Unknown
@@ -18,10 +18,7 @@ from gsparc.models import checkpoint
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("located")
-    file = spectra(folder / "own.npz", rows=80)
-    train(compose("dataset=own", f"dataset.file='{file}'", "model=gp", "baselines=[]", "logger=none"), folder)
-    return folder / "model.ckpt"
+    return towns.trained(spectra(tmp_path_factory.mktemp("located") / "own.npz", rows=80), "gp")
 
 
 def test_a_predicted_spectrum_is_located_where_it_was_predicted(trained):
@@ -50,11 +47,7 @@ def test_areas_are_those_that_were_calibrated(trained, caplog):
 
 
 def test_missing_and_silent_stations_are_no_values(tmp_path):
-    file = powers(tmp_path / "own.npz")
-    train(
-        compose("dataset=own", f"dataset.file='{file}'", "model=gp", "baselines=[]", "logger=none"), tmp_path
-    )
-    predictor = gsparc.load(tmp_path / "model.ckpt")
+    predictor = gsparc.load(towns.trained(powers(tmp_path / "own.npz"), "gp"))
     place = (predictor.site.moving_box + predictor.site.origin).mean(0)
     power = predictor.rssi(**{predictor.site.moving_end: place[None]})
     loud, quiet = (predictor.locate(power, silent=silent)[0] for silent in (None, [[True]]))

@@ -36,6 +36,7 @@ def spectra(campaign, folds, tmp_path):
 
 def test_world_positions_many_and_one(spectra):
     data, predictor = spectra
+    assert isinstance(predictor.method, GaussianProcess)
     world = data.tx[:3] + data.site.origin
     batch = data.batch(np.arange(3))
     expected = predictor.method.predict(batch.tx, batch.rx)
@@ -83,24 +84,33 @@ def test_channels_in_physical_units_with_a_moving_receiver(campaign, folds, tmp_
     assert torch.allclose(predictor.csi(rx=pose), torch.from_numpy(found))
 
 
-def test_wrong_questions_get_clear_answers(spectra, campaign, folds, tmp_path):
-    data, predictor = spectra
-    here = data.site.origin
+HERE = np.array([3.0, 2, 1])
+
+
+@pytest.mark.parametrize(
+    ("said", "ends"),
+    [
+        ("tx= is needed", {}),
+        ("NaN or Inf in row 1", {"tx": [HERE, HERE * np.nan]}),
+        ("shape", {"tx": HERE[:2]}),
+        ("shape", {"tx": np.zeros((2, 2, 3))}),
+        ("shape", {"tx": np.zeros((0, 3))}),
+        ("numbers", {"tx": "here"}),
+        ("must be real numbers", {"tx": [1j, 0, 0]}),  # they lost their imaginary part
+        ("expected metres, none beyond 1e", {"tx": [1e300, 0, 0]}),  # beyond float32: answered with NaN
+        ("holds 2 positions, the other end 3", {"tx": np.tile(HERE, (2, 1)), "rx": np.tile(HERE, (3, 1))}),
+    ],
+)
+def test_positions_that_are_none_are_refused(spectra, said, ends):
+    with pytest.raises(ValueError, match=said):
+        spectra[1].spectrum(**ends)
+
+
+def test_wrong_questions_get_clear_answers(spectra, folds, tmp_path):
     with pytest.raises(ValueError, match=r"predicts spectrum \(dataset toy\), not csi: call .spectrum"):
-        predictor.csi(tx=here)
-    with pytest.raises(ValueError, match="tx= is needed"):
-        predictor.spectrum()
-    with pytest.raises(ValueError, match="NaN or Inf in row 1"):
-        predictor.spectrum(tx=[here, here * np.nan])
-    for wrong in (here[:2], np.zeros((2, 2, 3)), np.zeros((0, 3))):
-        with pytest.raises(ValueError, match="shape"):
-            predictor.spectrum(tx=wrong)
-    with pytest.raises(ValueError, match="numbers"):
-        predictor.spectrum(tx="here")
-    with pytest.raises(ValueError, match="holds 2 positions, the other end 3"):
-        predictor.spectrum(tx=np.tile(here, (2, 1)), rx=np.tile(here, (3, 1)))
+        spectra[1].csi(tx=HERE)
     with pytest.raises(ValueError, match="mean has no confidence"):
-        loaded(data, folds(40).folds[0], tmp_path, Mean.name).confidence(tx=here)
+        loaded(spectra[0], folds(40).folds[0], tmp_path, Mean.name).confidence(tx=HERE)
 
 
 def test_importing_costs_nothing():
@@ -109,10 +119,6 @@ def test_importing_costs_nothing():
     assert "load" in dir(gsparc)
     with pytest.raises(AttributeError, match="lod"):
         gsparc.lod  # noqa: B018
-
-
-def test_load_restores_the_class(spectra):
-    assert isinstance(spectra[1].method, GaussianProcess)
 
 
 def test_other_frequencies_than_the_one_measured_are_refused(campaign, folds, tmp_path):
@@ -125,16 +131,6 @@ def test_other_frequencies_than_the_one_measured_are_refused(campaign, folds, tm
     assert np.array_equal(predictor.csi(rx=place, frequency_hz=2.4e9)[0], predictor.csi(rx=place))
     with pytest.raises(ValueError, match=r"measured at 2400\.000 MHz alone"):
         predictor.csi(rx=place, frequency_hz=[2.4e9, 2.41e9])
-
-
-@pytest.mark.parametrize(
-    ("place", "said"),
-    [([1j, 0, 0], "must be real numbers"), ([1e300, 0, 0], "expected metres, none beyond 1e")],
-)
-def test_positions_that_are_none_are_refused(spectra, place, said):
-    """Complex numbers lost their imaginary part, and what overflows float32 was answered with NaN."""
-    with pytest.raises(ValueError, match=said):
-        spectra[1].spectrum(tx=place)
 
 
 @pytest.fixture

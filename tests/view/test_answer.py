@@ -14,9 +14,10 @@ from gsparc.data.walls import SceneWalls
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import KEY, Operating
 from gsparc.view.answer import Answer, Rays, ask, rays
-from gsparc.view.building import rays_of
+from gsparc.view.building import MIRROR, WALL, rays_of
 from gsparc.view.crossed import Obstacles, crossed_losses
-from gsparc.view.reasons import Surroundings, reasons, usual
+from gsparc.view.reasons import Surroundings, answer_markdown, legend_html, reasons, usual
+from gsparc.view.scene import Faces
 from gsparc.view.viewed import open_viewed
 
 HERE = np.zeros(3)
@@ -105,11 +106,11 @@ def test_a_fade_is_said_to_be_one():
 
 
 def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
-    spectrum = ask(spectrum_view.viewed.asked(None), spectrum_view.starts(None))
+    spectrum = ask(spectrum_view.viewed.predictor_of(None), spectrum_view.starts(None))
     assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None and spectrum.query_ms > 0
     assert set(spectrum.ends) == {"tx", "rx"}
     name = power_view.viewed.stations[1]
-    asked, at = power_view.viewed.asked(name), power_view.starts(name)
+    asked, at = power_view.viewed.predictor_of(name), power_view.starts(name)
     power = ask(asked, at)
     assert power.level_db == pytest.approx(10 * np.log10(asked.rssi(**at)[0]), abs=1e-3)
     assert power.spread_db > 0 and power.spectrum is None
@@ -142,3 +143,17 @@ def test_an_operating_point_without_confidence_showed_that_of_the_whole_model(sp
     lean, trained = open_viewed(file).ways
     place = {end: np.full(3, 0.5) for end in spectrum_view.viewed.moving}
     assert ask(lean, place).confidence is None and ask(trained, place).confidence is not None
+
+
+def test_nought_has_no_sign():
+    said = answer_markdown(Answer({"rx": np.array([-0.001, 0.0, -1.0])}, 1.0, level_db=-50.0), ["rx"], [])
+    assert "receiver at 0.00, 0.00, -1.00 m" in said
+
+
+def test_what_surfaces_are_is_said_once_of_each_colour():
+    """Planes were drawn in a colour that nothing explained."""
+    faces = [
+        Faces("a", np.zeros((3, 3)), np.zeros((1, 3), int), colour, 0.5) for colour in (MIRROR, WALL, WALL)
+    ]
+    said = legend_html([], faces)
+    assert said.count("known walls") == said.count("mirror planes that were found") == 1

@@ -12,8 +12,6 @@ from towns import town_model
 
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
-from gsparc.maps import map_of
-from gsparc.maps.field_map import FieldMap
 from gsparc.models import checkpoint
 from gsparc.view.building import SPLATS, Given, build
 from gsparc.view.viewed import open_viewed
@@ -51,7 +49,7 @@ def test_without_viser_one_line_says_what_to_install(here, monkeypatch, more):
     [
         (["save=scene.obj"], "expected a name that ends with .html, .png, .ply"),
         (["port=70000"], "a number from 0 to 65535"),
-        (["save=a.png", "station=nowhere"], "there are west, east"),
+        (["save=a.png", "station=nowhere"], "there are east, west"),
         (["save=a.png", "at=[1,2]"], "three finite numbers"),
         (["save=a.png", "map=missing.npz"], "expected map.npz of gsparc map"),
         (["save=a.ply"], "holds no Gaussians to write"),
@@ -62,19 +60,6 @@ def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, 
     with pytest.raises(DataError, match=said):
         view(here, town_model(), *more)
     assert not [file for file in here.iterdir() if file.suffix in (".png", ".ply", ".html")]
-
-
-def test_a_map_that_was_made_is_read_again(here):
-    import gsparc
-
-    made = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=8.0)
-    made.save(here / "map.npz")
-    found = FieldMap.read(here / "map.npz")
-    np.testing.assert_array_equal(found.power_db, made.power_db)
-    assert found.stations == made.stations and found.grid.step == pytest.approx(8.0)
-    (here / "other.npz").write_bytes(b"no archive")
-    with pytest.raises(DataError, match="no map that can be read"):
-        FieldMap.read(here / "other.npz")
 
 
 def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):

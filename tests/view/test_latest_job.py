@@ -24,70 +24,39 @@ def settle(work, seconds=5.0):
     assert not len(work)
 
 
-def once(act):
-    def job():
-        act()
-        yield
+def job(done, *said, begun=None, go=None):
+    """Appends each of `said` in a step of its own; with events, begins and waits until it may go on."""
 
-    return job
-
-
-def test_of_many_drags_the_first_and_the_last_are_answered(work):
-    done, begun, go = [], threading.Event(), threading.Event()
-
-    def first():
-        begun.set()
-        go.wait(5)
-        done.append("first")
-        yield
-
-    work.ask("drag", first)
-    assert begun.wait(5)
-    for number in range(100):
-        work.ask("drag", once(lambda number=number: done.append(number)))
-    go.set()
-    settle(work)
-    assert done == ["first", 99]
-
-
-def test_an_urgent_job_comes_between_the_steps_of_a_long_one(work):
-    order, begun, go = [], threading.Event(), threading.Event()
-
-    def plane():
-        begun.set()
-        go.wait(5)
-        for step in range(3):
-            order.append(step)
+    def steps():
+        if begun is not None:
+            begun.set()
+            go.wait(5)
+        for one in said:
+            done.append(one)
             yield
 
-    work.ask("plane", plane)
+    return steps
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "order"),
+    [
+        (("drag", ["first"]), [("drag", [number], False) for number in range(100)], ["first", 99]),
+        (("plane", [0, 1, 2]), [("answer", ["answer"], True)], [0, "answer", 1, 2]),
+        (("a", ["a"] * 3), [("b", ["b"] * 3, False)], ["a", "b"] * 3),
+    ],
+    ids=["of many drags the first and last", "urgent between steps of a long one", "two clients by turns"],
+)
+def test_order(work, first, then, order):
+    done, begun, go = [], threading.Event(), threading.Event()
+    key, said = first
+    work.ask(key, job(done, *said, begun=begun, go=go))
     assert begun.wait(5)
-    work.ask("answer", once(lambda: order.append("answer")), urgent=True)
+    for key, said, urgent in then:
+        work.ask(key, job(done, *said), urgent=urgent)
     go.set()
     settle(work)
-    assert order == [0, "answer", 1, 2]
-
-
-def test_two_clients_take_turns(work):
-    order, begun, go = [], threading.Event(), threading.Event()
-
-    def job(name):
-        def steps():
-            if name == "a":
-                begun.set()
-                go.wait(5)
-            for _ in range(3):
-                order.append(name)
-                yield
-
-        return steps
-
-    work.ask("a", job("a"))
-    assert begun.wait(5)
-    work.ask("b", job("b"))
-    go.set()
-    settle(work)
-    assert order == ["a", "b"] * 3
+    assert done == order
 
 
 def test_a_forgotten_client_costs_nothing_more(work):
@@ -101,7 +70,7 @@ def test_a_forgotten_client_costs_nothing_more(work):
 
     work.ask((7, "plane"), endless)
     assert begun.wait(5)
-    work.forget(lambda key: key[0] == 7)
+    work.forget(7)
     settle(work)
     count = len(steps)
     time.sleep(0.05)
@@ -117,6 +86,6 @@ def test_a_job_that_fails_does_not_end_the_others(work, caplog):
 
     work.ask("a", wrong)
     settle(work)
-    work.ask("a", once(lambda: done.append(1)))
+    work.ask("a", job(done, 1))
     settle(work)
     assert done == [1] and "a step of a failed" in caplog.text

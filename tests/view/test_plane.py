@@ -5,21 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from campaigns import channels, compose
+from campaigns import channels
+from towns import trained
 
-from gsparc.commands.train import train
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import ask
 from gsparc.view.plane import Plane, beyond_distance, refining, sheet, thinned, weakest
 from gsparc.view.reasons import usual
-from gsparc.view.scene import Legend
 from gsparc.view.site_view import grid_for
 from gsparc.view.viewed import open_viewed
 
 
 def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
     name, grid = power_view.viewed.stations[0], power_view.grid
-    asked = power_view.viewed.asked(name)
+    asked = power_view.viewed.predictor_of(name)
     planes = [plane for plane in refining(asked, grid) if plane is not None]
     assert [plane.stride for plane in planes] == [2, 1]
     assert all(np.isfinite(plane.level_db).all() for plane in planes)
@@ -38,14 +37,13 @@ def test_what_distance_explains_is_taken_off_a_plane(power_view):
     level = law.at(np.linalg.norm(grid.places() - still, axis=1)).reshape(grid.shape)
     level[3, 4] -= 12
     found = beyond_distance(Plane(grid, level, 1), law, still).level_db
-    assert (
-        found[3, 4] == pytest.approx(-12)
-        and np.abs(np.delete(found.reshape(-1), 3 * grid.shape[1] + 4)).max() < 1e-9
-    )
+    level[:] = 0
+    level[3, 4] = -12
+    np.testing.assert_allclose(found, level, atol=1e-9)
 
 
 def test_a_lifted_plane_is_asked_at_its_height(power_view):
-    asked = power_view.viewed.asked(power_view.viewed.stations[0])
+    asked = power_view.viewed.predictor_of(power_view.viewed.stations[0])
     high = replace(thinned(power_view.grid, 10), height=6.0)
     *_, plane = refining(asked, high)
     assert (high.places()[:, 2] == 6.0).all() and max(high.shape) <= 11
@@ -57,25 +55,19 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
     grid = power_view.grid
     values = np.zeros(grid.shape)
     values[0, 0] = np.nan  # south-west
-    made = sheet("plane", grid, values, Legend("", 0.0, 1.0))
+    dot = power_view.station("west").dot
+    made = sheet("plane", grid, values, Legend("", 0.0, 1.0), dot / 2)  # so that dots are seen whole
     assert made.image[-1, 0, 3] == 0 and (made.image[:-1, :, 3] > 0).all()
     left, _, _, high = grid.extent
-    np.testing.assert_allclose(made.corner, [left, high, grid.height])
+    assert dot > 0
+    np.testing.assert_allclose(made.corner, [left, high, grid.height - dot / 2])
     assert made.right[0] > 0 and made.down[1] < 0
 
 
 def test_a_plane_of_channels_has_the_level_that_answers_have(tmp_path):
     """It was of the mean alone: up to 24 dB below the answer where the mean fades and the error does not."""
-    file = channels(tmp_path / "room.npz", shape="S")
-    train(compose("dataset=own", f"dataset.file={file}", "model=gp", "baselines=[]", "logger=none"), tmp_path)
-    viewed = open_viewed(tmp_path / "model.ckpt")
-    *_, plane = refining(viewed.asked(None), grid_for(viewed, {"step_m": 0.5}))
-    said = [ask(viewed.asked(None), {"rx": place}) for place in plane.grid.places()]
+    viewed = open_viewed(trained(channels(tmp_path / "room.npz", shape="S"), "gp"))
+    *_, plane = refining(viewed.predictor_of(None), grid_for(viewed, {"step_m": 0.5}))
+    said = [ask(viewed.predictor_of(None), {"rx": place}) for place in plane.grid.places()]
     assert any(one.response is not None and one.spread_db > 2 for one in said)
     np.testing.assert_allclose(plane.level_db[plane.grid.inside], [one.level_db for one in said], atol=1e-3)
-
-
-def test_a_plane_lies_half_a_dot_lower_so_that_dots_are_seen_whole(power_view):
-    grid, one = power_view.grid, power_view.station("west")
-    made = sheet("plane", grid, np.zeros(grid.shape), Legend("", 0.0, 1.0), one.dot / 2)
-    assert one.dot > 0 and made.corner[2] == grid.height - one.dot / 2

@@ -6,8 +6,9 @@ import numpy as np
 
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.pictures import GREY, Legend
 from gsparc.view.building import Given, build
-from gsparc.view.scene import EXTENT, GREY, Frame, Legend
+from gsparc.view.scene import EXTENT, Frame
 
 
 def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():

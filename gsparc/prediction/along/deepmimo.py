@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.prediction.along.taps import LIGHT, located_paths
+from gsparc.data.schema import LIGHT
+from gsparc.prediction.along.taps import located_paths
 from gsparc.prediction.predictor import Predictor
 
 PATHS = 25  # that a DeepMIMO scenario has at most
@@ -15,15 +16,10 @@ DIRECT_M = 0.1  # a source so near the static end is that end
 
 
 def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, float]:
-    """Write a scenario: the static end is DeepMIMO's transmitter, places are its receivers.
+    """Write a scenario: the static end is DeepMIMO's transmitter, places (n, 3) [m, world] are receivers.
 
     A source that is not the static end is given as one reflection, in the plane that mirrors the one into the
     other: directions and delays are the source's, points of several reflections are not.
-
-    Args:
-        folder: there.
-        predictor: whose channels are made of paths, of one static end whose place is known.
-        place: (n, 3) [m, world] of the moving end.
 
     Returns: the most paths of a place, and the share of power that those beyond `PATHS` have.
 
@@ -38,10 +34,10 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
     power = np.square(np.abs(found.gain[:, 0].astype(np.complex128)))
     order = np.argsort(-power, axis=1)[:, :PATHS]
 
-    def kept(value: np.ndarray) -> np.ndarray:
+    def top(value: np.ndarray) -> np.ndarray:
         return np.take_along_axis(value, order.reshape(order.shape + (1,) * (value.ndim - 2)), 1)
 
-    strongest, towards, delay = kept(power), kept(found.direction), kept(found.delay_s[:, 0])
+    strongest, towards, delay = top(power), top(found.direction), top(found.delay_s[:, 0])
     away = LIGHT * delay[..., None] * towards  # from a place to the source
     normal = place[:, None] + away - still
     apart = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -55,7 +51,7 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
     silent = strongest <= 0
     arrays = {
         "power": 10 * np.log10(np.where(silent, np.nan, strongest)), "delay": delay,
-        "phase": np.degrees(np.angle(kept(found.gain[:, 0]))), "inter": np.where(direct, 0.0, 1.0),
+        "phase": np.degrees(np.angle(top(found.gain[:, 0]))), "inter": np.where(direct, 0.0, 1.0),
         "inter_pos": meets[:, :, None],
     }  # fmt: skip
     for name, one in (("aoa", towards), ("aod", leaves)):

@@ -17,20 +17,16 @@ class TrajectoryChannel(ChannelModel):
 
     >>> channel = OFDMChannel(TrajectoryChannel("model-sionna/cir.npz"), resource_grid)
 
-    Args:
-        path: the file.
-        seed: of the times at which stretches begin.
-
     Raises:
         ValueError: a batch longer than the trajectory.
     """
 
     def __init__(self, path: str | Path, seed: int = 0) -> None:
         super().__init__()
-        held = read_raw(path).arrays
-        self._gain = CubicSpline(held["time_s"], held["gain"])
-        self._time, self._delay = held["time_s"], torch.from_numpy(held["delay_s"])
-        self._receives = "tx_position" in held  # the array does
+        arrays = read_raw(path).arrays
+        self._gain = CubicSpline(arrays["time_s"], arrays["gain"])
+        self._time, self._delay = arrays["time_s"], torch.from_numpy(arrays["delay_s"])
+        self._receives = "tx_position" in arrays  # the array does
         self._draw = np.random.default_rng(seed)
 
     def __call__(

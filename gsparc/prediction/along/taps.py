@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from gsparc.data.schema import LIGHT
 from gsparc.prediction.export import Paths
 from gsparc.prediction.predictor import Predictor
 
-LIGHT = 299_792_458.0
 PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs
 MOST = 50_000  # instants
 CHUNK = 64  # places that the model answers at once
@@ -130,13 +130,13 @@ def fitted(
         raise ValueError(f"rate_hz= is needed: {site.name} was measured at one frequency")
     rate_hz, carrier = rate_hz or float(np.diff(np.sort(tones)).min() * len(tones)), float(tones.mean())
     time_s = way.instants(LIGHT / carrier)
-    places, kept = way.at(time_s), list[Paths]()
+    places, parts = way.at(time_s), list[Paths]()
 
     def ask(place: np.ndarray) -> np.ndarray:
         if early is not None:
             one = located_paths(predictor, place, antennas)
             assert one is not None
-            kept.append(one)
+            parts.append(one)
             return one.channel(tones)
         tx, rx = (place if end == site.moving_end else None for end in ("tx", "rx"))
         return predictor.csi(tx, rx)[:, :antennas]
@@ -148,7 +148,7 @@ def fitted(
         tones = carrier + rate_hz * OCCUPIED * np.linspace(-0.5, 0.5, FITTED)
         early = np.floor(found.delay_s.min() * rate_hz) - taps  # beyond what tones can tell apart
         known = ask(look) * np.exp(2j * np.pi * (tones - carrier) / rate_hz * early)
-        kept.clear()
+        parts.clear()
     if np.ptp(tones) > rate_hz:
         raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")
     taps, turns = min(taps, len(tones)), (tones - carrier) / rate_hz
@@ -165,9 +165,9 @@ def fitted(
         at = places[int(np.argmin(total))].round(2).tolist()
         raise ValueError(f"the model's channels are 0 at {at} m, as far from every measurement")
     paths = None
-    if kept:
-        gain, delay = (np.concatenate([getattr(one, name) for one in kept]) for name in ("gain", "delay_s"))
-        paths = Paths(gain, delay, kept[0].reference_hz)
+    if parts:
+        gain, delay = (np.concatenate([getattr(one, name) for one in parts]) for name in ("gain", "delay_s"))
+        paths = Paths(gain, delay, parts[0].reference_hz)
     residual = float(error.sum() / total.sum()), float((error / total).max())
     return Line(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual, paths)
 
@@ -195,8 +195,8 @@ def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
         return 0
     apart = int(np.clip(round(1 / np.diff(np.sort(turns)).min()), taps, 8192))  # then delays come again
     profile = np.square(np.abs(rows @ np.exp(2j * np.pi * turns[:, None] * np.arange(apart)))).sum(0)
-    held = np.convolve(np.concatenate([profile, profile])[: apart + taps - 1], np.ones(taps), "valid")
-    middle = int(held.argmax())
+    energy = np.convolve(np.concatenate([profile, profile])[: apart + taps - 1], np.ones(taps), "valid")
+    middle = int(energy.argmax())
 
     def left(first: int) -> float:
         columns, solve = _atoms(turns, first, taps)

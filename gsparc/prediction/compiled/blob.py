@@ -36,13 +36,7 @@ class Form:
 
 
 def packed(form: Form, origin: np.ndarray, error: float) -> bytes:
-    """The file's bytes.
-
-    Args:
-        form: as made.
-        origin: (3,) [m] of its places in the world.
-        error: of the form against the model, of the root mean square of the model's answers.
-    """
+    """The file's bytes; places are from `origin` (3,) [m], `error` is `Compiled.error`."""
     numbers = np.array([form.kind, error, *origin, *form.numbers], np.float64)
     arrays = {"numbers": numbers, **{name: value for name, value in form.arrays.items() if value.size}}
     at = HEAD.size + SECTION.size * len(arrays)

@@ -18,13 +18,7 @@ BEYOND = 1e6  # [m], a place that is near none
 
 
 def sources_form(method: ImageSourceGP, site: Site, query: Query) -> Form:
-    """Of an ensemble's sources without clutter, whose gains `query` has.
-
-    Args:
-        method: fitted; its frame, weights of searches and factors of antennas.
-        site: what it was fitted to.
-        query: of as many searches as the method has weights.
-    """
+    """Of an ensemble's sources without clutter, whose gains `query` has."""
     pack, rotation = query.pack, np.eye(3) if site.rx_rotation is None else site.rx_rotation
     count, rows = len(pack.sources), len(pack.places)
     outputs, wide = query.level.shape[2] // 2, -(-rows // LANES) * LANES

@@ -30,11 +30,7 @@ from gsparc.prediction.compiled.spectra import array_form, process_form, view_fo
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
-ANSWERED = {
-    "spectrum": 400,
-    "csi": 1_500,
-    "rssi": 3_000,
-}  # places whose answers a distilled form is made from
+ANSWERED = {"spectrum": 400, "csi": 1500, "rssi": 3000}  # places that distilled forms are made from
 KEPT = 96  # components of spectra: what a query reads grows with them
 
 
@@ -54,12 +50,7 @@ class Compiled:
 
 
 def compiled(predictor: Predictor, count: int = 256, seed: int = 0) -> Compiled:
-    """The form of a model of one station.
-
-    Args:
-        predictor: of the model.
-        count: random places that a distilled form's error is measured at.
-        seed: of places.
+    """The form of a model of one station; its error is measured at `count` random places.
 
     Raises:
         ValueError: no form answers as this model does, or it is of several stations.
@@ -189,31 +180,27 @@ def random_places(site: Site, count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(low, high, (count, len(low))).astype(np.float32)
 
 
+def ends_at(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
+    """Local places (B, 3) float64 [m] of the ends that move, from (B, 3) or (B, 6)."""
+    places = places.astype(np.float64)
+    return {site.moving_end: places} if site.static_end else {"tx": places[:, :3], "rx": places[:, 3:]}
+
+
 def answers(predictor: Predictor, places: np.ndarray) -> np.ndarray:
     """The model's answers (B, ...) in physical units at local places (B, 3) or (B, 6) [m]."""
     site = predictor.site
-    ends = {site.moving_end: places} if site.static_end else {"tx": places[:, :3], "rx": places[:, 3:]}
     ask = getattr(predictor, site.kind)
-    found = [
-        ask(**{end: place[i : i + 64].astype(np.float64) + site.origin for end, place in ends.items()})
-        for i in range(0, len(places), 64)
-    ]
-    return np.concatenate(found)
+    parts = (ends_at(site, places[i : i + 64]) for i in range(0, len(places), 64))
+    return np.concatenate([ask(**{end: at + site.origin for end, at in part.items()}) for part in parts])
 
 
 def answered(predictor: Predictor, places: np.ndarray) -> Measurements:
     """Measurements whose targets are the model's answers at local places [m]."""
     site, count = predictor.site, len(places)
     still = np.zeros(3) if site.static_position is None else site.static_position
-    tx, rx = (np.broadcast_to(still, (count, 3)) for _ in range(2))
-    if site.static_end is None:
-        tx, rx = places[:, :3], places[:, 3:]
-    elif site.moving_end == "tx":
-        tx = places
-    else:
-        rx = places
+    ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | ends_at(site, places)
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     return Measurements(
-        site, tx.astype(np.float64), rx.astype(np.float64), np.broadcast_to(rotation, (count, 3, 3)),
-        answers(predictor, places) / site.target_scale,
+        site, ends["tx"].astype(np.float64), ends["rx"].astype(np.float64),
+        np.broadcast_to(rotation, (count, 3, 3)), answers(predictor, places) / site.target_scale,
     )  # fmt: skip

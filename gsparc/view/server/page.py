@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import viser
 
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import Answer, ask
 from gsparc.view.building import PATHS, SPHERE, rays_of
 from gsparc.view.panel import panel_image
 from gsparc.view.plane import sheet
 from gsparc.view.reasons import ENDS, Usual, headline, legend_html
-from gsparc.view.scene import EXTENT, Legend, Part, Points, Scene, Sheet
+from gsparc.view.scene import EXTENT, Part, Points, Scene, Sheet
 from gsparc.view.server.draw import draw, draw_scene, first_view, floor
 from gsparc.view.site_view import SiteView, walk
 
@@ -66,7 +67,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             legends += more
         sphere, extent = view.sphere(name), view.extent(name)
         for place in walk(view, name, steps // len(names)):
-            answer = ask(viewed.asked(name), {**view.starts(name), moving: place})
+            answer = ask(viewed.predictor_of(name), {**view.starts(name), moving: place})
             dot.position = scene.frame.drawn(place)
             label.text = (f"{name}: " if len(names) > 1 else "") + headline(answer, view.unit)
             parts: list[Part] = list(rays_of(answer, extent) or ())

@@ -58,7 +58,7 @@ class Server:
             if not gone:
                 self.sessions[client.client_id] = session
         if gone:
-            self.work.forget(lambda key: isinstance(key, tuple) and key[0] == client.client_id)
+            self.work.forget(client.client_id)
             return
         log.info("client %d came, %d here", client.client_id, len(self.sessions))
 
@@ -66,7 +66,7 @@ class Server:
         with self._lock:
             if self.sessions.pop(client.client_id, None) is None:
                 self._gone.add(client.client_id)
-        self.work.forget(lambda key: isinstance(key, tuple) and key[0] == client.client_id)
+        self.work.forget(client.client_id)
         log.info("client %d went, %d here", client.client_id, len(self.sessions))
 
     def run(self) -> None:

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from gsparc.maps.area import Grid
+from gsparc.maps.pictures import Legend
 from gsparc.view.answer import Answer, ask
 from gsparc.view.building import (
     ERRORS,
@@ -32,7 +33,7 @@ from gsparc.view.panel import response_db, spectrum_image, tones_mhz
 from gsparc.view.plane import Plane, beyond_distance, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
 from gsparc.view.reasons import ENDS, answer_markdown, legend_html, reasons
-from gsparc.view.scene import EXTENT, Legend, Points
+from gsparc.view.scene import EXTENT, Points
 from gsparc.view.server.draw import draw, draw_scene, first_view, floor
 from gsparc.view.site_view import SiteView
 
@@ -51,13 +52,7 @@ LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
 
 
 class Session:
-    """Everything of one client; callbacks only note what is wanted, a `LatestJobQueue` does it.
-
-    Args:
-        client: of viser.
-        view: what all clients share.
-        work: does what is asked.
-    """
+    """Everything of one client; callbacks only note what is wanted, a `LatestJobQueue` does it."""
 
     def __init__(self, client: Any, view: SiteView, work: LatestJobQueue, threads: int) -> None:
         self.client, self.view, self.work, self.threads = client, view, work, threads
@@ -77,8 +72,7 @@ class Session:
         self.sphere = view.sphere(self.station)
         self.made: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # layers of a map, as they are chosen
         for grid, one in view.layers:
-            legend = Legend(one.label, *one.range(), one.colours)
-            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, legend
+            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
         self._draw_still()
         first_view(client.camera)
         self._panel()
@@ -313,7 +307,7 @@ class Session:
         if threads != torch.get_num_threads():
             torch.set_num_threads(threads)
         try:
-            answer = ask(self.view.viewed.asked(self.station, way), places)
+            answer = ask(self.view.viewed.predictor_of(self.station, way), places)
         except ValueError as error:
             self.said.content = f"**{error}**"
             return
@@ -414,7 +408,7 @@ class Session:
         yield
 
     def _predicted_plane(self, grid: Grid, beyond: bool) -> Iterator[None]:
-        predictor = self.view.viewed.asked(self.station)
+        predictor = self.view.viewed.predictor_of(self.station)
         other = self.places["tx"] if self.site.static_end is None else None
         known, there = self.one.about.usual, self._still()
         legend, begin = None if beyond else self.one.power, time.perf_counter()

@@ -84,8 +84,8 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
 def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
     _, _, ckpt, _ = swept
     before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
-    points, measured = operating_point.kept(after.extra)
-    assert points and "contribution" in measured and operating_point.kept(before.extra) == ([], {})
+    points, measured = operating_point.stored_points(after.extra)
+    assert points and "contribution" in measured and operating_point.stored_points(before.extra) == ([], {})
     assert after.config == before.config and set(after.extra) == {*before.extra, operating_point.KEY}
     place = field.data.site.origin + 0.1
     same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
@@ -110,7 +110,7 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
 
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt, _ = swept
-    points, _ = operating_point.kept(checkpoint.read(ckpt).extra)
+    points, _ = operating_point.stored_points(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
     monkeypatch.setattr(operating_point, "interleaved", lambda calls, clock, threads: pretended)
     best = max(points, key=lambda p: p.score)

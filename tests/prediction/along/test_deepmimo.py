@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from gsparc.data.schema import LIGHT
 from gsparc.prediction.along import deepmimo
-from gsparc.prediction.along.taps import LIGHT
 from gsparc.prediction.export import Paths
 
 CARRIER = 3.5e9
@@ -46,13 +46,9 @@ def scenario(tmp_path):
 
 def test_channels_of_the_scenario_are_the_models(scenario):
     params, held = scenario
-    sets = params["txrx_sets"]
-    assert (sets["txrx_set_0"]["is_tx"], sets["txrx_set_1"]["is_rx"], params["scene"]["num_scenes"]) == (
-        True,
-        True,
-        1,
-    )
-    assert sets["txrx_set_1"]["num_points"] == 2 and params["rt_params"]["frequency"] == CARRIER
+    sends, receives = params["txrx_sets"].values()
+    assert sends["is_tx"] and receives["is_rx"] and receives["num_points"] == 2
+    assert params["scene"]["num_scenes"] == 1 and params["rt_params"]["frequency"] == CARRIER
     shift = np.array([-5e6, 0, 7e6])
     gain = 10 ** (held["power"] / 20) * np.exp(1j * np.radians(held["phase"]))
     turned = np.exp(-2j * np.pi * shift * held["delay"][..., None]) * gain[..., None]
@@ -66,6 +62,10 @@ def unit(azimuth, zenith):
     return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
 
 
+def towards(start, end):
+    return (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
+
+
 def test_a_mirror_is_found_where_it_is(scenario):
     _, held = scenario
     np.testing.assert_array_equal(held["inter"][:, :2], [[0, 1], [0, 1]])
@@ -75,12 +75,8 @@ def test_a_mirror_is_found_where_it_is(scenario):
     np.testing.assert_allclose(whole, held["delay"][:, 1] * LIGHT, rtol=1e-5)
     leaves, arrives = (unit(held[f"{name}_az"], held[f"{name}_el"]) for name in ("aod", "aoa"))
     for path, at in ((0, PLACES), (1, point)):
-        np.testing.assert_allclose(
-            leaves[:, path], (at - STILL) / np.linalg.norm(at - STILL, axis=1)[:, None], atol=1e-4
-        )
-    np.testing.assert_allclose(
-        arrives[:, 1], (point - PLACES) / np.linalg.norm(point - PLACES, axis=1)[:, None], atol=1e-4
-    )
+        np.testing.assert_allclose(leaves[:, path], towards(STILL, at), atol=1e-4)
+    np.testing.assert_allclose(arrives[:, 1], towards(PLACES, point), atol=1e-4)
 
 
 def test_models_without_paths_are_refused(tmp_path):

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hydra import compose, initialize_config_module
+from campaigns import compose
 
 import gsparc
 from gsparc.commands import export
 from gsparc.data.raw import Raw, read_raw, write_raw
+from gsparc.data.schema import LIGHT
 from gsparc.models import checkpoint
 from gsparc.prediction.along import emulators
-from gsparc.prediction.along.taps import LIGHT, Trajectory, fitted
+from gsparc.prediction.along.taps import Trajectory, fitted
 from gsparc.prediction.export import Paths
 
 CARRIER = 3.5e9
@@ -95,15 +96,18 @@ def test_residual_is_stated_and_falls_with_taps():
     assert found[0] > found[1] > found[2] > found[3] and found[0] > 0.05
 
 
-def test_what_cannot_be_is_refused():
-    with pytest.raises(ValueError, match="each later than the one before"):
-        Trajectory(np.array([0.0, 0.0]), np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="rate_hz= is needed"):
-        fitted(Rays(TONES[:1]), drive(), 4)
-    with pytest.raises(ValueError, match="the tones span"):
-        fitted(Rays(TONES), drive(), 4, 1e6)
-    with pytest.raises(ValueError, match="wavelengths long"):
-        fitted(Rays(TONES), drive(length=1e4), 4)
+@pytest.mark.parametrize(
+    ("said", "tones", "length", "rate_hz"),
+    [
+        ("each later than the one before", TONES, 0.0, None),
+        ("rate_hz= is needed", TONES[:1], 0.5, None),
+        ("the tones span", TONES, 0.5, 1e6),
+        ("wavelengths long", TONES, 1e4, None),
+    ],
+)
+def test_what_cannot_be_is_refused(said, tones, length, rate_hz):
+    with pytest.raises(ValueError, match=said):
+        fitted(Rays(tones), drive(length=length), 4, rate_hz)
 
 
 @pytest.fixture
@@ -118,12 +122,8 @@ def sionna_rk(folder, symbols):
     size = (4 + 8 * taps + 2 * taps + 3) & ~3
     assert about["num_cirs"] % symbols == 0 and len(raw) == about["num_cirs"] * size
     rows = [struct.unpack_from(f"<f{2 * taps}f{taps}H", raw, size * i) for i in range(about["num_cirs"])]
-    each = np.array(rows)
-    return (
-        each[:, 0],
-        each[:, 1 : 1 + 2 * taps : 2] + 1j * each[:, 2 : 1 + 2 * taps : 2],
-        each[:, 1 + 2 * taps :],
-    )
+    norm, pairs, index = np.split(np.array(rows), [1, 1 + 2 * taps], axis=1)
+    return norm[:, 0], pairs[:, ::2] + 1j * pairs[:, 1::2], index
 
 
 @pytest.mark.parametrize("taps", [6, 7])
@@ -166,8 +166,7 @@ def test_the_command_writes_all_and_checks_them(tmp_path, monkeypatch):
     monkeypatch.setattr(export, "run_directory", lambda: tmp_path)
 
     def run(*given):
-        with initialize_config_module("gsparc.conf", version_base=None):
-            return export.task(compose("export", list(given)))
+        return export.task(compose(*given, config="export"))
 
     out, common = tmp_path / "out", (f"ckpt={tmp_path}/model.ckpt", "to=cir", f"table={tmp_path}/drive.csv")
     facts = run(*common, f"out={out}", "file=h5", "taps=4")
@@ -209,6 +208,16 @@ def test_the_check_says_what_a_reader_would_refuse(tmp_path, line):
         emulators.check(tmp_path, 14)
 
 
+def played(file, line, taps, end="rx_position"):
+    """Sionna's channel model of a line of taps."""
+    from gsparc.prediction.along.link import TrajectoryChannel
+
+    delay = (line.first + np.arange(taps)) / line.rate_hz
+    arrays = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay}
+    write_raw(file, Raw({**arrays, end: drive().at(line.time_s)}))
+    return TrajectoryChannel(file, seed=3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("receives", [False, True])
 def test_sionna_hears_the_models_channel(tmp_path, receives):
@@ -216,15 +225,9 @@ def test_sionna_hears_the_models_channel(tmp_path, receives):
     pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
     from sionna.phy.channel import cir_to_ofdm_channel
 
-    from gsparc.prediction.along.link import TrajectoryChannel
-
     ray, way = Rays(TONES), drive()
-    line = fitted(ray, way, 64, antennas=2)
-    delay = (line.first + np.arange(64)) / line.rate_hz
     end = "tx_position" if receives else "rx_position"
-    held = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay, end: way.at(line.time_s)}
-    write_raw(tmp_path / "cir.npz", Raw(held))
-    model = TrajectoryChannel(tmp_path / "cir.npz", seed=3)
+    model = played(tmp_path / "cir.npz", fitted(ray, way, 64, antennas=2), 64, end)
     gain, tau = model(5, 14, 28e3)
     assert gain.shape == ((5, 1, 2, 1, 1, 64, 14) if receives else (5, 1, 1, 1, 2, 64, 14))
     assert tau.shape == (5, 1, 1, 64)
@@ -246,15 +249,11 @@ def test_a_link_over_exported_taps_is_the_link_study(tmp_path):
     from sionna.phy.channel import cir_to_ofdm_channel
 
     from gsparc.commands.link.pusch import Pusch
-    from gsparc.prediction.along.link import TrajectoryChannel
 
     tones = CARRIER + 30e3 * (np.arange(48) - 23.5)
     ray, way = Rays(tones, True), drive()
-    line = fitted(ray, way, 32, 30.72e6)
-    delay = (line.first + np.arange(32)) / line.rate_hz
-    held = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay, "rx_position": way.at(line.time_s)}
-    write_raw(tmp_path / "cir.npz", Raw(held))
-    gain, tau = TrajectoryChannel(tmp_path / "cir.npz", seed=3)(32, 1, 1.0)  # still while a slot lasts
+    model = played(tmp_path / "cir.npz", fitted(ray, way, 32, 30.72e6), 32)
+    gain, tau = model(32, 1, 1.0)  # still while a slot lasts
     offset = torch.from_numpy((tones - CARRIER).astype(np.float32))
     exported = cir_to_ofdm_channel(offset, gain, tau).reshape(32, 48)
     begin = np.random.default_rng(3).uniform(0, 1, 32) * 0.5

@@ -1,0 +1,42 @@
+"""Densities and variances of processes by their formulas, in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gsparc.prediction.confidence import process_variance
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.nearest import EXCESS, Sample, density_given_nearest
+
+KERNEL = Kernel((1.2, 6.0), (0.4, 0.6), 0.08)
+
+
+def test_variance_of_places_is_what_known_ones_leave():
+    rng = np.random.default_rng(0)
+    known, places = rng.uniform(0, 9, (30, 3)), rng.uniform(0, 9, (7, 3))
+    between = KERNEL.between(torch.from_numpy(known), torch.from_numpy(places)).numpy()
+    gram = KERNEL.between(torch.from_numpy(known), torch.from_numpy(known)).numpy() + 0.08 * np.eye(30)
+    wanted = 1.08 - np.diag(between.T @ np.linalg.solve(gram, between))
+    np.testing.assert_allclose(process_variance(KERNEL, known, places), wanted, rtol=1e-9)
+
+
+def test_density_of_rows_given_their_neighbours():
+    rng = np.random.default_rng(1)
+    places, values = rng.uniform(0, 3, (12, 6, 3)), rng.standard_normal((12, 6, 2))
+    count = rng.integers(1, 4, (12, 6)).astype(float)
+    squared, variance = [], []
+    for row, value, times in zip(places, values, count, strict=True):
+        at = torch.from_numpy(row)
+        gram = KERNEL.between(at, at).numpy() + np.diag(0.08 / times)
+        weights = np.linalg.solve(gram[1:, 1:], gram[1:, 0])
+        squared.append(np.mean((value[0] - weights @ value[1:]) ** 2))
+        variance.append(gram[0, 0] - weights @ gram[1:, 0])
+    amplitude = np.mean(np.divide(squared, variance))
+    excess = max(np.log(amplitude / np.mean(values[:, 0] ** 2)), 0)
+    wanted = 0.5 * (np.log(amplitude) + np.mean(np.log(variance))) + EXCESS * excess**2 / 12
+    sample = Sample.of(*map(torch.from_numpy, (places, values, count)))
+    parameters = torch.from_numpy(KERNEL.parameters()).requires_grad_()
+    nats, found = density_given_nearest(parameters, sample)
+    assert abs(nats.item() - wanted) < 1e-6 and abs(found.item() / amplitude - 1) < 1e-6
+    assert torch.autograd.gradcheck(lambda at: density_given_nearest(at, sample)[0], parameters)
