@@ -89,7 +89,10 @@ EDIT = st.fixed_dictionaries(
 def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
     model, trainer = fresh(count)
     optimizer = trainer.optimizers[0]
-    module = SimpleNamespace(model=model, total_steps=99, global_step=0, conditional=False, solved=False)
+    module = SimpleNamespace(
+        model=model, total_steps=99, global_step=0, conditional=False, solved=False,
+        schedule_step=lambda interval: trainer.global_step,
+    )  # fmt: skip
     draw = torch.Generator().manual_seed(seed)
     ever = set(model.gaussians.ids.tolist())
     for number, edit in enumerate(edits, start=1):
@@ -151,8 +154,9 @@ def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
     densify = Densify(
         0, 99, 1, 0.5, draws.draw(st.sampled_from([0.0, 1e9])), max_radius=5.0, max_gaussians=20
     )
-    densify.statistics, trainer.global_step = nasty, 1
-    densify.on_train_batch_end(trainer, SimpleNamespace(model=model, total_steps=99, global_step=0))
+    densify.statistics = nasty
+    module = SimpleNamespace(model=model, total_steps=99, global_step=0, schedule_step=lambda interval: 1)
+    densify.on_train_batch_end(trainer, module)
     assert 1 <= len(model.gaussians) <= 20
     assert all(p.isfinite().all() for p in model.parameters())
     assert all(t.isfinite().all() for t in densify.statistics.values())
