@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsparc.commands.compare_places import Row as PlaceRow
-from gsparc.commands.compare_places import compare_places
-from gsparc.commands.output import columns, run_directory, show
+from gsparc.commands.locate import locate
+from gsparc.commands.output import columns, finish, run_directory, show
 from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
@@ -22,16 +21,15 @@ from gsparc.evaluation.experiment.cells import Budget, contenders, plan, plugged
 from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
+from gsparc.evaluation.experiment.places import compare_places, facts_and_table
 from gsparc.evaluation.experiment.problem import problems_of
 from gsparc.evaluation.experiment.table import Result, Row, markdown, overview, results
 from gsparc.evaluation.experiment.table import blocks as blocks_of
 from gsparc.evaluation.experiment.table import rows as rows_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
-log = logging.getLogger(__name__)
 
-
-def task(config: DictConfig) -> list[Row] | list[PlaceRow]:
+def task(config: DictConfig) -> list[Row] | pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods, or locate; and report."""
     RunSettings.of(config)
     run_dir = run_directory()
@@ -56,7 +54,10 @@ def task(config: DictConfig) -> list[Row] | list[PlaceRow]:
     with held(kept, "cells"):
         filled = fill_all(prepared, bool(settings["train"]), limit_s)
         if locating:
-            return compare_places(filled, settings["locate"], kept, run_dir)
+            found = compare_places(filled, settings["locate"], kept, locate)
+            write_samples(run_dir / "places.csv", {name: found[name].tolist() for name in found})
+            finish(run_dir, *facts_and_table(found))
+            return found
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
@@ -76,9 +77,8 @@ def report(
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
     drawn = [row for row in rows if row.draws]
-    by_set = [
-        [row for row in drawn if row.dataset == name] for name in dict.fromkeys(r.dataset for r in drawn)
-    ]
+    names = dict.fromkeys(row.dataset for row in drawn)
+    by_set = [[row for row in drawn if row.dataset == name] for name in names]
     page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours, only_timed)])
     write_samples(run_dir / "compare.csv", columns(rows, Row))
     write_samples(run_dir / "cells.csv", columns(results(filled), Result))

@@ -59,15 +59,13 @@ COMMANDS = {
         Command("train", "train a method on a dataset and test it beside baselines"),
         Command("evaluate", "test a checkpoint again: ckpt=FILE"),
         Command("check", "what is in files of measurements, or what is wrong: FILE...", configured=False),
-        Command(
-            "predict", "predictions at places of a table: ckpt=FILE places=FILE", f"{ROOM}predict.command"
-        ),
+        Command("predict", "predictions at places of a table: ckpt=FILE places=FILE"),
         Command("simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
         Command("study", "variants of one model: kind=effects, positions or measurements"),
         Command("tradeoff", "accuracy against latency of one model: ckpt=FILE"),
         Command("compare", "every method under the same data, metrics and clock"),
         Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
-        Command("link", "rates and block errors with predicted channels: ckpt=FILE", f"{ROOM}link.command"),
+        Command("link", "rates and block errors with predicted channels: ckpt=FILE"),
         Command("export", "the model for other programs: ckpt=FILE to=c, cir, deepmimo, sionna"),
         Command("serve", "answers over HTTP: ckpt=FILE", f"{ROOM}serve.command"),
         Command("locate", "where rows were heard, by the field's likelihood: ckpt=FILE"),
@@ -77,7 +75,7 @@ COMMANDS = {
         Command("place", "where one more station serves an area best: ckpt=FILE"),
         Command("llvm", "fetch the LLVM that ray tracing needs", "gsparc.simulate.llvm", configured=False),
         Command("report", "one page about many runs: RUN...", bare="runs"),
-        Command("bench", "timings of kernels as ratios to the machine's limit", f"{ROOM}bench.command"),
+        Command("bench", "timings of kernels as ratios to the machine's limit"),
     )
 }
 

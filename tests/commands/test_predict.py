@@ -15,11 +15,11 @@ from drives import city_drive, write_table
 
 import gsparc
 from gsparc.commands.check import main as check
-from gsparc.commands.predict.command import predict
 from gsparc.commands.train import train
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
+from gsparc.evaluation.answers import predict
 from gsparc.evaluation.open_runs import aligned
 from gsparc.models import checkpoint
 from gsparc.models.per_station import for_links

@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsparc.commands.bench import kernels, layers
-from gsparc.commands.bench.measure import Call, Case, Machine, measure, timed, undisturbed
-from gsparc.commands.bench.scene import Scene, scene
 from gsparc.ops.projection import Projection
+from gsparc.prediction.bench import kernels, layers
+from gsparc.prediction.bench.measure import Call, Case, Machine, measure, timed, undisturbed
+from gsparc.prediction.bench.scene import Scene, scene
 from gsparc.prediction.timing import ClockSettings
 
 # Of forward / limit: for fewer Gaussians than MANY, and for more. Where it comes from: docs/kernels.md.

@@ -1,9 +1,11 @@
-"""Predictions at places, station by station, and their CSV or npz file."""
+"""Predictions at the places of a file, station by station, and their CSV or npz file."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +15,19 @@ import torch
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.files import whole_file
-from gsparc.data.query_places import QueryPlaces
-from gsparc.data.schema import End, Kind
+from gsparc.data.query_places import QueryPlaces, read_query_places
+from gsparc.data.schema import End, Kind, Site
 from gsparc.evaluation.intervals import in_decibels
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction
+from gsparc.prediction.placing import far_outside, in_a_speck, in_world, stations_of, with_heights
 from gsparc.prediction.predictor import Predictor
 
+log = logging.getLogger(__name__)
+
 CHUNK = 512  # places predicted at a time
+MOST_ENTRIES = 16  # of a channel, as columns of a table
+ENDINGS = (".csv", ".npz")
 
 
 @dataclass(frozen=True)
@@ -45,66 +52,132 @@ class Answers:
         return len(self.place)
 
 
+def predict(
+    predictor: Predictor,
+    places: str | Path,
+    out: str | Path | None = None,
+    *,
+    station: str | None = None,
+    columns: dict[str, object] | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Predict at the places of a file and write the answers; what was guessed is logged.
+
+    Args:
+        predictor: of the model.
+        places: see `read_query_places`.
+        out: *.csv or *.npz; None: beside the places.
+        station: name or number of the only one to predict.
+        columns: of a table of places, by quantity, where a guess will not do.
+        overwrite: whether a file that is there may be replaced.
+
+    Returns:
+        Facts for `summary.json`.
+
+    Raises:
+        DataError: anything that is wrong with the places, the station or the file to write.
+    """
+    site, places = predictor.site, Path(places)
+    path = target(None if out is None else str(out), places, overwrite)
+    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
+    queries = with_heights(read_query_places(places, moving, columns or {}), site)
+    for note in _notes(queries, site):
+        log.info("%s: %s", places, note)
+    world = in_world(queries, site)
+    row, number = stations_of(queries, site, station)
+    named = station is not None or queries.station is not None
+    far, margin = far_outside(world, site)
+    found = answers(predictor, queries, world, row, number, named, partial(check_fits, path, site.kind))
+    speck = in_a_speck(queries, world, site)
+    if speck is not None:
+        log.warning("%s: %s", places, speck)
+    if far.any():
+        log.warning(
+            "%s: %d of %d places lie more than %.3g m outside the box of the training places, the first in "
+            "%s: expect little of the predictions there",
+            places, int(far.sum()), len(far), margin, queries.rows[int(np.argmax(far))],
+        )  # fmt: skip
+    write(path, queries, found, site.kind)
+    facts = {
+        "predict/places": len(queries), "predict/predictions": len(found),
+        "predict/far_outside": int(far.sum()),
+        "predict/stations": 0 if found.station is None else len(np.unique(found.station)),
+        "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
+        "places": str(places), "out": str(path),
+    }  # fmt: skip
+    level = decibels(found)[0] if site.kind == "rssi" else np.zeros(0)
+    level = level[np.isfinite(level)]
+    if len(level):
+        facts |= {"predict/lowest_db": float(level.min()), "predict/highest_db": float(level.max())}
+    return facts
+
+
+def _notes(queries: QueryPlaces, site: Site) -> list[str]:
+    notes, origin = list(queries.notes), site.georeference
+    if origin is not None and not any(where.degrees for where in queries.ends.values()):
+        notes.append(f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees")
+    if queries.station is not None and site.stations is None:
+        notes.append("not used: stations; the model has none")
+    return notes
+
+
 def answers(
     predictor: Predictor,
     queries: QueryPlaces,
     world: dict[End, np.ndarray],
-    pairs: list[tuple[int, int | None]],
+    row: np.ndarray,
+    number: np.ndarray,
     named: bool,
     accept: Callable[[tuple[int, ...]], None],
-) -> tuple[Answers, list[str]]:
-    """Predict, and say which stations cannot be.
+) -> Answers:
+    """Predict; stations that cannot be are left out, which is logged.
 
     Args:
         predictor: of the model.
         queries: for messages.
         world: (n, 3) [m] by end.
-        pairs: (row, number of the station) of each prediction.
+        row, number: (N,) of each prediction, see `stations_of`.
         named: whether somebody asked for these stations; then one without a model is refused.
         accept: raises where predictions of a shape are not wanted; called after the first ones.
 
     Raises:
         DataError: a station that was asked for had too few training rows, or none has a model.
     """
-    row = np.array([row for row, _ in pairs], np.int64)
-    number = np.array([-1 if number is None else number for _, number in pairs], np.int64)
     stations = predictor.site.stations
     blocks: list[tuple[Predictor, np.ndarray]] = []
     silent: list[str] = []
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
         try:
-            asking = predictor if stations is None else predictor.at(stations.name[one])
+            own = predictor if stations is None else predictor.at(stations.name[one])
         except ValueError as error:
             if named:
                 raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
             silent.append(f"left out: {error}")
             continue
-        blocks += [(asking, rows) for rows in np.split(chosen, range(CHUNK, len(chosen), CHUNK))]
+        blocks += [(own, rows) for rows in np.split(chosen, range(CHUNK, len(chosen), CHUNK))]
+    if not blocks:
+        raise DataError(silent[0])
 
     def predicted(block: int) -> Prediction:
-        asking, rows = blocks[block]
+        own, rows = blocks[block]
         ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
-        return asking.predict(**ends)
+        return own.predict(**ends)
 
     parts: list[tuple[np.ndarray, Prediction]] = []
-    for block, said in each(predicted, range(len(blocks)), "blocks of places"):
+    for block, prediction in each(predicted, range(len(blocks)), "blocks of places"):
         if not parts:
-            accept(tuple(said.mean.shape[1:]))
-        parts.append((blocks[block][1], said))
-    if not parts:
-        raise DataError(silent[0])
+            accept(tuple(prediction.mean.shape[1:]))
+        parts.append((blocks[block][1], prediction))
+    for line in silent:
+        log.warning(line)
     rows = np.concatenate([rows for rows, _ in parts])
     order = np.argsort(rows, kind="stable")
-    whole = Prediction.joined([said for _, said in parts], torch.from_numpy(order))
-    spread, sure = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
+    whole = Prediction.joined([prediction for _, prediction in parts], torch.from_numpy(order))
+    variance, confidence = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
     rows = rows[order]
     names = None if stations is None else np.array(stations.name)[number[rows]]
-    return Answers(row[rows], names, whole.mean.numpy(), spread, sure), silent
-
-
-MOST_ENTRIES = 16  # of a channel, as columns of a table
-ENDINGS = (".csv", ".npz")
+    return Answers(row[rows], names, whole.mean.numpy(), variance, confidence)
 
 
 def target(out: str | None, places: Path, overwrite: bool) -> Path:

@@ -15,8 +15,8 @@ from hydra.core.hydra_config import HydraConfig
 from towns import town_model
 
 import gsparc
-from gsparc.commands.tradeoff import _alone, task
-from gsparc.evaluation.experiment.tradeoff import Recorded, closeness
+from gsparc.commands.tradeoff import task
+from gsparc.evaluation.experiment.tradeoff import Recorded, closeness, irreducible
 from gsparc.evaluation.scores import score
 from gsparc.models import checkpoint
 from gsparc.models.baselines.distance_law import DistanceLaw
@@ -154,8 +154,8 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
 def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
     whole = gsparc.load(town_model())
     method, single = whole.method, whole.at("west").method
-    assert "of several stations is asked as it was trained" in _alone(method)[0]
-    assert "no Gaussians, sources" in _alone(DistanceLaw())[0] and not _alone(single)
+    assert "of several stations is asked as it was trained" in irreducible(method)[0]
+    assert "no Gaussians, sources" in irreducible(DistanceLaw())[0] and not irreducible(single)
 
 
 def test_a_model_of_several_stations_could_not_be_timed():
