@@ -11,7 +11,7 @@ from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.output import run_directory
-from gsparc.commands.run_lock import held
+from gsparc.commands.run_lock import locked
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation import simulated, summary
 from gsparc.evaluation.console import open_console
@@ -68,7 +68,7 @@ def task(config: DictConfig) -> Outcome | None:
         return None
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
-    with held(out.with_name(out.name + ".parts"), "out"):
+    with locked(out.with_name(out.name + ".parts"), "out"):
         outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
     simulated.floor_plan(outcome, run_dir / "floor_plan.png")

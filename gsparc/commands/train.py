@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from gsparc.commands import cli
 from gsparc.commands.continued import once
 from gsparc.commands.output import run_directory, show
-from gsparc.commands.run_lock import held
+from gsparc.commands.run_lock import locked
 from gsparc.commands.settings import RunSettings
 from gsparc.evaluation.experiment.run import Objects, objective_of, run
 from gsparc.evaluation.metric_formats import score_of
@@ -26,7 +26,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     Raises:
         ValueError: as `run`; or another run writes there.
     """
-    with held(run_dir):
+    with locked(run_dir):
         RunSettings.of(config)
         return run(config, run_dir)
 

@@ -26,7 +26,7 @@ Locate = Callable[[DictConfig, Path], dict[str, Any]]
 
 
 def compare_places(
-    filled: Sequence[Filled], settings: Mapping[str, Any], kept: Path, locate: Locate
+    filled: Sequence[Filled], settings: Mapping[str, Any], cells_dir: Path, locate: Locate
 ) -> pd.DataFrame:
     """Locate with every kept model that states a variance, and with the field of every set of fingerprints.
 
@@ -35,7 +35,7 @@ def compare_places(
     Args:
         filled: cells; those without a checkpoint are left out.
         settings: files of `fingerprints` by name, their `splits`, and overrides of `gsparc locate`.
-        kept: folder of cells.
+        cells_dir: of kept cells.
         locate: locates as conf/locate.yaml says, into a folder, and returns its facts.
 
     Returns:
@@ -55,7 +55,7 @@ def compare_places(
         for split in settings["splits"]:
             chosen = {"dataset": "fingerprints", "dataset.file": file, "dataset.split": split}
             mark = sha256(Path(file).read_bytes()).hexdigest()[:20]
-            jobs.append(((name, split, "field"), kept / f"{name}-{split}-field-{mark}", chosen))
+            jobs.append(((name, split, "field"), cells_dir / f"{name}-{split}-field-{mark}", chosen))
     rows: list[dict[str, Any]] = []
     for names, folder, chosen in jobs:
         try:
