@@ -16,8 +16,7 @@ from gsparc.commands.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.summary import provenance, shown, table, write_summary
 from gsparc.ops.native import instruction_set
-from gsparc.prediction.bench.cases import cases
-from gsparc.prediction.bench.claims import Claim, claims
+from gsparc.prediction.bench.claims import Claim, cases, claims
 from gsparc.prediction.bench.measure import Machine, Row, facts, measure
 from gsparc.prediction.timing import ClockSettings, machine_facts, peak_memory
 

@@ -34,10 +34,9 @@ def check(
     try:
         reading = read_any(path, columns, stations_file)
     except DataError as error:
-        for problem in error.problems:
-            _line(console, problem)
         count = len(error.problems)
-        _line(console, f"{path}: refused, {count} problem{'s' if count > 1 else ''}")
+        for line in [*error.problems, f"{path}: refused, {count} problem{'s' * (count > 1)}"]:
+            _line(console, line)
         return False
     levels = link_levels(reading.data)
     steps = [] if levels is None else steps_of(levels)

@@ -47,8 +47,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)
     if out.exists():
         raise SettingError(f"out={out}: is there already; remove it or name another folder")
-    predictor = load(path)
-    predictor = predictor if config.station is None else predictor.at(config.station)
+    predictor = load(path) if config.station is None else load(path).at(config.station)
     with whole_folder(out) as folder:
         facts, lines = WRITERS[config.to](predictor, config, folder, out)
     facts |= {"model/name": predictor.method.name, "out": str(out), "ckpt": str(path)}
@@ -75,8 +74,7 @@ def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:
 
 
 def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
-    place = _places(predictor, config)
-    time_s = read_times(config.table)
+    place, time_s = _places(predictor, config), read_times(config.table)
     if time_s is None:
         raise SettingError(f"table={config.table}: no column time_s [s]")
     facts = write_impulses(predictor, Trajectory(time_s, place), plain(config), folder, config.to == "cir")

@@ -46,8 +46,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, reduced(method, some, measured)) for some in settings]
     cache = platform_cache() if config.cache is None else Path(config.cache)
-    asked = config.baselines, config.peers, config.ckpt, config.eval_on
-    others = tradeoff.others_of(run, *asked, cache)
+    contenders = config.baselines, config.peers, config.ckpt, config.eval_on
+    others = tradeoff.others_of(run, *contenders, cache)
     places = data.moving[rows] + data.site.origin
     clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)

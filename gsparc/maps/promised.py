@@ -80,8 +80,8 @@ def notes_of(found: FieldMap, coverage: Coverage | None) -> list[str]:
             "the strongest and above its floor; noise_db=... says where noise lies"
         )
     if coverage is None:
-        alone = "intervals are the model's own deviations, and places far from data are not refused"
-        return [*notes, f"no promise: {alone}"]
+        own = "intervals are the model's own deviations, and places far from data are not refused"
+        return [*notes, f"no promise: {own}"]
     ours = f"{coverage.share:.1%} did (mean width {coverage.width_db:.1f} dB"
     own = f"the model's own deviations: {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB)"
     notes.append(

@@ -75,9 +75,9 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
 
 def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
     """In words that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
-    given = [world[end] for end, where in queries.ends.items() if not where.degrees]
+    metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
     low, high = site.moving_box
-    wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in given), default=0.0)
+    wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in metres), default=0.0)
     side = float((high - low).max())
     if not 0 < wide <= SPECK * side:
         return None

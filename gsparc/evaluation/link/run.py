@@ -77,8 +77,8 @@ class LinkStudy:
         scores = evidence.scores[kind]
         self.score = scores[self.test]
         self.accepted = self.score >= threshold.value
-        sure = aside[scores[aside] >= threshold.value]
-        self.aside = sure if len(sure) else aside
+        rows = aside[scores[aside] >= threshold.value]
+        self.aside = rows if len(rows) else aside
         self.states_variance = bool(grid.variance.isfinite().all())
         self.grid, bad = grid.of(self.test), promise.bad(evidence.error[self.test])
         self.facts: dict[str, Any] = {

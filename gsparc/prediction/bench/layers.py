@@ -82,13 +82,13 @@ def loss(batch: int) -> Case:
     )
 
 
-def channel(field: Scene, antennas: int, subcarriers: int, batch: int) -> Case:
+def channel(field: Scene, antennas: int, subcarriers: int) -> Case:
     """Antennas x subcarriers at a moving receiver: the factored sum (kernel); all of the query (whole)."""
     count, draw = len(field), torch.Generator().manual_seed(0)
     steering = torch.randn(count, antennas, 2, generator=draw)
     delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
-    gains = torch.randn(batch, count, 2, generator=draw)
-    poses, tx = receivers(batch), places(batch) + 1
+    gains = torch.randn(1, count, 2, generator=draw)
+    poses, tx = receivers(1), places(1) + 1
 
     def whole() -> Tensor:
         share = mean_weights(field.plan(poses, channels=True), *field.geometry).share
@@ -96,8 +96,8 @@ def channel(field: Scene, antennas: int, subcarriers: int, batch: int) -> Case:
         return channels(share.unsqueeze(-1) * emitted, steering, delays, *TONES, subcarriers)
 
     return Case(
-        *(f"channel of {antennas} x {subcarriers}", field.projection, count, batch),
-        work=Work(size((gains, steering, delays)) + 8 * batch * antennas * subcarriers),
+        *(f"channel of {antennas} x {subcarriers}", field.projection, count, 1),
+        work=Work(size((gains, steering, delays)) + 8 * antennas * subcarriers),
         kernel=lambda: channels(gains, steering, delays, *TONES, subcarriers),
         whole=whole,
         reference=lambda: summed(gains, steering, delays, TONES, subcarriers),
