@@ -53,16 +53,6 @@ def test_dashboards_get_the_points_that_nothing_beats(swept):
     assert len(rows) == facts["tradeoff/front"] and {len(row) for row in rows} == {len(heads)}
 
 
-def test_a_misspelt_subset_is_refused_in_words_before_anything_is_measured(field, tmp_path, monkeypatch):
-    """Without baselines it was an AttributeError, after every combination had been made."""
-    monkeypatch.setattr(
-        HydraConfig, "get", lambda: type("C", (), {"runtime": type("R", (), {"output_dir": tmp_path})})
-    )
-    config = compose(f"ckpt='{field.checkpoints[0]}'", "baselines=[]", "eval_on=tset", config="tradeoff")
-    with pytest.raises(ValueError, match="eval_on='tset' is none of train, val, test"):
-        task(config)
-
-
 def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     facts, folder, *_ = swept
     with (folder / "tradeoff.csv").open() as file:
