@@ -55,9 +55,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
     geotiff_wanted(config.geotiff, predictor.site.georeference)
-    promise = None
-    if config.promised:
-        promise = promise_of(str(config.ckpt), settings["dataset"], how, bool(config.renew))
+    promise = promise_of(str(config.ckpt), settings)
     found = map_of(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
     lines = notes_of(found, coverage)

@@ -11,7 +11,6 @@ from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.maps.pictures import draw_placing
 from gsparc.maps.placing import NewStation, in_words, new_station_error, number, place_next, unheard_refused
-from gsparc.maps.promise import PromiseSettings
 from gsparc.maps.promised import promise_of, trained
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
@@ -31,9 +30,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
     }  # fmt: skip
     place_next(predictor, count=1, dry=True, **query)  # refuses what cannot be before anything is fitted
-    promise, error = None, NewStation()
-    if config.promised:
-        promise = promise_of(path, settings["dataset"], PromiseSettings(**settings["promise"]))
+    promise, error = promise_of(path, settings), NewStation()
     if config.left_out:
         error = new_station_error(*trained(path, settings["dataset"]), int(config.left_out))
     found = place_next(predictor, count=config.count, promise=promise, error=error, **query)

@@ -14,7 +14,6 @@ from gsparc.evaluation.summary import write_samples
 from gsparc.maps.floor_plan import plan_of
 from gsparc.maps.pictures import draw_plan_picture
 from gsparc.maps.planning import plan_next
-from gsparc.maps.promise import PromiseSettings
 from gsparc.maps.promised import promise_of
 from gsparc.prediction.operating_point import load
 
@@ -25,10 +24,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir, settings = run_directory(), plain(config)
     floor = plan_of(settings)
     predictor = None if config.ckpt is None else load(config.ckpt)
-    promise = None
-    if predictor is not None and config.promised:
-        how = PromiseSettings(**settings["promise"])
-        promise = promise_of(str(config.ckpt), settings["dataset"], how)
+    promise = None if predictor is None else promise_of(str(config.ckpt), settings)
     found = plan_next(
         predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
         plan=floor, stations=stations_of(settings["stations"]), other_end=settings["other_end"],

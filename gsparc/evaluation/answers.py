@@ -211,26 +211,30 @@ def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
 
 def write(path: Path, queries: QueryPlaces, found: Answers, kind: Kind) -> None:
     """Write all predictions, whole or not at all."""
-    columns = {**_places(queries, found), **_levels(found, kind)}
-    if path.suffix.lower() == ".npz":
-        arrays = columns if kind == "rssi" else {**columns, kind: found.mean}
-        with whole_file(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+    archive = path.suffix.lower() == ".npz"
+    columns = _places(queries, found)
+    if kind == "rssi":
+        named = zip(("rssi_db", "rssi_db_std"), decibels(found), strict=True)
+        columns |= {name: values.astype(np.float32) for name, values in named if values is not None}
+    elif found.variance is not None:
+        columns[f"{kind}_std"] = np.sqrt(found.variance).astype(np.float32)
+    if archive and kind != "rssi":
+        columns[kind] = found.mean
+    elif kind == "csi":
+        columns |= _entries(found.mean)
+    columns |= {} if found.confidence is None else {"confidence": found.confidence}
+    if not archive:
+        write_samples(path, {name: _cells(values) for name, values in columns.items()})
         return
-    if kind == "csi":
-        columns |= _parts(found.mean)
-    confidence = columns.pop("confidence", None)
-    columns |= {} if confidence is None else {"confidence": confidence}
-    write_samples(path, {name: _cells(values) for name, values in columns.items()})
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **columns)
 
 
 def decibels(found: Answers) -> tuple[np.ndarray, np.ndarray | None]:
     """Level and standard deviation (N,) [dB] of powers, NaN where the power is 0; None without a variance."""
     power = found.mean[:, 0].astype(np.float64)
-    good = power > 0
-    level, spread = (np.full(len(power), np.nan) for _ in range(2))
     variance = np.zeros(len(power)) if found.variance is None else found.variance
-    level[good], spread[good] = in_decibels(power[good], variance[good])
+    level, spread = in_decibels(np.where(power > 0, power, np.nan), variance)
     return level, None if found.variance is None else spread
 
 
@@ -245,26 +249,14 @@ def _places(queries: QueryPlaces, found: Answers) -> dict[str, np.ndarray]:
     return columns if found.station is None else {**columns, "station": found.station}
 
 
-def _levels(found: Answers, kind: Kind) -> dict[str, np.ndarray]:
-    columns: dict[str, np.ndarray] = {}
-    if kind == "rssi":
-        level, spread = decibels(found)
-        columns = {"rssi_db": level} | ({} if spread is None else {"rssi_db_std": spread})
-    elif found.variance is not None:
-        columns = {f"{kind}_std": np.sqrt(found.variance)}
-    columns = {name: values.astype(np.float32) for name, values in columns.items()}
-    return columns if found.confidence is None else {**columns, "confidence": found.confidence}
-
-
-def _parts(channels: np.ndarray) -> dict[str, np.ndarray]:
+def _entries(channels: np.ndarray) -> dict[str, np.ndarray]:
     """Real and imaginary parts; numbers of antenna and subcarrier where there are several."""
-    _, antennas, tones = channels.shape
-    columns = {}
-    for a in range(antennas):
-        for k in range(tones):
-            number = (f"_{a}" if antennas > 1 else "") + (f"_{k}" if tones > 1 else "")
-            columns[f"csi_re{number}"] = channels[:, a, k].real
-            columns[f"csi_im{number}"] = channels[:, a, k].imag
+    columns: dict[str, np.ndarray] = {}
+    for place in np.ndindex(channels.shape[1:]):
+        counts = zip(place, channels.shape[1:], strict=True)
+        number = "".join(f"_{index}" for index, count in counts if count > 1)
+        entry = channels[:, *place]
+        columns |= {f"csi_re{number}": entry.real, f"csi_im{number}": entry.imag}
     return columns
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -22,24 +22,31 @@ from gsparc.training.context import FitContext
 log = logging.getLogger(__name__)
 
 
-def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, renew: bool = False) -> Promise:
+def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
     """The evidence stored with a model, or gathered from its training data and then stored.
+
+    Args:
+        path: the model's file.
+        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of conf/map.yaml.
 
     Raises:
         DataError: the training data are gone, or are others.
     """
+    how = PromiseSettings(**settings["promise"])
+    if not settings["promised"]:
+        return None
     stored = checkpoint.read(path)
-    found = None if renew else stored_promise(stored.extra)
-    if found is not None and (settings.block_m is None or settings.block_m == found.block_m):
+    found = None if settings.get("renew") else stored_promise(stored.extra)
+    if found is not None and how.block_m in (None, found.block_m):
         return found
     if "model" not in stored.configuration:
         raise DataError(
             f"{path}: does not say how it was trained; say promised=false for a map without promise"
         )
-    method, make, data, fold, context = trained(path, dataset)
-    log.info("a promise for this map: %d fits without blocks of places", settings.folds)
-    found = gather(method, make, data, fold, settings, context)
-    found.coverage(settings.share)  # too little evidence is said before anything is stored
+    method, make, data, fold, context = trained(path, settings["dataset"])
+    log.info("a promise for this map: %d fits without blocks of places", how.folds)
+    found = gather(method, make, data, fold, how, context)
+    found.coverage(how.share)  # too little evidence is said before anything is stored
     found.keep(path)
     return found
 
