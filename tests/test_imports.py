@@ -35,7 +35,7 @@ ARROWS = {
     "maps": "data evaluation models prediction processes training",
     "view": "data evaluation maps models ops prediction",
     "callbacks": "data evaluation field training",
-    "commands": "conf data evaluation field locate maps models ops prediction simulate training view",
+    "commands": "conf data evaluation locate maps models ops prediction simulate training view",
     "conf": "",
 }
 LARGEST = ("models", "data", "commands")

@@ -24,32 +24,26 @@ def check(
     stations_file: str | None = None,
     draw: str | None = None,
 ) -> bool:
-    """Write what was understood of `path`, or all its problems one per line; returns whether it is good.
+    """Write what was understood of a file, or its problems one per line; returns whether it is good.
 
     Args:
-        path: file or folder.
+        path, columns, stations_file: see `read_any`.
         console: where lines go.
-        columns, stations_file: of a table.
         draw: PNG file for a map; None draws none.
     """
     try:
         reading = read_any(path, columns, stations_file)
     except DataError as error:
-        for problem in error.problems:
-            _line(console, problem)
         count = len(error.problems)
-        _line(console, f"{path}: refused, {count} problem{'s' if count > 1 else ''}")
+        for line in [*error.problems, f"{path}: refused, {count} problem{'s' * (count > 1)}"]:
+            _line(console, line)
         return False
-    for topic, sentence in describe(reading.data):
-        _line(console, f"{topic:<12}{sentence}")
-    for note in reading.notes:
-        _line(console, f"{'note':<12}{note}")
     levels = link_levels(reading.data)
-    steps = []
-    if levels is not None:
-        steps = steps_of(levels)
-        for warning in plausibility_warnings(levels, steps):
-            _line(console, f"{'warning':<12}{warning}")
+    steps = [] if levels is None else steps_of(levels)
+    warnings = [] if levels is None else plausibility_warnings(levels, steps)
+    found = [*describe(reading.data), *(("note", note) for note in reading.notes)]
+    for topic, sentence in [*found, *(("warning", warning) for warning in warnings)]:
+        _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
 
@@ -69,28 +63,21 @@ def check(
 
 
 def _line(console: Console, text: str) -> None:
-    # As it is: paths may hold brackets, and one problem stays one line.
-    # A path that is not UTF-8 must not stop the message about it.
-    text = text.encode("utf-8", "replace").decode()
+    text = text.encode("utf-8", "replace").decode()  # a path may not be UTF-8, and hold brackets
     console.print(text, markup=False, highlight=False, soft_wrap=True, emoji=False)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; exit status 0 when everything given is good, else 1."""
     parser = argparse.ArgumentParser(prog="gsparc check", description=__doc__)
-    parser.add_argument(
-        "path",
-        nargs="+",
-        help="npz or HDF5 file, a table (csv, parquet), a campaign's file, or a folder like the RFID release",
-    )
-    parser.add_argument(
-        "--column", action="append", default=[], metavar="NAME=HEAD", help="of a table: which column is what"
-    )
-    parser.add_argument("--stations-file", help="of a table: a second one that lists the stations")
-    parser.add_argument("--draw", metavar="FILE.png", help="where the map goes; else to outputs/check")
-    parser.add_argument(
-        "--no-draw", action="store_true", help="no map of places, levels and what looks wrong"
-    )
+    add = parser.add_argument
+    kinds = "npz or HDF5 file, a table (csv, parquet), a campaign's file, or a folder like the RFID release"
+    add("path", nargs="+", help=kinds)
+    column = "of a table: which column is what"
+    add("--column", action="append", default=[], metavar="NAME=HEAD", help=column)
+    add("--stations-file", help="of a table: a second one that lists the stations")
+    add("--draw", metavar="FILE.png", help="where the map goes; else to outputs/check")
+    add("--no-draw", action="store_true", help="no map of places, levels and what looks wrong")
     given = parser.parse_intermixed_args(arguments)
     columns = dict(text.partition("=")[::2] for text in given.column)
     for text in [text for text in given.path if text.startswith(SETTINGS)]:  # as refusals and notes say them

@@ -59,23 +59,20 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     try:
         with _noting(interrupts):
             main()
-    except KeyboardInterrupt as interrupt:
-        _print_error(str(interrupt) or "interrupted")
-        sys.exit(130)
     except BrokenPipeError:  # of Hydra's own lists: gsparc/__main__.py ends quietly
         raise
-    except InUse as busy:
-        _print_error(str(busy))
-        sys.exit(1)
-    except (_Failed, Exception) as failure:
+    except (_Failed, InUse, KeyboardInterrupt, Exception) as failure:
         error = failure.error if isinstance(failure, _Failed) else failure
-        if _began_as_interrupt(error):
-            _print_error("interrupted")
-            sys.exit(130)
-        if before == "1":
+        interrupted = _began_as_interrupt(error)
+        if before == "1" and isinstance(error, Exception) and not interrupted:
             raise error from error.__cause__
-        _print_error(f"interrupted: {_message_of(error)}" if interrupts else _message_of(error))
-        sys.exit(130 if interrupts else 1)
+        message = _message_of(error)
+        if interrupts and not interrupted:
+            message = f"interrupted: {message}"
+        Console(stderr=True, soft_wrap=True).print(
+            f"error: {message}", markup=False, highlight=False, style="red"
+        )
+        sys.exit(130 if interrupted or interrupts else 1)
     finally:
         logging.raiseExceptions = True
         release()
@@ -114,8 +111,12 @@ def _began_as_interrupt(error: BaseException | None) -> bool:
     return False
 
 
-def _message_of(error: Exception) -> str:
+def _message_of(error: BaseException) -> str:
     """One line; of a launcher whose job has died, with what to do."""
+    if isinstance(error, InUse | KeyboardInterrupt):
+        return str(error) or "interrupted"
+    if _began_as_interrupt(error):
+        return "interrupted"
     if type(error).__module__.startswith(LAUNCHERS):
         advice = "what is done is kept, the same command goes on with the rest"
         return f"a job was lost ({one_line(error)}); {advice}"
@@ -129,8 +130,8 @@ def _explained(task: Callable[[DictConfig], object], config: str) -> str:
     texts = [(folder / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
     kind = re.search(r"^  - kind: (\w+)", texts[0], re.MULTILINE)  # settings of the command itself
     if kind is not None:
-        said = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
-        file = folder / "kind" / f"{(said or [kind[1]])[-1]}.yaml"
+        given = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
+        file = folder / "kind" / f"{(given or [kind[1]])[-1]}.yaml"
         texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
     return "\n\n".join([what, *texts]) + "\n\n"
 
@@ -146,9 +147,3 @@ def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], obje
             raise  # in a sweep Hydra names the job that failed
 
     return wrapped
-
-
-def _print_error(message: str) -> None:
-    Console(stderr=True, soft_wrap=True).print(
-        f"error: {message}", markup=False, highlight=False, style="red"
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -13,10 +12,9 @@ import pandas as pd
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsparc.commands.compare_places import Row as PlaceRow
-from gsparc.commands.compare_places import compare_places
-from gsparc.commands.output import run_directory, show
-from gsparc.commands.run_lock import held
+from gsparc.commands.locate import locate
+from gsparc.commands.output import finish, run_directory, show
+from gsparc.commands.run_lock import locked
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.limits import choice
@@ -24,14 +22,13 @@ from gsparc.evaluation.experiment.cells import Budget, Contender, plan, plugged
 from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
+from gsparc.evaluation.experiment.places import compare_places, facts_and_table
 from gsparc.evaluation.experiment.problem import named, problems_of
 from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, overview, rows_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
-log = logging.getLogger(__name__)
 
-
-def task(config: DictConfig) -> pd.DataFrame | list[PlaceRow]:
+def task(config: DictConfig) -> pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods, or locate; and report."""
     RunSettings.of(config)
     run_dir = run_directory()
@@ -40,27 +37,30 @@ def task(config: DictConfig) -> pd.DataFrame | list[PlaceRow]:
     locating = settings["task"] == "locate"
     methods = plugged() | named("methods", Contender, settings["methods"])
     folder = settings["cells"]
-    kept = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
+    cells_dir = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     paths = [(own or {}).get(key) for own in settings["datasets"].values() for key in ("root", "file")]
-    alone = locating and settings["locate"]["fingerprints"] and not any(paths)
-    problems = [] if alone else problems_of(settings, kept)
+    only_prints = locating and settings["locate"]["fingerprints"] and not any(paths)
+    problems = [] if only_prints else problems_of(settings, cells_dir)
     budgets = [
         Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
     ]
     prepared = [
-        prepare(cell, methods[cell.method], settings["datasets"][cell.dataset] or {}, problem, kept)
+        prepare(cell, methods[cell.method], settings["datasets"][cell.dataset] or {}, problem, cells_dir)
         for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
-    with held(kept, "cells"):
+    with locked(cells_dir, "cells"):
         filled = fill_all(prepared, bool(settings["train"]), limit_s)
         if locating:
-            return compare_places(filled, settings["locate"], kept, run_dir)
+            found = compare_places(filled, settings["locate"], cells_dir, locate)
+            write_samples(run_dir / "places.csv", {name: found[name].tolist() for name in found})
+            finish(run_dir, *facts_and_table(found))
+            return found
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
-    timed = timed_here(filled, by_name, kept, bool(settings["latency"]))
+    timed = timed_here(filled, by_name, cells_dir, bool(settings["latency"]))
     return report(filled, timed, str(settings["ours"]), run_dir)
 
 

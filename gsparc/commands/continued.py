@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.run_lock import held, in_use
+from gsparc.commands.run_lock import in_use, locked
 from gsparc.commands.settings import plain
 from gsparc.data.files import whole_file
 from gsparc.evaluation.report.sweep import FAILURE
@@ -21,6 +21,7 @@ from gsparc.models.parts import LAST
 log = logging.getLogger(__name__)
 
 RECORD = "job.json"  # of a job's folder: its settings and data, when it began, and what it returned
+WHERE = ("engine", "workers", "ray")  # settings of where a job is done
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 
 
@@ -39,10 +40,9 @@ def once(
     Raises:
         ValueError: another process is doing it.
     """
-    with held(run_dir / ".job"):  # the run's own is its work's
-        where = ("engine", "workers", "ray")
-        told = {name: value for name, value in plain(config).items() if name not in where}
-        settings = json.loads(json.dumps(told, default=str))
+    with locked(run_dir / ".job"):  # the run's own is its work's
+        stated = {name: value for name, value in plain(config).items() if name not in WHERE}
+        settings = json.loads(json.dumps(stated, default=str))
         now = {"settings": settings, "data": _files(settings.get("dataset"), run_dir)}
         record, other = _read(run_dir / RECORD), None
         same = record is not None and all(record.get(key, now[key]) == now[key] for key in now)
@@ -56,8 +56,9 @@ def once(
         elif config.ckpt_path is None:
             config.ckpt_path = _left(run_dir, record["began"])
         if other is not None:
-            config.ckpt_path, text = _left(other.parent, 0.0), "to begin anew, delete it"
-            log.info("going on from %s, where the same run was interrupted; %s", config.ckpt_path, text)
+            config.ckpt_path = _left(other.parent, 0.0)
+            text = "going on from %s, where the same run was interrupted; to begin anew, delete it"
+            log.info(text, config.ckpt_path)
         (run_dir / FAILURE).unlink(missing_ok=True)  # of an earlier try
         value = work(config)
         for path in (run_dir / RECORD, *([] if other is None else [other])):
@@ -91,17 +92,16 @@ def _beside(run_dir: Path, record: dict[str, Any]) -> Path | None:
 
 
 def _left(run_dir: Path, began: float) -> str | None:
-    """The last checkpoint of this job, or the folder of one of many parts; None: it begins anew."""
+    """The last checkpoint of this job, not of one with other settings before, or the folder of one of many
+    parts; None: it begins anew."""
+
+    def own(path: Path) -> bool:
+        return path.exists() and path.stat().st_mtime >= began
+
     for name in LAST:
-        if _is_of(run_dir / name, began):
+        if own(run_dir / name):
             return str(run_dir / name)
-    parts = (path for pattern in PARTS for path in run_dir.glob(pattern))
-    return str(run_dir) if any(_is_of(path, began) for path in parts) else None
-
-
-def _is_of(path: Path, began: float) -> bool:
-    """Whether a checkpoint is there and of this job, not of one with other settings before."""
-    return path.exists() and path.stat().st_mtime >= began
+    return str(run_dir) if any(own(path) for pattern in PARTS for path in run_dir.glob(pattern)) else None
 
 
 def _read(path: Path) -> dict[str, Any] | None:

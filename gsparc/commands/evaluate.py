@@ -8,14 +8,14 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import run_directory, show
+from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
+from gsparc.evaluation.summary import remarks, results_table, write_samples
 from gsparc.models import checkpoint
 
 
@@ -63,11 +63,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         cache=platform_cache() if config.cache is None else Path(config.cache),
     )
     seed = checkpoint.read(paths[0]).configuration.get("seed")
-    facts = {**found.facts, **provenance(), "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
-    write_summary(run_dir / "summary.json", facts)
+    facts = {**found.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
     shown = results_table(facts, facts["model/label"], title, config.eval_on)
-    show(run_dir, shown, lines=remarks(facts, config.eval_on))
-    return facts
+    return finish(run_dir, facts, shown, lines=remarks(facts, config.eval_on))

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
-ROOM = "gsparc.commands."
-
 
 @dataclass(frozen=True)
 class Command:
@@ -18,21 +16,16 @@ class Command:
     Attributes:
         name: also of its configuration, `conf/<name>.yaml`.
         answers: one line for the list.
-        own: module with `task(config)`; empty: `gsparc.commands.<name>`.
+        module: with `task(config)`; empty: `gsparc.commands.<name>`.
         bare: setting that takes words without an equals sign, as a list of paths.
         configured: False for a command without a configuration: its module has `main(arguments)`.
     """
 
     name: str
     answers: str
-    own: str = ""
+    module: str = ""
     bare: str | None = None
     configured: bool = True
-
-    @property
-    def module(self) -> str:
-        """Where its task is."""
-        return self.own or ROOM + self.name
 
     def arguments(self, given: Sequence[str]) -> list[str]:
         """A command line in Hydra's words: bare paths become `<bare>=[...]`."""
@@ -45,7 +38,7 @@ class Command:
 
     def run(self) -> None:
         """Run it with the command line in `sys.argv`; ends the process when it fails."""
-        module = import_module(self.module)
+        module = import_module(self.module or f"gsparc.commands.{self.name}")
         if not self.configured:
             sys.exit(module.main(sys.argv[1:]))
         from gsparc.commands import cli
@@ -59,17 +52,15 @@ COMMANDS = {
         Command("train", "train a method on a dataset and test it beside baselines"),
         Command("evaluate", "test a checkpoint again: ckpt=FILE"),
         Command("check", "what is in files of measurements, or what is wrong: FILE...", configured=False),
-        Command(
-            "predict", "predictions at places of a table: ckpt=FILE places=FILE", f"{ROOM}predict.command"
-        ),
+        Command("predict", "predictions at places of a table: ckpt=FILE places=FILE"),
         Command("simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
         Command("study", "variants of one model: kind=effects, positions or measurements"),
         Command("tradeoff", "accuracy against latency of one model: ckpt=FILE"),
         Command("compare", "every method under the same data, metrics and clock"),
         Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
-        Command("link", "rates and block errors with predicted channels: ckpt=FILE", f"{ROOM}link.command"),
+        Command("link", "rates and block errors with predicted channels: ckpt=FILE"),
         Command("export", "the model for other programs: ckpt=FILE to=c, cir, deepmimo, sionna"),
-        Command("serve", "answers over HTTP: ckpt=FILE", f"{ROOM}serve.command"),
+        Command("serve", "answers over HTTP: ckpt=FILE"),
         Command("locate", "where rows were heard, by the field's likelihood: ckpt=FILE"),
         Command("map", "received power over an area with a promised error: ckpt=FILE"),
         Command("view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
@@ -77,7 +68,7 @@ COMMANDS = {
         Command("place", "where one more station serves an area best: ckpt=FILE"),
         Command("llvm", "fetch the LLVM that ray tracing needs", "gsparc.simulate.llvm", configured=False),
         Command("report", "one page about many runs: RUN...", bare="runs"),
-        Command("bench", "timings of kernels as ratios to the machine's limit", f"{ROOM}bench.command"),
+        Command("bench", "timings of kernels as ratios to the machine's limit"),
     )
 }
 

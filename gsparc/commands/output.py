@@ -7,11 +7,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from rich.console import RenderableType
 
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import machine_facts
 
 
@@ -29,11 +31,14 @@ def show(run_dir: Path, *shown: RenderableType, lines: Iterable[str] = (), befor
         console.print(line, highlight=False)
 
 
-def finish(run_dir: Path, facts: Mapping[str, Any], *shown: RenderableType, **said: Any) -> dict[str, Any]:
-    """Write `summary.json` with the program and the machine, and `show` what is `said`; returns the facts."""
-    whole = {**facts, **provenance(), **machine_facts()}
+def finish(run_dir: Path, facts: Mapping[str, Any], *shown: RenderableType, **how: Any) -> dict[str, Any]:
+    """Write `summary.json` with the program and the machine, then `show`; returns the facts.
+
+    Of the machine, what `facts` says of it stands.
+    """
+    whole = {**machine_facts(), **facts, **provenance()}
     write_summary(run_dir / "summary.json", whole)
-    show(run_dir, *shown, **said)
+    show(run_dir, *shown, **how)
     return whole
 
 
@@ -41,3 +46,12 @@ def columns(rows: Sequence[Any], of: type) -> dict[str, list[Any]]:
     """Columns of a CSV file from instances of the dataclass `of`; None becomes an empty cell."""
     values = {field.name: [getattr(row, field.name) for row in rows] for field in fields(of)}
     return {name: ["" if value is None else value for value in column] for name, column in values.items()}
+
+
+def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np.ndarray]:
+    """Columns of a table of places (n, 3) [m], in degrees, too, where the model knows its place on Earth."""
+    columns = dict(zip(("x", "y", "z"), places.T.round(4), strict=True))
+    if predictor is not None and predictor.site.georeference is not None and len(places):
+        latitude, longitude, _ = predictor.degrees(places)
+        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
+    return columns

@@ -6,13 +6,12 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.map import coordinates, promise_of, trained
-from gsparc.commands.output import finish, run_directory
+from gsparc.commands.output import coordinates, finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.maps.pictures import draw_placing
 from gsparc.maps.placing import NewStation, in_words, new_station_error, number, place_next, unheard_refused
-from gsparc.maps.promise import PromiseSettings
+from gsparc.maps.promised import promise_of, trained
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
 from gsparc.prediction.operating_point import load
@@ -26,17 +25,15 @@ def task(config: DictConfig) -> dict[str, Any]:
     if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):
         raise unheard_refused(path)  # before the copies of all stations are restored
     predictor = load(path)
-    asked = {
+    query = {
         "area": settings["area"], "goal": config.goal, "threshold_db": float(config.threshold_db),
         "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
     }  # fmt: skip
-    place_next(predictor, count=1, dry=True, **asked)  # refuses what cannot be before anything is fitted
-    promise, error = None, NewStation()
-    if config.promised:
-        promise = promise_of(path, settings["dataset"], PromiseSettings(**settings["promise"]), False)
+    place_next(predictor, count=1, dry=True, **query)  # refuses what cannot be before anything is fitted
+    promise, error = promise_of(path, settings), NewStation()
     if config.left_out:
         error = new_station_error(*trained(path, settings["dataset"]), int(config.left_out))
-    found = place_next(predictor, count=config.count, promise=promise, error=error, **asked)
+    found = place_next(predictor, count=config.count, promise=promise, error=error, **query)
     columns = coordinates(found.places, predictor)
     columns |= {found.what: found.goal, "low": found.low, "high": found.high}
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})

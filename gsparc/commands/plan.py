@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.map import coordinates, plan_of, promise_of, settings_of, stations_of
-from gsparc.commands.output import finish, run_directory
+from gsparc.commands.map import settings_of, stations_of
+from gsparc.commands.output import coordinates, finish, run_directory
 from gsparc.commands.settings import plain
 from gsparc.evaluation.summary import write_samples
+from gsparc.maps.floor_plan import plan_of
 from gsparc.maps.pictures import draw_plan_picture
 from gsparc.maps.planning import plan_next
-from gsparc.maps.promise import PromiseSettings
+from gsparc.maps.promised import promise_of
 from gsparc.prediction.operating_point import load
 
 
@@ -21,12 +22,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Choose, draw and write; returns the facts of `summary.json`."""
     settings_of(config)
     run_dir, settings = run_directory(), plain(config)
-    floor = plan_of(config)
+    floor = plan_of(settings)
     predictor = None if config.ckpt is None else load(config.ckpt)
-    promise = None
-    if predictor is not None and config.promised:
-        how = PromiseSettings(**settings["promise"])
-        promise = promise_of(str(config.ckpt), settings["dataset"], how, False)
+    promise = None if predictor is None else promise_of(str(config.ckpt), settings)
     found = plan_next(
         predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
         plan=floor, stations=stations_of(settings["stations"]), other_end=settings["other_end"],
@@ -43,8 +41,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan/scatter_db": found.scatter_db, "plan/in_vain": int(bool(found.in_vain)),
         "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
     }  # fmt: skip
-    said = f"{len(found.places)} places: expected error {found.before_db:.2f} -> {found.after_db:.2f} dB"
+    before = f"{len(found.places)} places: expected error {found.before_db:.2f} -> {found.after_db:.2f} dB"
     if config.route or config.route_m is not None:
-        said += f", a walk of {found.length_m:.4g} m"
+        before += f", a walk of {found.length_m:.4g} m"
     lines = [line for line in (found.stopped, found.in_vain) if line]
-    return finish(run_dir, facts, lines=lines, before=f"{said}; plan ")
+    return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")

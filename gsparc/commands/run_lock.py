@@ -17,7 +17,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 LOCK, HOLDER = ".lock", ".held-by"
-_held: list[FileLock] = []  # by the command that is running
+_locks: list[FileLock] = []  # by the command that is running
 
 
 class InUse(BaseException):
@@ -54,33 +54,25 @@ def hold(folder: Path, jobs: bool = False) -> None:
     """
     since = datetime.now().isoformat(sep=" ", timespec="seconds")
     who = f"process {os.getpid()} on {socket.gethostname()} since {since}: {' '.join(sys.argv)}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _held.append(_locked(folder))
-        (folder / HOLDER).write_text(who, encoding="utf-8")  # before looking: of two, one sees the other
-        near = [parent / HOLDER for parent in folder.resolve().parents]
-        for other in near + (sorted(folder.rglob(HOLDER)) if jobs else []):
-            if other.exists() and other.parent != folder:
-                _locked(other.parent).release()
-    except (OSError, NotImplementedError) as error:
-        raise InUse(f"{folder}: cannot be locked ({error}); give another hydra.run.dir=...") from None
+    _locks.append(_lock(folder, holder=who))  # named before looking: of two, one sees the other
+    near = [parent / HOLDER for parent in folder.resolve().parents]
+    for other in near + (sorted(folder.rglob(HOLDER)) if jobs else []):
+        if other.exists() and other.parent != folder:
+            _lock(other.parent).release()
 
 
 @contextmanager
-def held(folder: Path, setting: str = "hydra.run.dir") -> Iterator[None]:
+def locked(folder: Path, setting: str = "hydra.run.dir") -> Iterator[None]:
     """Hold the folder of a setting meanwhile; nothing where a command of this process holds it.
 
     Raises:
         ValueError: another process has locked it, or it cannot be locked.
     """
-    if folder.resolve() in (Path(lock.lock_file).parent for lock in _held):
+    if folder.resolve() in (Path(lock.lock_file).parent for lock in _locks):
         yield
         return
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = _locked(folder, setting)
-    except (OSError, NotImplementedError) as error:
-        raise ValueError(f"{folder}: cannot be locked ({error}); give another {setting}=...") from None
+        lock = _lock(folder, setting)
     except InUse as busy:
         raise ValueError(str(busy)) from None
     try:
@@ -92,31 +84,36 @@ def held(folder: Path, setting: str = "hydra.run.dir") -> Iterator[None]:
 def in_use(folder: Path) -> bool:
     """Whether another run writes there."""
     try:
-        _locked(folder).release()
+        _lock(folder).release()
     except InUse:
         return True
     return False
 
 
-def _locked(folder: Path, setting: str = "hydra.run.dir") -> FileLock:
-    """Its lock, held."""
+def _lock(folder: Path, setting: str = "hydra.run.dir", holder: str = "") -> FileLock:
+    """Its lock, held, and beside it who holds it, where that is given."""
     lock = FileLock(folder.resolve() / LOCK)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
+        if holder:
+            (folder / HOLDER).write_text(holder, encoding="utf-8")
+        return lock
     except Timeout:
-        holder = ""
+        other = ""
         with suppress(OSError):
-            holder = f" ({(folder / HOLDER).read_text(encoding='utf-8')})"
-        raise InUse(
-            f"{folder}: another run writes here{holder}; wait for its end, or give another {setting}=..."
-        ) from None
-    return lock
+            other = f" ({(folder / HOLDER).read_text(encoding='utf-8')})"
+        why = f"another run writes here{other}; wait for its end, or"
+    except (OSError, NotImplementedError) as error:
+        lock.release()
+        why = f"cannot be locked ({error});"
+    raise InUse(f"{folder}: {why} give another {setting}=...")
 
 
 def release() -> None:
     """Unlock what this process holds."""
-    while _held:
-        lock = _held.pop()
+    while _locks:
+        lock = _locks.pop()
         with suppress(OSError):
             Path(lock.lock_file).with_name(HOLDER).unlink(missing_ok=True)
         lock.release()  # the file stays: removing it would let a third run pass the second

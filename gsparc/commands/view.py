@@ -9,13 +9,13 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.map import plan_of
 from gsparc.commands.output import finish, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.walls import read_walls
 from gsparc.maps.field_map import FieldMap
+from gsparc.maps.floor_plan import plan_of
 from gsparc.maps.making import place_of
 from gsparc.maps.pictures import layers
 from gsparc.prediction.timing import peak_memory
@@ -33,51 +33,37 @@ SAVED = (".html", ".png", ".ply")
 def task(config: DictConfig) -> dict[str, Any]:
     """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
     RunSettings.of(config)
-    settings, save = plain(config), None if config.save is None else Path(str(config.save))
+    save = None if config.save is None else Path(str(config.save))
     check(save, int(config.port))
-    view = view_of(config, settings)
-    said = [*view.viewed.notes]
-    if save is None:
-        said.append(serve(view, str(config.host), int(config.port)))
-    else:
-        said.append(write(view, save))
+    view = view_of(plain(config))
+    end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
+    viewed, site = view.viewed, view.viewed.site
     facts = {
-        "dataset/name": view.viewed.site.name, "dataset/kind": view.viewed.site.kind,
-        "model/name": view.viewed.predictor.method.name, "ckpt": str(config.ckpt),
-        "view/operating_points": len(view.viewed.ways), **peak_memory(),
+        "dataset/name": site.name, "dataset/kind": site.kind, "model/name": viewed.predictor.method.name,
+        "ckpt": str(config.ckpt), "view/operating_points": len(viewed.ways), **peak_memory(),
     }  # fmt: skip
-    return finish(run_directory(), facts, lines=said, before="summary ")
+    return finish(run_directory(), facts, lines=[*viewed.notes, end], before="summary ")
 
 
 def check(save: Path | None, port: int) -> None:
-    """Refuse what cannot be done before anything is read.
-
-    Raises:
-        DataError: an ending that nothing is written with, no such port, or `viser` is needed and not there.
-    """
+    """Refuse, with `DataError`, what cannot be done before anything is read."""
     if save is not None and save.suffix.lower() not in SAVED:
         raise DataError(f"save={save}: expected a name that ends with {', '.join(SAVED)}")
     if not 0 <= port < 65536:
         raise DataError(f"port={port}: a number from 0 to 65535 is needed")
     if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
-        raise DataError(
-            "viewing in a browser needs viser: pip install 'gsparc[viewer]' "
-            "(save=picture.png and save=gaussians.ply do without)"
-        )
+        without = "(save=picture.png and save=gaussians.ply do without)"
+        raise DataError(f"viewing in a browser needs viser: pip install 'gsparc[viewer]' {without}")
 
 
-def view_of(config: DictConfig, settings: dict[str, Any]) -> SiteView:
-    """Everything that is shown, from a configuration.
-
-    Raises:
-        DataError: a file or a place that cannot be.
-    """
-    plan = plan_of(config)
-    given = Given(plan, None if config.walls is None else read_walls(config.walls))
-    viewed = open_viewed(config.ckpt, settings["dataset"], config.station, config.unit)
+def view_of(settings: dict[str, Any]) -> SiteView:
+    """Everything that is shown, from a configuration; `DataError` for a file or a place that cannot be."""
+    plan, walls = plan_of(settings), settings["walls"]
+    given = Given(plan, None if walls is None else read_walls(walls))
+    viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
     made: tuple[Any, ...] = ()
-    if config.map is not None:
-        found = FieldMap.read(config.map)
+    if settings["map"] is not None:
+        found = FieldMap.read(settings["map"])
         made = tuple((found.grid, layer) for layer in layers(found, viewed.unit) if not layer.words)
     at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
     return SiteView(viewed, given, grid_for(viewed, settings, plan), made, at, other)
@@ -101,15 +87,14 @@ def write(view: SiteView, path: Path) -> str:
     elif ending == ".html":
         from gsparc.view.server.page import page
 
-        text = page(view)
         with whole_file(path) as partial:
-            partial.write_text(text, encoding="utf-8")
+            partial.write_text(page(view), encoding="utf-8")
     else:
         name = view.viewed.stations[0]
         cloud = cloud_of(view.viewed, name, view.station(name).measured)
         if cloud is None:
-            method = view.viewed.predictor.method.name
-            raise DataError(f"save={path}: {method} of {view.viewed.site.name} holds no Gaussians to write")
+            model = f"{view.viewed.predictor.method.name} of {view.viewed.site.name}"
+            raise DataError(f"save={path}: {model} holds no Gaussians to write")
         write_ply(path, cloud, cloud_colours(cloud)[1])
         return f"{len(cloud)} Gaussians written to {path}"
     return f"written to {path}"

@@ -1,18 +1,256 @@
-"""Pictures of localisation: where single snapshots may have been heard, and distributions of errors."""
+"""Localisation by a trained model or by a field of fingerprints: places, errors, pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
 
+from gsparc.data.limits import POSITIVE, SHARE
+from gsparc.data.load import split_settings
+from gsparc.data.own import interpreted
+from gsparc.data.raw import read_raw
+from gsparc.evaluation.console import plain
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
-from gsparc.locate.locator import Located
+from gsparc.evaluation.open_runs import Opened, aligned, open_files
+from gsparc.evaluation.scores import rows_of
+from gsparc.evaluation.summary import table, write_samples
+from gsparc.locate import locator as locating
+from gsparc.locate.baselines.table import located_by
+from gsparc.locate.cells import Cells, cover
+from gsparc.locate.fingerprints.locator import SHARED, FingerprintLocator, as_snapshots, trusted
+from gsparc.locate.fingerprints.rows import parted, read_fingerprints
+from gsparc.locate.likelihood import Trust
+from gsparc.locate.locator import Located, Locator
+from gsparc.locate.search import Unknown
+from gsparc.locate.snapshots import Snapshots, snapshots
+from gsparc.locate.track import followed
+from gsparc.models import checkpoint
+from gsparc.models.registry import build
+from gsparc.training.context import FitContext
 
+log = logging.getLogger(__name__)
+
+DEVICES_DB = 6.0  # deviation of what receivers of one building add to all levels
 SHOWN = 6  # snapshots, evenly over all
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Snapshots, and where each was heard.
+
+    Attributes:
+        answers: by method; the first is ours.
+        heard, trained: what was located, and what was learned from.
+        origin: (3,) of local coordinates [m].
+        placed: whether the places of `heard` are known.
+        level: mass of the areas.
+        promise: what the areas promise, in words.
+        facts: for the summary.
+    """
+
+    answers: dict[str, list[Located]]
+    heard: Snapshots
+    trained: Snapshots
+    origin: np.ndarray
+    placed: bool
+    level: float
+    promise: str
+    facts: dict[str, Any]
+
+    def columns(self, inside: Sequence[bool]) -> dict[str, Any]:
+        """Of `locate.csv`, in the world's coordinates [m]."""
+        located = next(iter(self.answers.values()))
+        place, true = np.array([one.place for one in located]), self.heard.place
+        found: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
+        if self.placed:
+            found |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
+            found |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
+        found |= {"area_m2": [one.area for one in located]}
+        found |= {"inside": [int(one) for one in inside]} if self.placed else {}
+        return {**found, "modes": [one.modes for one in located]}
+
+
+def report(
+    found: Localisation, against: Sequence[str], run_dir: Path
+) -> tuple[dict[str, Any], list[Table], list[str]]:
+    """Write `locate.csv` and pictures; facts, and where places are known, a table and a sentence of errors.
+
+    Args:
+        found: what was located.
+        against: names of plain methods beside it.
+        run_dir: where files go.
+    """
+    (ours, located), heard, facts = next(iter(found.answers.items())), found.heard, dict(found.facts)
+    inside = [one.posterior.level(p) <= found.level for one, p in zip(located, heard.place, strict=True)]
+    write_samples(run_dir / "locate.csv", found.columns(inside))
+    facts |= {
+        "locate/snapshots": len(heard), "locate/track": int(len(found.answers) > 1),
+        "locate/area_m2": float(np.median([one.area for one in located])),
+        "time/locate_ms_p50": float(np.median([one.seconds for one in located]) * 1e3),
+    }  # fmt: skip
+    shown_at = [locating.in_world(one, found.origin) for one in located]
+    true = heard.place + found.origin if found.placed else None
+    draw_posteriors(shown_at, true, found.trained.place + found.origin, run_dir / "posteriors.png")
+    if not found.placed:
+        return facts, [], []
+    places = {name: np.array([one.place for one in answers]) for name, answers in found.answers.items()}
+    stems = {name: "locate" if name == ours else f"locate/{name}" for name in places}
+    for name in against:
+        stems[name] = stem = f"baseline/{name}"
+        beside = located_by(name, found.trained, heard)
+        places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
+    errors = {name: np.linalg.norm(place - heard.place, axis=1) for name, place in places.items()}
+    facts |= {"locate/coverage": float(np.mean(inside))}
+    for name, values in errors.items():
+        median, p90 = np.quantile(values, [0.5, 0.9])
+        facts |= {f"{stems[name]}/median_m": float(median), f"{stems[name]}/p90_m": float(p90)}
+    draw_errors(errors, run_dir / "errors.png")
+    keys = ("median_m", "p90_m")
+    rows = [[name, *(f"{facts[f'{stems[name]}/{key}']:.3g}" for key in keys)] for name in errors]
+    title = f"{facts['dataset/name']}, {len(heard)} snapshots"
+    sentence = (
+        f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places, "
+        f"{found.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
+    )
+    return facts, [table(title, ["method"], ["median [m]", "p90 [m]"], rows)], [sentence]
+
+
+def by_model(
+    config: DictConfig, run_dir: Path, open_at: Callable[[np.ndarray], np.ndarray] | None
+) -> Localisation:
+    """A trained model locates its test rows, or those of a file.
+
+    Args:
+        config: see conf/locate.yaml.
+        run_dir: of trainings that learn how far the model is trusted.
+        open_at: which of places (n, 2) [m, world] one can stand at; None: everywhere.
+
+    Raises:
+        ValueError: the model states no variance, or does not name its settings.
+    """
+    run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
+    data, fold, method = run.data, run.split.folds[0], run.methods[0]
+    learned = np.sort(np.concatenate([fold.train, fold.val]))
+    unknown, share = Unknown(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
+    start = Trust() if config.calibrate else locating.restored(run.stored[0].extra, unknown, share)
+    east_north = data.site.origin[:2]
+    light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
+    cells = partial(cover, most=locating.MOST, around=config.prior == "trained", open_at=light)
+    locator, count = Locator.of(method, data, learned, unknown, start, cells, share), 0
+    if config.calibrate:
+        trust, count = _trust(config, run, locator, cells, run_dir)
+        locator = Locator(locator.field, locator.cells, unknown, trust, locator.share)
+        if config.store:
+            checkpoint.amend(config.ckpt, locating.kept(trust, unknown, locator.share))
+    heard, placed = _heard(config, run)
+    answers, trained = {method.name: locator.locate(heard)}, snapshots(data, learned)
+    level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
+    if config.track:
+        answers["alone"], promise = answers[method.name], "of a track nothing is promised"
+        answers[method.name] = followed(answers["alone"], trained, heard, level)
+    facts = {**run.facts(), "locate/calibrated_on": count}
+    return Localisation(answers, heard, trained, data.site.origin, placed, level, promise, facts)
+
+
+def _trust(
+    config: DictConfig, run: Opened, locator: Locator, cells: Callable[[np.ndarray], Cells], run_dir: Path
+) -> tuple[Trust, int]:
+    """Learned from training rows that were left out, and their number."""
+    settings = OmegaConf.create(run.stored[0].configuration)
+    if "model" not in settings:
+        raise ValueError(f"{config.ckpt} does not name its settings: calibrate=0 goes without")
+    split = settings.get("split")
+    context = FitContext(
+        run_dir=run_dir / "left_out", seed=int(config.seed), budget_s=float(config.calibrate_s),
+        split=None if split is None else split_settings(plain(split)),
+        stations=settings.get("stations", "auto"),
+    )  # fmt: skip
+    make = partial(build, settings.model)
+    folds = int(config.calibrate)
+    found = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
+    log.info("trust learned from %d snapshots that were left out: %s", found[1], found[0])
+    return found
+
+
+def _heard(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
+    """The snapshots, and whether their places are known."""
+    site, placed = run.data.site, True
+    if config.data is None:
+        heard = snapshots(run.data, rows_of(run.split.folds[0], config.eval_on))
+    else:
+        raw, place = read_raw(config.data), f"{site.moving_end}_position"
+        placed = place in raw.arrays
+        if not placed:  # anywhere: nothing is compared with it
+            count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
+            low, high = site.moving_box + site.origin
+            raw.arrays[place] = np.linspace(low, high, count)
+        other = aligned(interpreted(raw, config.data), site)
+        heard = snapshots(other, np.arange(len(other)))
+    return heard.at(_drawn(config, len(heard))), placed
+
+
+def by_fingerprints(config: DictConfig) -> Localisation:
+    """A field of fingerprints is learned, and rows that it did not learn from are located.
+
+    Args:
+        config: see conf/locate.yaml.
+
+    Raises:
+        ValueError: no file, a checkpoint as well, or rows that cannot be followed.
+    """
+    chosen, seed, groups = config.dataset, int(config.seed), int(config.calibrate)
+    if chosen.file is None or not OmegaConf.is_missing(config, "ckpt"):
+        raise ValueError("dataset=fingerprints learns its own field: give dataset.file=FILE, and no ckpt")
+    POSITIVE.check("dataset.side_m", chosen.side_m)
+    SHARE.check("dataset.held_out", chosen.held_out)
+    rows = read_fingerprints(chosen.file)
+    if config.track and not rows.time_s.any():
+        raise ValueError(f"track=true: {chosen.file} does not say when its rows were heard (time_s)")
+    how: Any = "file" if config.data else chosen.split
+    cut = float(chosen.side_m), float(chosen.held_out)
+    if config.data:
+        known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
+    else:
+        known, heard = map(rows.at, parted(rows, how, *cut, seed))
+    heard = heard.at(_drawn(config, len(heard.level)))
+    offset = DEVICES_DB if config.offset_db is None else float(config.offset_db)
+    started = time.perf_counter()
+    locator = FingerprintLocator.of(known, offset, config.prior == "trained", bool(config.track))
+    facts = {
+        "dataset/name": Path(chosen.file).stem, "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
+        "split/name": how, "split/train": len(known.level), "locate/calibrated_on": 0,
+        "time/fit_s": time.perf_counter() - started,
+    }  # fmt: skip
+    promise = "nothing is promised without calibration, or of another campaign"
+    if groups:
+        drawn, share = how in ("random", "places", "blocks", "walks"), float(config.share)
+        inner: Any = how if drawn else "places"
+        locator, facts["locate/calibrated_on"] = trusted(locator, known, inner, *cut, groups, share, seed)
+        promise = f"{share:.0%} are promised" if drawn else promise
+    answers = {"field": locator.locate(heard)}
+    if config.track:
+        answers["alone"] = replace(locator, speed=None, point=SHARED).locate(heard)
+    both, placed = (as_snapshots(heard), as_snapshots(known)), bool(np.isfinite(heard.position).all())
+    return Localisation(answers, *both, np.zeros(3), placed, locator.area.level, promise, facts)
+
+
+def _drawn(config: DictConfig, count: int) -> np.ndarray:
+    """Numbers of at most `rows` of so many rows, drawn evenly."""
+    if not count:
+        raise ValueError("there is nothing to be located")
+    return np.sort(np.random.default_rng(int(config.seed)).permutation(count)[: config.rows])
 
 
 def draw_posteriors(

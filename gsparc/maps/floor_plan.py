@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,3 +95,14 @@ def _checked(points: Any, path: str | Path) -> np.ndarray:
     if not 0 < np.hypot(*(pairs[1, 2:] - pairs[0, 2:])) < FARTHEST or np.abs(pairs[:, 2:]).max() > FARTHEST:
         raise DataError(f"plan={path}: its two points are one place, or not in metres; take two far apart")
     return pairs
+
+
+def plan_of(settings: Mapping[str, Any]) -> FloorPlan | None:
+    """The floor plan that `plan` and `plan_points` of settings name; None where they name none.
+
+    Raises:
+        DataError: points without an image, or one that cannot be read.
+    """
+    if settings["plan"] is None and settings["plan_points"] is not None:
+        raise DataError("plan_points: goes with an image, plan=FILE")
+    return None if settings["plan"] is None else read_plan(settings["plan"], settings["plan_points"])

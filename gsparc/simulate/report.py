@@ -82,3 +82,21 @@ def figures(outcome: Outcome) -> dict[str, Any]:
         if choice.verdict is not None:
             facts |= {f"auto/verdict/{k}": v for k, v in vars(choice.verdict).items()}
     return facts
+
+
+def closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
+    """What a simulation took, and how far two seeds of it are apart, in sentences."""
+    count = len(outcome.survey)
+    lines = [
+        f"{count} receivers with {outcome.effects} in {seconds:.0f} s (load {load:.1f} per core): "
+        + ", ".join(f"{name} {value:.0f} s" for name, value in outcome.seconds.items()),
+        f"{outcome.made.facts['below_horizon']:.1%} of the power comes from below the horizon, unseen",
+    ]
+    if outcome.convergence is not None:
+        error = outcome.convergence
+        lines.append(
+            f"convergence error between two seeds: channel NMSE {error.nmse:.2g}, "
+            f"spectra {error.spectrum_psnr_db:.1f} dB, SSIM {error.spectrum_ssim:.4f}, "
+            f"received power within {error.power_db:.2g} dB at 95 % of {error.receivers} receivers"
+        )
+    return lines

@@ -1,4 +1,4 @@
-"""`gsparc COMMAND key=value ...`: the list, a typo, the help of every command."""
+"""`gsparc COMMAND key=value ...`: the list, a typo, the help of every command, an interrupt."""
 
 from __future__ import annotations
 
@@ -8,22 +8,15 @@ import subprocess
 import sys
 
 import pytest
+from doors import Answer, knock
 
 from gsparc.__main__ import READER_LEFT, main
 from gsparc.commands.cli import _began_as_interrupt
 from gsparc.commands.listing import COMMANDS
 
 
-def gsparc(monkeypatch, capsys, *words: str) -> tuple[int, str, str]:
-    """Exit status, stdout and stderr of a command line, in this process."""
-    monkeypatch.setattr(sys, "argv", ["gsparc", *words])
-    status = 0
-    try:
-        main()
-    except SystemExit as ended:
-        status = int(ended.code or 0)
-    said = capsys.readouterr()
-    return status, said.out, said.err
+def gsparc(*words: str) -> Answer:
+    return knock(main, "gsparc", words)
 
 
 def test_without_a_command_all_are_listed_at_once():
@@ -34,17 +27,25 @@ def test_without_a_command_all_are_listed_at_once():
     assert listed == list(COMMANDS)
 
 
-def test_a_typo_gets_the_nearest_command(monkeypatch, capsys):
-    status, out, err = gsparc(monkeypatch, capsys, "tardeoff", "ckpt=x")
-    assert (status, out, err) == (1, "", "error: no command is called 'tardeoff'; did you mean 'tradeoff'?\n")
+def test_a_typo_gets_the_nearest_command():
+    line = "error: no command is called 'tardeoff'; did you mean 'tradeoff'?"
+    assert gsparc("tardeoff", "ckpt=x") == Answer(1, [], [line])
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_says_what_a_command_does_and_what_its_settings_mean(command, monkeypatch, capsys):
-    status, out, _ = gsparc(monkeypatch, capsys, command, "--help")
-    assert status == 0 and f"gsparc {command}" in out
+def test_help_says_what_a_command_does_and_what_its_settings_mean(command):
+    answer = gsparc(command, "--help")
+    text = "\n".join(answer.out)
+    assert answer.status == 0 and f"gsparc {command}" in text
     if COMMANDS[command].configured:
-        assert "hydra.run.dir" not in out.partition("powered by Hydra")[0] and "  # " in out
+        assert "hydra.run.dir" not in text.partition("powered by Hydra")[0] and "  # " in text
+
+
+@pytest.mark.parametrize(
+    ("kind", "setting"), [("positions", "errors_deg"), ("measurements", "shares of the training rows")]
+)
+def test_help_of_a_kind_of_study_has_its_settings(kind, setting):
+    assert any(setting in line for line in gsparc("study", f"kind={kind}", "-h").out)
 
 
 @pytest.mark.parametrize("words", [[], pytest.param(["train"], marks=pytest.mark.slow)])
@@ -53,81 +54,60 @@ def test_a_reader_that_leaves_early_is_no_error(words):
     command = [sys.executable, "-m", "gsparc", *words, "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
         running.stdout.close()
-        said = running.stderr.read()
-    assert (said, running.returncode) == ("", READER_LEFT)
+        err = running.stderr.read()
+    assert (err, running.returncode) == ("", READER_LEFT)
 
 
-def test_help_of_a_kind_of_study_has_its_settings(monkeypatch, capsys):
-    assert "errors_deg" in gsparc(monkeypatch, capsys, "study", "kind=positions", "--help")[1]
-    assert "shares of the training rows" in gsparc(monkeypatch, capsys, "study", "kind=measurements", "-h")[1]
+def test_files_need_no_name_where_a_command_is_about_files(tmp_path):
+    given = ["a b", "c", "title=x", "-m"]
+    assert COMMANDS["report"].arguments(given) == ["title=x", "-m", "runs=['a b','c']"]
+    assert COMMANDS["evaluate"].arguments(["a b"]) == ["a b"]
+    answer = gsparc("check", str(tmp_path / "absent.npz"))
+    assert answer.status == 1 and "no such file" in answer.out[0]
+
+
+def while_a_library_cleans_up(config):
+    """An interrupt inside OmegaConf left a list half changed: its clean-up's error hid the interrupt."""
+    try:
+        raise KeyboardInterrupt
+    finally:
+        config.dataset.there_is_no_such_key.at_all  # noqa: B018
+
+
+def in_compiled_code(config):
+    """Of matplotlib came "Invalid bounding box", with nothing left of the interrupt."""
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    raise ValueError("Invalid bounding box")
+
+
+def with_advice(config):
+    raise KeyboardInterrupt("go on with ckpt_path=last.ckpt")
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("task", "line"),
     [
-        (["study", "kind=efects"], "error: kind=efects: no such choice; did you mean 'effects'?"),
-        (["report"], "error: runs is not set; give runs=..."),
-        (
-            ["study", "baselines=[gpp]"],
-            "error: baselines=['gpp']: a list of methods is needed, 'gpp' is none",
-        ),
-        (["study", "model.field.count=-1"], "error: model.field.count=-1: a whole number of at least 0"),
+        (while_a_library_cleans_up, "error: interrupted"),
+        (in_compiled_code, "error: interrupted: Invalid bounding box"),
+        (with_advice, "error: go on with ckpt_path=last.ckpt"),
     ],
 )
-def test_an_error_is_one_line(words, says, monkeypatch, capsys, tmp_path):
-    status, _, err = gsparc(monkeypatch, capsys, *words, f"hydra.run.dir={tmp_path}")
-    assert status == 1 and err.startswith(says) and err.count("\n") == 1
-
-
-def test_files_need_no_name_where_a_command_is_about_files(monkeypatch, capsys, tmp_path):
-    assert COMMANDS["report"].arguments(["a b", "c", "title=x", "-m"]) == [
-        "title=x",
-        "-m",
-        "runs=['a b','c']",
-    ]
-    assert COMMANDS["evaluate"].arguments(["a b"]) == ["a b"]
-    status, out, _ = gsparc(monkeypatch, capsys, "check", str(tmp_path / "absent.npz"))
-    assert status == 1 and "no such file" in out
-
-
-def test_ctrl_c_while_a_library_cleans_up_was_its_error_and_status_1(monkeypatch, capsys, tmp_path):
-    """An interrupt inside OmegaConf left a list half changed: its clean-up's error hid the interrupt."""
-
-    def task(config):
-        try:
-            raise KeyboardInterrupt
-        finally:
-            config.dataset.there_is_no_such_key.at_all  # noqa: B018
-
+def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeypatch, tmp_path):
     monkeypatch.setattr("gsparc.commands.train.task", task)
-    words = ("train", "dataset=rfid", "model=gsparc", f"hydra.run.dir={tmp_path}")
-    status, _, err = gsparc(monkeypatch, capsys, *words)
-    assert status == 130 and err.splitlines()[-1] == "error: interrupted"
-
-
-def test_ctrl_c_in_compiled_code_came_out_as_an_error_of_its_own(monkeypatch, capsys, tmp_path):
-    """Of matplotlib: "Invalid bounding box", with nothing left of the interrupt."""
-
-    def task(config):
-        with contextlib.suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        raise ValueError("Invalid bounding box")
-
-    monkeypatch.setattr("gsparc.commands.train.task", task)
-    words = ("train", "dataset=rfid", "model=gsparc", f"hydra.run.dir={tmp_path}")
     before = signal.getsignal(signal.SIGINT)
-    status, _, err = gsparc(monkeypatch, capsys, *words)
-    assert status == 130 and err.splitlines()[-1] == "error: interrupted: Invalid bounding box"
+    answer = gsparc("train", "dataset=rfid", "model=gsparc", f"hydra.run.dir={tmp_path}")
+    assert answer.status == 130 and answer.err[-1] == line
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch, capsys):
+def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gsparc.commands.cli.offer", interrupted)
-    status, _, err = gsparc(monkeypatch, capsys, "train", "dataset=rfid", "model=gsparc")
-    assert (status, err) == (130, "error: interrupted\n")
+    answer = gsparc("train", "dataset=rfid", "model=gsparc")
+    assert (answer.status, answer.err) == (130, ["error: interrupted"])
 
 
 def test_an_error_that_is_its_own_context_was_followed_without_end():

@@ -12,12 +12,10 @@ import pytest
 from campaigns import brief, compose, spectra
 from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import gsparc.conf
-from gsparc.evaluation.console import one_line
 from gsparc.models.method import Method
 from gsparc.models.registry import METHODS, build
 from gsparc.training.fit import DEFAULTS
@@ -49,26 +47,6 @@ def test_every_choice_composes_and_builds(choice):
     for node in (config.callbacks or {}).values():
         instantiate(node)
     instantiate(config.trainer, accelerator="cpu", devices=1)  # there may be no other here
-
-
-@pytest.mark.parametrize(
-    ("override", "hint"),
-    [
-        ("model=gsprac", "'gsparc'"),
-        ("dataset=rfd", "'rfid'"),
-        ("split=gruped", "'grouped'"),
-        ("callbacks=densfy", "'densify'"),
-        ("model.emission.hiden=8", "'model.emission.hidden'"),
-        ("trainer.max_step=8", "'trainer.max_steps'"),
-        ("sed=1", "'seed'"),
-        ("model.field.cuont=8", "'model.field.count'"),
-    ],
-)
-def test_a_typo_gets_the_nearest_right_name(override, hint):
-    with pytest.raises(HydraException) as raised:
-        compose(override)
-    line = one_line(raised.value)
-    assert f"did you mean {hint}" in line and "\n" not in line
 
 
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
@@ -120,13 +98,6 @@ def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
 
 def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
     assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
-
-
-def test_a_folder_that_cannot_be_written_is_named_without_a_number():
-    """`[Errno 2] No such file or directory: '/proc/x'`."""
-    assert one_line(FileNotFoundError(2, "No such file or directory", "/proc/x")) == (
-        "/proc/x: No such file or directory"
-    )
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from gsparc.commands.cli import _message_of
 from gsparc.commands.continued import once
-from gsparc.commands.run_lock import held
+from gsparc.commands.run_lock import locked
 from gsparc.evaluation.report.sweep import FAILURE
 
 
@@ -85,7 +85,7 @@ def test_the_same_run_said_again_began_anew_without_a_word(tmp_path, caplog):
 
 
 def test_a_job_that_another_process_does_is_refused(tmp_path):
-    with held(tmp_path / ".job"), pytest.raises(ValueError, match="another run writes here"):
+    with locked(tmp_path / ".job"), pytest.raises(ValueError, match="another run writes here"):
         once(tmp_path, job(), lambda config: 1.0)
 
 

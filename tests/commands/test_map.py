@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigns import compose
-from hydra.core.hydra_config import HydraConfig
+from doors import assert_refused, knock
 from PIL import Image
 from towns import town_model
 
 import gsparc
+from gsparc.commands.listing import COMMANDS
 from gsparc.maps import map_of
 
 ROOT = Path(__file__).parents[2]
 
 
 def run(command, *settings, folder):
-    line = [sys.executable, "-m", "gsparc", command, *settings, f"hydra.run.dir={folder}", "threads=1"]
-    return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return knock(COMMANDS[command].run, command, [*settings, f"hydra.run.dir={folder}", "threads=1"])
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +39,8 @@ def mapped(model, tmp_path_factory):
     Image.new("RGB", (400, 300), "white").save(folder / "floor.png")
     plan = [f"plan={folder / 'floor.png'}", "plan_points=[[0,300,0,0],[400,300,80,0]]"]
     done = run("map", f"ckpt={model}", "step_m=2", "threshold_db=-85", *plan, folder=folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder, done.stdout
+    assert done.status == 0, done
+    return folder, "\n".join(done.out)
 
 
 def test_every_layer_a_table_and_a_page(mapped):
@@ -73,48 +70,15 @@ def test_the_promise_stays_with_the_model(mapped, model):
 
 def test_a_plan_from_the_model(mapped, model, tmp_path):
     done = run("plan", f"ckpt={model}", "count=6", "route=true", "area=[-20,0,80,60]", folder=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "6 places: expected error" in done.stdout and "a walk of" in done.stdout
+    assert done.status == 0, done
+    assert any("6 places: expected error" in line and "a walk of" in line for line in done.out), done
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 7 and (tmp_path / "plan.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("command", "settings", "said"),
-    [
-        ("map", ["step_m=0"], "above 0 metres"),
-        ("map", ["stations=[nord]"], "no station 'nord'"),
-        ("map", ["plan=missing.png"], "no such file"),
-        ("map", ["plan_points=[[0,0,0,0],[1,1,1,1]]"], "goes with an image"),
-        ("map", ["promise.share=1.5"], "share=1.5"),
-        ("map", ["dataset.file=gone.npz", "renew=true"], "gone.npz"),
-        ("plan", ["count=0"], "at least 1"),
-        ("place", [], "train with stations=together"),
-    ],
-)
-def test_errors_come_before_anything_is_written(model, tmp_path, monkeypatch, command, settings, said):
-    runtime = type("R", (), {"output_dir": tmp_path})
-    monkeypatch.setattr(HydraConfig, "get", lambda: type("C", (), {"runtime": runtime}))
-    with pytest.raises(ValueError, match=re.escape(said)) as error:
-        import_module(f"gsparc.commands.{command}").task(
-            compose(f"ckpt='{model}'", *settings, config=command)
-        )
-    assert len(str(error.value).splitlines()) == 1
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_path, monkeypatch):
-    runtime = type("R", (), {"output_dir": tmp_path})
-    monkeypatch.setattr(HydraConfig, "get", lambda: type("C", (), {"runtime": runtime}))
-    place = import_module("gsparc.commands.place")
-    monkeypatch.setattr(place, "load", lambda path: pytest.fail("all stations are restored"))
-    with pytest.raises(ValueError, match="train with stations=together"):
-        place.task(compose(f"ckpt='{model}'", config="place"))
-
-
-def test_errors_are_one_line(model, tmp_path):
-    done = run("map", f"ckpt={model}", "step_m=0", folder=tmp_path / "run")
-    assert done.returncode == 1 and "above 0 metres" in done.stderr
-    assert len([line for line in done.stderr.splitlines() if line.startswith("error:")]) == 1
+    monkeypatch.setattr("gsparc.commands.place.load", lambda path: pytest.fail("all stations are restored"))
+    answer = run("place", f"ckpt={model}", folder=tmp_path)
+    assert_refused(answer, "train with stations=together", tmp_path)
 
 
 def test_an_interrupt_leaves_no_half_written_file(model, tmp_path):

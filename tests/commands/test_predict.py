@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import csv
 import logging
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from campaigns import compose
+from doors import knock
 from drives import city_drive, write_table
 
 import gsparc
 from gsparc.commands.check import main as check
-from gsparc.commands.predict.command import predict
+from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import train
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
+from gsparc.evaluation.answers import predict
 from gsparc.evaluation.open_runs import aligned
 from gsparc.models import checkpoint
 from gsparc.models.per_station import for_links
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
-ROOT = Path(__file__).parents[2]
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
 NAMES = np.array(["roof-0", "roof-1", "mast"])
 
@@ -50,17 +49,15 @@ def powers(places):
     return -20 * np.log10(np.linalg.norm(places[:, None] - POSTS, axis=-1)) - [0, 10, 20]
 
 
+def stations(**changes):
+    """Arrays of three stations that transmit, in metres; the receiver is 1.5 m above ground."""
+    arrays = {"rx_position": walk(), "station_position": POSTS, "station_name": NAMES}
+    return {**arrays, "rssi_db": powers(walk()), **changes}
+
+
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
-    """Three stations that transmit, in metres; the receiver is 1.5 m above ground."""
-    place = walk()
-    arrays = {
-        "rx_position": place,
-        "station_position": POSTS,
-        "station_name": NAMES,
-        "rssi_db": powers(place),
-    }
-    return fitted(arrays, tmp_path_factory.mktemp("town"))
+    return fitted(stations(), tmp_path_factory.mktemp("town"))
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +82,13 @@ def column(rows, name):
     return np.array([float(row[name]) for row in rows])
 
 
+def answered(model, folder, heads, rows, **how):
+    """Rows of the table of predictions at the rows of a table."""
+    rows = rows.tolist() if isinstance(rows, np.ndarray) else rows
+    count = len(list(folder.glob("*.csv")))
+    return read(predict(model, write_table(folder / f"{count}.csv", heads, rows), **how)["out"])
+
+
 def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
     """Three commands; held-out places of the measured city are predicted better than by the mean."""
     drive = city_drive(tmp_path)
@@ -92,11 +96,9 @@ def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
     settings = [f"dataset.file={drive.rows}", f"dataset.stations_file={drive.sites}", "threads=1"]
     train(compose("dataset=own", *settings, "model=gp", "baselines=[]", "logger=none"), tmp_path / "run")
     ours = [f"ckpt={tmp_path / 'run' / 'model.ckpt'}", f"places={drive.places}", f"hydra.run.dir={tmp_path}"]
-    done = subprocess.run(
-        [sys.executable, "-m", "gsparc", "predict", *ours], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "60 places, 2 stations" in done.stdout and (tmp_path / "summary.json").exists()
+    done = knock(COMMANDS["predict"].run, "predict", ours)
+    assert done.status == 0 and (tmp_path / "summary.json").exists(), done
+    assert any("60 places, 2 stations" in line for line in done.out), done
     found = read(tmp_path / "places.predicted.csv")
     given = read(drive.places)
     assert [row["latitude"] for row in found[::2]] == [row["Latitude"] for row in given]  # every digit
@@ -122,92 +124,62 @@ def test_every_station_of_every_place(town, tmp_path):
 
 
 def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
+    heads = ["x", "y", "z", "cell"]
     table = [[5, 5, 1.5, "mast"], [6, 6, 1.5, "roof-1"], [7, 7, 1.5, "mast"], [8, 8, 1.5, "roof-0"]]
-    file = write_table(tmp_path / "a.csv", ["x", "y", "z", "cell"], table)
-    predict(town, file)
-    found = read(tmp_path / "a.predicted.csv")
+    found = answered(town, tmp_path, heads, table)
     assert [row["station"] for row in found] == ["mast", "roof-1", "mast", "roof-0"]
-    predict(town, file, tmp_path / "mast.csv", station="mast")
-    assert column(read(tmp_path / "mast.csv"), "x").tolist() == [5, 7]
-    plain = write_table(tmp_path / "b.csv", "xyz", [row[:3] for row in table])
-    predict(town, plain, tmp_path / "one.csv", station="roof-1")
-    assert {row["station"] for row in read(tmp_path / "one.csv")} == {"roof-1"}
-    lost = write_table(tmp_path / "c.csv", ["x", "y", "z", "station"], [*table[:2], [1, 1, 1, "roof-2"]])
+    assert column(answered(town, tmp_path, heads, table, station="mast"), "x").tolist() == [5, 7]
+    places = [row[:3] for row in table]
+    one = answered(town, tmp_path, "xyz", places, station="roof-1")
+    assert {row["station"] for row in one} == {"roof-1"}
     with pytest.raises(DataError, match=r"line 4: 'roof-2' is no station.*did you mean 'roof-"):
-        predict(town, lost)
+        answered(town, tmp_path, heads, [*table[:2], [1, 1, 1, "roof-2"]])
     with pytest.raises(DataError, match=r"station=mats: no such station; did you mean 'mast'"):
-        predict(town, plain, tmp_path / "d.csv", station="mats")
-    few = write_table(tmp_path / "e.csv", ["x", "y", "z", "cell"], table[:1])
-    with pytest.raises(DataError, match=r"no row of .*e\.csv is about it"):
-        predict(town, few, station="roof-0")
+        answered(town, tmp_path, "xyz", places, station="mats")
+    with pytest.raises(DataError, match=r"no row of .*\.csv is about it"):
+        answered(town, tmp_path, heads, table[:1], station="roof-0")
 
 
 def test_stations_called_by_numbers_answered_for_each_other(tmp_path):
     """They were asked by their index, which is the name of another."""
-    place = walk()
-    arrays = {"rx_position": place, "station_position": POSTS, "station_name": np.array(["1", "2", "3"])}
-    model = fitted({**arrays, "rssi_db": powers(place)}, tmp_path)
-    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:4].tolist()))
-    found = column(read(tmp_path / "a.predicted.csv"), "rssi_db").reshape(4, 3)
-    assert np.abs(found - powers(place)[:4]).max() < 0.1
+    model = fitted(stations(station_name=np.array(["1", "2", "3"])), tmp_path)
+    found = column(answered(model, tmp_path, "xyz", walk()[:4]), "rssi_db").reshape(4, 3)
+    assert np.abs(found - powers(walk())[:4]).max() < 0.1
 
 
 @pytest.mark.parametrize(("names", "asked"), [(NAMES.tolist(), "0"), (["212", "33", "7"], "1")])
 def test_a_number_that_names_no_station_was_an_index(tmp_path, names, asked):
     """`0` in a table of places answered as `roof-0`, and an unknown cell id below T as another cell."""
-    place = walk()
-    arrays = {"rx_position": place, "station_position": POSTS, "station_name": np.array(names)}
-    model = fitted({**arrays, "rssi_db": powers(place)}, tmp_path)
+    model = fitted(stations(station_name=np.array(names)), tmp_path)
     rows = [[5, 5, 1.5, names[0]], [8, 8, 1.5, asked]]
-    file = write_table(tmp_path / "a.csv", ["x", "y", "z", "cell"], rows)
     with pytest.raises(DataError, match=f"line 3: '{asked}' is no station of the model"):
-        predict(model, file)
+        answered(model, tmp_path, ["x", "y", "z", "cell"], rows)
     if "mast" not in names:  # names that are numbers leave none for counting, from Python and in settings too
         with pytest.raises(ValueError, match="no station 1; there are 212, 33, 7"):
             model.at(1)
 
 
 def test_a_station_with_too_few_rows_is_left_out_or_refused(tmp_path, caplog):
-    place = walk()
-    arrays = {
-        "rx_position": place,
-        "station_position": POSTS,
-        "station_name": NAMES,
-        "rssi_db": powers(place),
-    }
-    model = fitted(arrays, tmp_path, skip=np.arange(2, 180, 3))
-    file = write_table(tmp_path / "a.csv", "xyz", place[:4].tolist())
-    facts = predict(model, file)
-    assert facts["predict/stations"] == 2 and "left out: gp: station mast had too few" in caplog.text
+    model = fitted(stations(), tmp_path, skip=np.arange(2, 180, 3))
+    found = answered(model, tmp_path, "xyz", walk()[:4])
+    assert {row["station"] for row in found} == {"roof-0", "roof-1"}
+    assert "left out: gp: station mast had too few" in caplog.text
     with pytest.raises(DataError, match="line 2: gp: station mast had too few training rows"):
-        predict(model, file, station="mast", overwrite=True)
+        answered(model, tmp_path, "xyz", walk()[:4], station="mast")
 
 
 def test_stations_at_unknown_places(tmp_path):
     """They are told apart by their names; what needs their places, together, says so."""
-    place, posts = walk(), POSTS.copy()
-    posts[1:] = np.nan
-    arrays = {
-        "rx_position": place,
-        "station_position": posts,
-        "station_name": NAMES,
-        "rssi_db": powers(place),
-    }
+    posts = np.where([[True], [False], [False]], POSTS, np.nan)
+    arrays = stations(station_position=posts)
     model = fitted(arrays, tmp_path, "distance_law")
-    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:4].tolist()))
-    found = column(read(tmp_path / "a.predicted.csv"), "rssi_db").reshape(4, 3)
-    assert np.abs(found - powers(place)[:4]).max() < 1
-    data = from_arrays(arrays)
-    back = from_arrays(
-        {
-            **arrays,
-            "station_position": posts[::-1],
-            "station_name": NAMES[::-1],
-            "rssi_db": arrays["rssi_db"][:, ::-1],
-        }
-    )
-    same = aligned(back, model.site)
+    found = column(answered(model, tmp_path, "xyz", walk()[:4]), "rssi_db").reshape(4, 3)
+    assert np.abs(found - powers(walk())[:4]).max() < 1
+    turned = {"station_position": posts, "station_name": NAMES, "rssi_db": arrays["rssi_db"].T}
+    back = stations(**{name: values[::-1] for name, values in turned.items()})
+    same = aligned(from_arrays(back | {"rssi_db": back["rssi_db"].T}), model.site)
     assert [NAMES[t] for t in same.station[:3]] == ["mast", "roof-1", "roof-0"]
+    data = from_arrays(arrays)
     rows = np.arange(len(data))
     method = for_links(method_class("gp"), data)
     with pytest.raises(ValueError, match="places of stations are unknown, it needs them; say stations=each"):
@@ -215,25 +187,21 @@ def test_stations_at_unknown_places(tmp_path):
 
 
 def test_an_unknown_transmitter(tmp_path):
-    place = walk()
-    model = fitted({"rx_position": place, "rssi_db": powers(place)[:, 0]}, tmp_path)
-    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:5].tolist()))
-    found = read(tmp_path / "a.predicted.csv")
+    model = fitted({"rx_position": walk(), "rssi_db": powers(walk())[:, 0]}, tmp_path)
+    found = answered(model, tmp_path, "xyz", walk()[:5])
     assert list(found[0]) == ["x", "y", "z", "rssi_db", "rssi_db_std", "confidence"]
-    assert np.abs(column(found, "rssi_db") - powers(place)[:5, 0]).max() < 3
+    assert np.abs(column(found, "rssi_db") - powers(walk())[:5, 0]).max() < 3
 
 
 def test_a_height_that_is_not_given(town, valley, tmp_path, caplog):
     caplog.set_level(logging.INFO)
-    flat = write_table(tmp_path / "a.csv", "xy", [[5, 5], [6, 6]])
-    predict(town, flat)
+    found = answered(town, tmp_path, "xy", [[5, 5], [6, 6]])
     assert "no height of the receiver: taken as 1.5 m" in caplog.text
-    assert column(read(tmp_path / "a.predicted.csv"), "z").tolist() == [1.5] * 6
-    hill = write_table(tmp_path / "b.csv", ["lat", "lon"], [[47.003, 11.004]])
+    assert column(found, "z").tolist() == [1.5] * 6
+    hill = ["lat", "lon"], [[47.003, 11.004]]
     with pytest.raises(DataError, match=r"measured at heights from 1\.\d+ to 2\.\d+ m; say columns.height="):
-        predict(valley, hill)
-    predict(valley, hill, columns={"height": 2.0})
-    assert read(tmp_path / "b.predicted.csv")[0]["height"] == "2.0"
+        answered(valley, tmp_path, *hill)
+    assert answered(valley, tmp_path, *hill, columns={"height": 2.0})[0]["height"] == "2.0"
 
 
 def test_degrees_metres_and_arrays_are_one_place(valley, tmp_path):
@@ -242,13 +210,11 @@ def test_degrees_metres_and_arrays_are_one_place(valley, tmp_path):
     metres = valley.metres(*degrees.T)
     np.savez(tmp_path / "c.npz", latitude=degrees[:, 0], longitude=degrees[:, 1], rx_height=degrees[:, 2])
     np.savez(tmp_path / "d.npz", rx_position=metres, station=np.array([0, 0]))
-    files = [
-        write_table(tmp_path / "a.csv", heads, [[*row, ""] for row in degrees.tolist()]),
-        write_table(tmp_path / "b.csv", ["X [km]", "Y [km]", "Z [km]"], (metres / 1e3).tolist()),
-        tmp_path / "c.npz",
-        tmp_path / "d.npz",
+    found = [
+        answered(valley, tmp_path, heads, [[*row, ""] for row in degrees.tolist()]),
+        answered(valley, tmp_path, ["X [km]", "Y [km]", "Z [km]"], metres / 1e3),
+        *(read(predict(valley, tmp_path / name)["out"]) for name in ("c.npz", "d.npz")),
     ]
-    found = [read(predict(valley, file)["out"]) for file in files]
     assert column(found[0], "latitude").tolist() == column(found[2], "latitude").tolist() == [47.003, 47.006]
     assert np.allclose(column(found[1], "x"), metres[:, 0]) and "latitude" not in found[3][0]
     for other in found[1:]:
@@ -322,13 +288,14 @@ def test_degrees_where_the_model_knows_none(town, tmp_path):
 
 def test_where_the_answers_go(town, tmp_path):
     file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1.5]])
-    with pytest.raises(DataError, match=r"expected a name ending in \.csv or \.npz"):
-        predict(town, file, tmp_path / "b.txt")
-    with pytest.raises(DataError, match="these are the places themselves"):
-        predict(town, file, file, overwrite=True)
     (tmp_path / "b.csv").write_text("kept")
-    with pytest.raises(DataError, match="is there already; say overwrite=true"):
-        predict(town, file, tmp_path / "b.csv")
+    for out, how, message in (
+        ("b.txt", {}, r"expected a name ending in \.csv or \.npz"),
+        ("a.csv", {"overwrite": True}, "these are the places themselves"),
+        ("b.csv", {}, "is there already; say overwrite=true"),
+    ):
+        with pytest.raises(DataError, match=message):
+            predict(town, file, tmp_path / out, **how)
     assert (tmp_path / "b.csv").read_text() == "kept"
     predict(town, file, tmp_path / "b.csv", overwrite=True)
     assert len(read(tmp_path / "b.csv")) == 3
@@ -347,48 +314,54 @@ def test_places_far_outside_are_counted(town, tmp_path, caplog):
     assert "2 of 4 places lie more than" in caplog.text and "the first in line 4" in caplog.text
 
 
-@pytest.mark.parametrize("factor, said", [(1e-3, True), (1e-5, True), (1e-2, False)])
-def test_degrees_or_kilometres_as_metres_were_one_place_without_a_word(town, tmp_path, caplog, factor, said):
+@pytest.mark.parametrize(("factor", "warned"), [(1e-3, True), (1e-5, True), (1e-2, False)])
+def test_degrees_or_kilometres_as_metres_were_one_place_without_a_word(
+    town, tmp_path, caplog, factor, warned
+):
     """All of them lay within millimetres, in the middle of what was measured, and were predicted alike."""
-    file = write_table(
-        tmp_path / "a.csv", "xyz", [[11 + x * factor, 4 + x * factor, 1 + x / 9] for x in range(19)]
-    )
-    predict(town, file)
-    assert ("degrees or km as x and y?" in caplog.text) == said
+    answered(town, tmp_path, "xyz", [[11 + x * factor, 4 + x * factor, 1 + x / 9] for x in range(19)])
+    assert ("degrees or km as x and y?" in caplog.text) == warned
 
 
-@pytest.mark.parametrize("shape, heads", [((), ["csi_re", "csi_im"]), ((2, 3), ["csi_re_0_0", "csi_im_1_2"])])
+@pytest.mark.parametrize(
+    ("shape", "heads"), [((), ["csi_re", "csi_im"]), ((2, 3), ["csi_re_0_0", "csi_im_1_2"])]
+)
 def test_channels(tmp_path, shape, heads):
-    place = walk()
     rng = np.random.default_rng(0)
     channel = rng.normal(size=(60, *shape)) + 1j * rng.normal(size=(60, *shape))
     frequency = 2.4e9 + 1e6 * np.arange(shape[-1] if shape else 1)
-    arrays = {"tx_position": place, "rx_position": POSTS[0], "csi": channel, "frequency_hz": frequency}
-    model = fitted(arrays, tmp_path, "nearest")
-    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:3].tolist()))
-    found = read(tmp_path / "a.predicted.csv")
+    arrays = {"tx_position": walk(), "rx_position": POSTS[0], "csi": channel, "frequency_hz": frequency}
+    found = answered(fitted(arrays, tmp_path, "nearest"), tmp_path, "xyz", walk()[:3])
     assert set(heads) <= set(found[0])
     first = np.array([column(found, name) for name in found[0] if name.startswith("csi_re")]).T
     assert np.allclose(first, channel[:3].reshape(3, -1).real, rtol=1e-5)
 
 
-def test_what_is_no_table_goes_to_an_npz(tmp_path):
-    place = walk()
-    many = {"tx_position": place, "rx_position": POSTS[0], "csi": np.ones((60, 4, 5), complex)}
-    model = fitted({**many, "frequency_hz": 2.4e9 + 1e6 * np.arange(5)}, tmp_path, "mean")
-    file = write_table(tmp_path / "a.csv", "xyz", place[:3].tolist())
-    with pytest.raises(DataError, match=r"4 antennas x 5 subcarriers are more than 16 .*say out=FILE\.npz"):
+TONES = {"frequency_hz": 2.4e9 + 1e6 * np.arange(5)}
+UNTABLED = {
+    "csi": (
+        {"csi": np.ones((60, 4, 5), complex), **TONES},
+        r"4 antennas x 5 subcarriers are more than 16 .*say out=FILE\.npz",
+    ),
+    "spectrum": (
+        {"spectrum": np.random.default_rng(0).uniform(0, 1, (60, 12, 24))},
+        r"spectra of 12 x 24 directions are no columns; say out=FILE\.npz",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", UNTABLED)
+def test_what_is_no_table_goes_to_an_npz(tmp_path, kind):
+    arrays, message = UNTABLED[kind]
+    model = fitted({"tx_position": walk(), "rx_position": POSTS[0], **arrays}, tmp_path, "mean")
+    file = write_table(tmp_path / "a.csv", "xyz", walk()[:3].tolist())
+    with pytest.raises(DataError, match=message):
         predict(model, file)
     predict(model, file, tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as stored:
-        assert np.allclose(stored["csi"], 1) and stored["x"].tolist() == place[:3, 0].tolist()
-    images = np.random.default_rng(0).uniform(0, 1, (60, 12, 24))
-    model = fitted({"tx_position": place, "rx_position": POSTS[0], "spectrum": images}, tmp_path, "mean")
-    with pytest.raises(DataError, match=r"spectra of 12 x 24 directions are no columns; say out=FILE\.npz"):
-        predict(model, file)
-    predict(model, file, tmp_path / "b.npz")
-    with np.load(tmp_path / "b.npz") as stored:
-        assert stored["spectrum"].shape == (3, 12, 24)
+        assert stored[kind].shape == (3, *arrays[kind].shape[1:])
+        assert np.allclose(stored[kind], arrays[kind].mean(0), atol=1e-5)
+        assert stored["x"].tolist() == walk()[:3, 0].tolist()
 
 
 def test_both_ends_move(tmp_path):
@@ -396,27 +369,24 @@ def test_both_ends_move(tmp_path):
     tx, rx = rng.uniform(0, 20, (2, 80, 3))
     level = -20 * np.log10(np.linalg.norm(tx - rx, axis=1))
     model = fitted({"tx_position": tx, "rx_position": rx, "rssi_db": level}, tmp_path, "distance_law")
-    heads = ["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]
-    table = np.hstack([tx, rx])[:4]
-    predict(model, write_table(tmp_path / "a.csv", heads, table.tolist()))
-    found = read(tmp_path / "a.predicted.csv")
+    heads, table = ["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"], np.hstack([tx, rx])[:4]
+    found = answered(model, tmp_path, heads, table)
     assert list(found[0])[:6] == heads and np.abs(column(found, "rssi_db") - level[:4]).max() < 2
-    plain = ["tx_x", "tx_y", "tx_z", "x", "y", "z"]  # of the two, the end without a name is the other one
-    predict(model, write_table(tmp_path / "b.csv", plain, table.tolist()))
-    assert [row["rssi_db"] for row in read(tmp_path / "b.predicted.csv")] == [row["rssi_db"] for row in found]
-    with pytest.raises(DataError, match=r"no coordinates of the receiver among .*say columns\.rx_x=COLUMN"):
-        predict(model, write_table(tmp_path / "c.csv", heads[:3], table[:, :3].tolist()))
-    with pytest.raises(DataError, match="no coordinates of the receiver"):
-        predict(model, write_table(tmp_path / "d.csv", "xyz", table[:, :3].tolist()))
-    degrees = ["tx_lat", "tx_lon", "tx_z", "rx_lat", "rx_lon", "rx_z"]
-    with pytest.raises(DataError, match="places in degrees, but"):
-        predict(model, write_table(tmp_path / "e.csv", degrees, table.tolist()))
+    plain = [*heads[:3], *"xyz"]  # of the two, the end without a name is the other one
+    same = answered(model, tmp_path, plain, table)
+    assert [row["rssi_db"] for row in same] == [row["rssi_db"] for row in found]
+    for wrong, rows, message in (
+        (heads[:3], table[:, :3], r"no coordinates of the receiver among .*say columns\.rx_x=COLUMN"),
+        ("xyz", table[:, :3], "no coordinates of the receiver"),
+        (["tx_lat", "tx_lon", "tx_z", "rx_lat", "rx_lon", "rx_z"], table, "places in degrees, but"),
+    ):
+        with pytest.raises(DataError, match=message):
+            answered(model, tmp_path, wrong, rows)
 
 
 def test_an_end_that_stood_still_is_where_it_was(town, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     heads = ["rx_x", "rx_y", "rx_z", "tx_x", "tx_y", "tx_z"]
-    predict(town, write_table(tmp_path / "a.csv", heads, [[5, 5, 1.5, 9, 9, 9]]), station="mast")
+    found = answered(town, tmp_path, heads, [[5, 5, 1.5, 9, 9, 9]], station="mast")
     assert "not used: coordinates of the transmitter; that end is where it was measured" in caplog.text
-    found = read(tmp_path / "a.predicted.csv")
     assert len(found) == 1 and column(found, "x")[0] == 5

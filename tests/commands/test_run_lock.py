@@ -10,7 +10,7 @@ from doors import assert_refused, knock
 from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.run_lock import HOLDER, LOCK, InUse, held, hold, release
+from gsparc.commands.run_lock import HOLDER, LOCK, InUse, hold, locked, release
 from gsparc.commands.train import train
 
 HOLDS = "import sys, time; from gsparc.commands.run_lock import hold; from pathlib import Path; "
@@ -49,10 +49,10 @@ def test_training_from_python_took_no_lock(other, tmp_path):
         train(OmegaConf.create({}), tmp_path)
     other.kill()
     other.wait()
-    with held(tmp_path), pytest.raises(ValueError, match="another run writes here"), held(tmp_path):
+    with locked(tmp_path), pytest.raises(ValueError, match="another run writes here"), locked(tmp_path):
         pass
     hold(tmp_path)  # as a command does before it trains
-    with held(tmp_path):
+    with locked(tmp_path):
         pass
     release()
 

@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from campaigns import brief, channels, compose, powers, spectra
 from doors import knock
+from lightning.pytorch import Trainer
 from omegaconf import open_dict
 
 import gsparc
 from gsparc.commands import evaluate
 from gsparc.commands.train import Objects, main, train
+from gsparc.data.datamodule import Loaded
+from gsparc.data.load import datamodule
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
+from gsparc.evaluation.console import one_line
+from gsparc.evaluation.experiment import run
+from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
+from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
+from gsparc.models.loading import module_of
 from gsparc.models.parts import Origin
 from gsparc.models.splat.method import LearnedField
 from gsparc.training.context import FitContext
@@ -44,6 +53,27 @@ FIGURES = {
 }
 PAIRED = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": None}
 KINDS = {"spectrum": spectra, "csi": channels, "rssi": powers}
+STILL = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
+         "opacities", "emission", "confidence", "gain")]  # fmt: skip
+
+
+def short(file: Path, *more: str):
+    """The configuration of a training of a second whose model may go on."""
+    return compose(*brief(file, "model.refit=false", *more))
+
+
+def plain(file: Path, model: str, *more: str):
+    """The configuration of a method without a gradient."""
+    return compose(*(s for s in brief(file) if not s.startswith("model.")), f"model={model}", *more)
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return checkpoint.read(path).state["inner"]["model"]
+
+
+def steps(folder: Path) -> list[int]:
+    """Those that a learning curve has rows of."""
+    return [int(row.split(",")[0]) for row in (folder / "learning_curve.csv").read_text().splitlines()[1:]]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -59,59 +89,52 @@ def test_a_run_leaves_every_key_of_the_contract(kind, tmp_path):
     assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
     assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
     assert isinstance(objects, Objects) and isinstance(objects.methods[0], LearnedField)
-    assert objects.checkpoints[0].exists() and (tmp_path / "run" / "per_sample.csv").exists()
-    assert (tmp_path / "run" / "split.json").exists() and (tmp_path / "run" / "learning_curve.csv").exists()
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"model.ckpt", "per_sample.csv", "split.json", "learning_curve.csv"} <= written
 
 
 @pytest.mark.parametrize("model", ["zero", "mean", "nearest", "idw", "gp"])
-def test_methods_without_a_gradient_take_the_same_road(model, tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    settings = [s for s in brief(file) if not s.startswith("model.")]
-    facts, objects = train(compose(*settings, f"model={model}"), tmp_path / "run")
+def test_methods_without_a_gradient_are_trained_alike(model, spectra_file, tmp_path):
+    facts, objects = train(plain(spectra_file, model, "baselines=[]"), tmp_path)
     assert facts["model/name"] == model and facts["time/train_s"] >= 0
     assert np.isfinite(facts["test/psnr_db"]) and objects.checkpoints[0].exists()
 
 
-def test_a_budget_that_a_method_does_not_take_is_said(tmp_path, caplog):
+def test_a_budget_that_a_method_does_not_take_is_said(spectra_file, tmp_path, caplog):
     """`effects.array=true budget_s=5` took its time without a word."""
-    settings = [s for s in brief(spectra(tmp_path / "own.npz")) if not s.startswith("model.")]
-    facts, _ = train(compose(*settings, "model=mean", "budget_s=5"), tmp_path / "run")
+    facts, _ = train(plain(spectra_file, "mean", "budget_s=5"), tmp_path)
     assert "budget_s=5 is not used: the seconds of mean cannot be chosen" in caplog.text
     assert facts["model/limited_by_clock"] is None
 
 
-def test_a_checkpoint_evaluates_to_the_same_figures(tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    facts, objects = train(compose(*brief(file)), tmp_path / "run")
-    found, _, _ = evaluate.evaluate_files(objects.checkpoints, baselines=["mean"])
+def test_a_checkpoint_evaluates_to_the_same_figures(field):
+    facts, checkpoints = field.evaluation.facts, field.checkpoints
+    found, _, _ = evaluate.evaluate_files(checkpoints, baselines=["mean"])
     same = [key for key in facts if key.startswith("test/")]
     assert len(same) > 5 and all(found.facts[key] == facts[key] for key in same)
-    image = gsparc.load(objects.checkpoints[0]).spectrum(tx=[0.1, 0.2, 0.1])
+    image = gsparc.load(checkpoints[0]).spectrum(tx=[0.1, 0.2, 0.1])
     assert image.shape == (16, 32) and image.max() <= 1
 
 
-def test_folds_have_folders_and_are_pooled(tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    settings = brief(file, "split=grouped", "split.folds=2", "model.refit=false", "split.buffer_m=0")
-    facts, objects = train(compose(*settings), tmp_path / "run")
+def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):
+    config = short(spectra_file, "split=grouped", "split.folds=2", "split.buffer_m=0")
+    facts, objects = train(config, tmp_path)
     assert [p.parent.name for p in objects.checkpoints] == ["fold0", "fold1"]
     assert facts["split/folds"] == 2 and facts["test/samples"] == 40
     assert facts["time/train_total_s"] == pytest.approx(2 * facts["time/train_s"])
 
 
 def test_the_simulated_stand_in_says_so(tmp_path):
-    settings = [s for s in brief(tmp_path) if not s.startswith("dataset")]
-    config = compose(*settings, "dataset=rfid_sim", "dataset.count=30", f"dataset.root={tmp_path}")
-    facts, _ = train(config, tmp_path / "run")
+    settings = [s for s in brief(tmp_path) if not s.startswith(("dataset", "model."))]
+    chosen = "dataset=rfid_sim", "dataset.count=30", f"dataset.root={tmp_path}", "model=mean"
+    facts, _ = train(compose(*settings, *chosen), tmp_path / "run")
     assert facts["dataset/name"] == "rfid-sim" and facts["dataset/stand_in"]
 
 
 def test_loss_decreases_and_the_field_beats_the_mean_on_simulated_channels(tmp_path):
     file = channels(tmp_path / "own.npz", rows=150)
-    config = compose(
-        *brief(file, "trainer.max_steps=150", "trainer.val_check_interval=25", "model.field.count=80")
-    )
-    facts, _ = train(config, tmp_path / "run")
+    more = "trainer.max_steps=150", "trainer.val_check_interval=25", "model.field.count=80"
+    facts, _ = train(compose(*brief(file, *more)), tmp_path / "run")
     rows = (tmp_path / "run" / "learning_curve.csv").read_text().splitlines()
     column = rows[0].split(",").index("train/task_loss")
     losses = [float(row.split(",")[column]) for row in rows[1:]]
@@ -139,58 +162,27 @@ class Recording:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_loggers_are_closed_whatever_happens(tmp_path, monkeypatch, fails):
-    file = spectra(tmp_path / "own.npz")
-    settings = [s for s in brief(file) if not s.startswith("model.")]
-    config = compose(*settings, "model=mean")
+def test_loggers_are_closed_whatever_happens(spectra_file, tmp_path, monkeypatch, fails):
+    config = plain(spectra_file, "mean")
     with open_dict(config):
         config.logger = {"own": {"_target_": f"{__name__}.Recording"}}
     Recording.made.clear()
     if fails:
-        monkeypatch.setattr("gsparc.commands.train.evaluate", lambda *a, **k: 1 / 0)
+        monkeypatch.setattr(run, "evaluate", lambda *a, **k: 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            train(config, tmp_path / "run")
+            train(config, tmp_path)
     else:
-        train(config, tmp_path / "run")
-        said = Recording.made[0].metrics
-        assert said["final/test/psnr_db"] and not [k for k in said if not k.startswith("final/")]
+        train(config, tmp_path)
+        metrics = Recording.made[0].metrics
+        assert metrics["final/test/psnr_db"] and not [k for k in metrics if not k.startswith("final/")]
     assert Recording.made[0].closed == ["failed" if fails else "success"]
 
 
-def test_a_finished_model_is_no_training_state(tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    _, objects = train(compose(*brief(file, "model.refit=false")), tmp_path / "run")
-    with pytest.raises(ValueError, match=r"resume from last\.ckpt instead"):
-        train(compose(*brief(file, f"ckpt_path={objects.checkpoints[0]}")), tmp_path / "again")
-
-
-def test_another_methods_model_is_no_training_state(tmp_path):
-    """It was taken for an interrupted run: `gsparc has not been trained: call fit() or load a checkpoint`."""
-    file = spectra(tmp_path / "own.npz")
-    settings = [s for s in brief(file) if not s.startswith("model.")]
-    _, objects = train(compose(*settings, "model=nearest"), tmp_path / "run")
-    with pytest.raises(ValueError, match=r"resume from last\.ckpt instead"):
-        train(compose(*brief(file, f"ckpt_path={objects.checkpoints[0]}")), tmp_path / "again")
-
-
-def test_a_missing_checkpoint_is_named(tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    with pytest.raises(ValueError, match=r"gone\.ckpt: no such file"):
-        train(compose(*brief(file, "ckpt_path=gone.ckpt")), tmp_path / "run")
-
-
-@pytest.fixture(scope="module")
-def interrupted(tmp_path_factory):
-    """A file of spectra, and what an interrupted run of `split=random` on it left."""
-    folder = tmp_path_factory.mktemp("interrupted")
-    file = spectra(folder / "own.npz")
-    often = "callbacks.checkpoint.every_n_train_steps=10"
-    train(compose(*brief(file, "model.refit=false", often)), folder / "run")
-    return file, folder / "run" / "last.ckpt"
+# -- what a run goes on from, and starts from -----------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "change,said",
+    ("change", "message"),
     [
         ("split=corner", r"split\.name=random \(here corner\)"),
         ("split.seed=3", r"split\.seed=0 \(here 3\)"),
@@ -199,45 +191,34 @@ def interrupted(tmp_path_factory):
         ("model.emission.hidden=7", r"model\.emission\.hidden=\d+ \(here 7\)"),
         ("dataset.batch_size=5", r"dataset\.batch_size=\d+ \(here 5\)"),
         ("stations=together", r"stations=auto \(here together\)"),  # a model of each was shown as one of all
+        ("dataset.file={other}", r"dataset\.file=.*own\.npz \(here .*other\.npz\)"),
+        # It was ignored; a run that began with it goes on with it, in its coordinates.
+        ("init_from={model}", r"init_from=None \(here .*model\.ckpt\)"),
     ],
 )
 def test_a_run_goes_on_with_the_same_split_seed_and_settings_or_not_at_all(
-    interrupted, tmp_path, change, said
+    spectra_file, halfway, tmp_path, change, message
 ):
     """Rows learned before were tested on: 29 or 41 dB were shown where 20 are true."""
-    file, last = interrupted
-    with pytest.raises(ValueError, match=rf"last\.ckpt: was trained with {said}"):
-        train(compose(*brief(file, "model.refit=false", change, f"ckpt_path={last}")), tmp_path)
+    model = halfway.checkpoints[0]
+    last, other = model.with_name("last.ckpt"), spectra(tmp_path / "other.npz", origin=1.0)
+    change = change.format(other=other, model=model)
+    with pytest.raises(ValueError, match=rf"last\.ckpt: was trained with {message}"):
+        train(short(spectra_file, change, f"ckpt_path={last}"), tmp_path)
     assert not (tmp_path / "summary.json").exists()
 
 
-def test_a_run_goes_on_with_the_same_data_or_not_at_all(interrupted, tmp_path):
-    _, last = interrupted
-    other = spectra(tmp_path / "other.npz", origin=1.0)
-    with pytest.raises(ValueError, match=r"was trained with dataset\.file=.*own\.npz \(here .*other\.npz\)"):
-        train(compose(*brief(other, "model.refit=false", f"ckpt_path={last}")), tmp_path / "run")
-
-
-def altered(last: Path, to: Path, change: Callable[[dict], object]) -> Path:
-    """The checkpoint with its content changed."""
-    content = torch.load(last, weights_only=True)
-    change(content)
-    torch.save(content, to)
-    return to
-
-
-def test_a_run_goes_on_with_the_same_grid_or_not_at_all(interrupted, tmp_path):
+def test_a_run_goes_on_with_the_same_grid_or_not_at_all(spectra_file, halfway, tmp_path):
     """The content hash does not know it."""
-    file, last = interrupted
-    with np.load(file) as stored:
+    with np.load(spectra_file) as stored:
         np.savez(tmp_path / "own.npz", **stored, grid_deg=[0.0, 0.0, 3.0, 10.0])
-    settings = brief(tmp_path / "own.npz", "model.refit=false", f"ckpt_path={last}")
+    last = halfway.checkpoints[0].with_name("last.ckpt")
     with pytest.raises(ValueError, match=r"last\.ckpt: was trained with other grid: go on with the same"):
-        train(compose(*settings), tmp_path / "run")
+        train(short(tmp_path / "own.npz", f"ckpt_path={last}"), tmp_path / "run")
 
 
 @pytest.mark.parametrize(
-    "what, change",
+    ("what", "change"),
     [
         ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
         ("other directions or uplink", lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64))),
@@ -246,30 +227,26 @@ def test_a_run_goes_on_with_the_same_grid_or_not_at_all(interrupted, tmp_path):
         ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
     ],
 )
-def test_facts_beside_the_content_hash_are_of_an_origin(interrupted, what, change):
-    file, last = interrupted
-    data = load_data({"name": "own", "file": str(file)})
+def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, what, change):
+    data = load_data({"name": "own", "file": str(spectra_file)})
     fold = Fold(np.arange(9), np.arange(9, 12), np.arange(12, 20))
     before, now = (Origin.of(d, fold, FitContext()) for d in (data, change(data)))
-    stored = replace(checkpoint.read(last), config="", extra=before.marks())
+    stored = checkpoint.read(halfway.checkpoints[0].with_name("last.ckpt"))
+    stored = replace(stored, config="", extra=before.marks())
     before.refuse_other(stored)
     with pytest.raises(ValueError, match=f"was trained with {what}: go on"):
         now.refuse_other(stored)
 
 
-def test_weights_to_start_from_beside_a_run_to_go_on_from_are_refused(interrupted, tmp_path):
-    """`init_from=` was ignored; a run that began with it goes on with it, in its coordinates."""
-    file, last = interrupted
-    first = train(compose(*brief(file, "model.refit=false")), tmp_path / "first")[1].checkpoints[0]
-    start = f"init_from={first}"
-    with pytest.raises(ValueError, match=r"was trained with init_from=None \(here .*model\.ckpt\)"):
-        train(compose(*brief(file, "model.refit=false", start, f"ckpt_path={last}")), tmp_path / "run")
-    often = "callbacks.checkpoint.every_n_train_steps=10"
-    train(compose(*brief(file, "model.refit=false", start, often)), tmp_path / "second")
-    on = f"ckpt_path={tmp_path / 'second' / 'last.ckpt'}"
-    assert train(compose(*brief(file, "model.refit=false", start, on)), tmp_path / "third")
+def test_weights_to_start_from_beside_a_run_to_go_on_from_are_those_it_began_with(
+    spectra_file, halfway, tmp_path
+):
+    often, start = "callbacks.checkpoint.every_n_train_steps=10", f"init_from={halfway.checkpoints[0]}"
+    train(short(spectra_file, start, often), tmp_path / "begun")
+    on = f"ckpt_path={tmp_path / 'begun' / 'last.ckpt'}"
+    assert train(short(spectra_file, start, on), tmp_path / "on")
     with pytest.raises(ValueError, match=r"was trained with init_from=.*model\.ckpt \(here None\)"):
-        train(compose(*brief(file, "model.refit=false", on)), tmp_path / "fourth")
+        train(short(spectra_file, on), tmp_path / "without")
 
 
 SPOILT = {
@@ -280,21 +257,196 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("where", SPOILT)
-def test_a_training_state_that_is_not_finite_is_refused_before_training(interrupted, tmp_path, where):
+def test_a_training_state_that_is_not_finite_is_refused_before_training(
+    spectra_file, halfway, tmp_path, where
+):
     """One rate of NaN trained on unnoticed; seconds of NaN failed when training was over."""
-    file, last = interrupted
-    spoilt = altered(
-        last, tmp_path / "spoilt.ckpt", lambda content: SPOILT[where](content["extra"]["trainer"])
-    )
+    content = torch.load(halfway.checkpoints[0].with_name("last.ckpt"), weights_only=True)
+    SPOILT[where](content["extra"]["trainer"])
+    torch.save(content, tmp_path / "spoilt.ckpt")
     with pytest.raises(ValueError, match=rf"trainer\.{re.escape(where)}.* is NaN or infinite; resume from"):
-        train(compose(*brief(file, "model.refit=false", f"ckpt_path={spoilt}")), tmp_path / "run")
+        train(short(spectra_file, f"ckpt_path={tmp_path / 'spoilt.ckpt'}"), tmp_path / "run")
     assert not (tmp_path / "run" / "learning_curve.csv").exists()
 
 
-def test_settings_of_the_schedule_may_change_and_are_named(interrupted, tmp_path, caplog):
-    file, last = interrupted
-    train(compose(*brief(file, "model.refit=false", "trainer.max_steps=25", f"ckpt_path={last}")), tmp_path)
+def test_settings_of_the_schedule_may_change_and_are_named(spectra_file, halfway, tmp_path, caplog):
+    last = halfway.checkpoints[0].with_name("last.ckpt")
+    train(short(spectra_file, "trainer.max_steps=25", f"ckpt_path={last}"), tmp_path)
     assert re.search(r"which had trainer\.max_steps=\d+ \(here 25\)", caplog.text)
+
+
+def test_checkpoints_come_when_asked_for_and_go_on_bit_identically(spectra_file, halfway, tmp_path):
+    last = halfway.checkpoints[0].with_name("last.ckpt")
+    assert checkpoint.read(last).extra["trainer"]["global_step"] == 15
+    _, objects = train(short(spectra_file, f"ckpt_path='{last}'"), tmp_path)
+    whole, resumed = weights(halfway.checkpoints[0]), weights(objects.checkpoints[0])
+    assert whole.keys() == resumed.keys() and all(torch.equal(whole[k], resumed[k]) for k in whole)
+
+
+def test_training_starts_from_given_weights_on_rows_of_another_campaign(halfway, tmp_path):
+    """Another campaign's box, and with it the origin of local coordinates, is never quite the same."""
+    new = spectra(tmp_path / "new.npz", rows=55)
+    before = weights(halfway.checkpoints[0])
+    after = {}
+    for name, more in {"still": ("trainer.max_steps=1", *STILL), "on": ()}.items():
+        config = short(new, f"init_from='{halfway.checkpoints[0]}'", *more)
+        _, objects = train(config, tmp_path / name)
+        after[name] = weights(objects.checkpoints[0])
+    same = [torch.equal(after["still"][k], before[k]) for k in before if k.startswith("gaussians.")]
+    assert all(same) and len(same) > 3 and len(objects.data) == 55
+    assert not torch.equal(after["on"]["gaussians.means"], before["gaussians.means"])
+
+
+@pytest.fixture(scope="module")
+def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
+    """Files that are none of `halfway`'s."""
+    folder = tmp_path_factory.mktemp("others")
+    files = {
+        "rx": spectra(folder / "rx.npz", moving="rx"),
+        "csi": channels(folder / "csi.npz"),
+        "far": spectra(folder / "far.npz", origin=100.0),
+    }
+    _, nearest = train(plain(spectra_file, "nearest"), folder / "nearest")
+    return files | {"model": halfway.checkpoints[0], "nearest": nearest.checkpoints[0]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["ckpt_path={model}"], r"resume from last\.ckpt instead"),
+        # It was taken for an interrupted run: `gsparc has not been trained: call fit() or load a checkpoint`.
+        (["ckpt_path={nearest}"], r"resume from last\.ckpt instead"),
+        (["ckpt_path=gone.ckpt"], r"gone\.ckpt: no such file"),
+        (["init_from=none.ckpt"], r"init_from=none\.ckpt: .*no such checkpoint"),
+        (["init_from={model}", "dataset.file={rx}"], "init_from=.*trained with static_end rx"),
+        (["init_from={model}", "dataset.file={csi}"], "init_from=.*trained with kind spectrum"),
+        (["init_from={model}", "dataset.file={far}"], "init_from=.*from the model's"),
+        (["init_from={model}", "model=nearest"], "init_from: nearest does not train by gradient"),
+        (["objective=test/psnr"], "did you mean 'test/psnr_db'"),
+        (["trainer.devices=2"], "say trainer=ddp"),  # several devices need processes that end
+    ],
+)
+def test_what_cannot_be_trained_is_refused_in_one_line(spectra_file, others, tmp_path, changes, message):
+    settings = brief(spectra_file, "model.refit=false")
+    if "model=nearest" in changes:
+        settings = [s for s in settings if not s.startswith("model.")]
+    with pytest.raises(ValueError, match=message) as error:
+        train(compose(*settings, *(change.format(**others) for change in changes)), tmp_path)
+    assert "\n" not in str(error.value) and not (tmp_path / "model.ckpt").exists()
+
+
+# -- options of the Trainer, and Lightning's own way to a model -------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "validated"),
+    [
+        (["trainer=debug"], [1]),
+        (["trainer.precision=bf16-mixed"], [10, 20]),
+        (["trainer.gradient_clip_val=1.0", "trainer.val_check_interval=7"], [7, 14]),
+        (["+trainer.profiler=simple"], [10, 20]),
+    ],
+)
+def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_file, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    facts, _ = train(short(spectra_file, *options), tmp_path)
+    assert facts["test/psnr_db"] > 20 and steps(tmp_path) == validated
+    assert ("FIT Profiler Report" in caplog.text) == (options[0] == "+trainer.profiler=simple")
+
+
+@pytest.mark.slow
+def test_two_devices_learn_what_one_does(spectra_file, halfway, tmp_path):
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    facts, objects = train(short(spectra_file, *two), tmp_path)
+    assert steps(tmp_path) == [10, 20] and facts["time/train_s"] > 0  # written by one of them
+    _, untouched = train(short(spectra_file, "trainer.max_steps=1", *STILL), tmp_path / "start")
+    one, both, began = (weights(o.checkpoints[0])["gaussians.means"] for o in (halfway, objects, untouched))
+    assert (both - one).norm() < 0.2 * (one - began).norm()  # the same mean gradient, but for rounding
+
+
+def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monkeypatch):
+    def absent(*unused, **named):
+        raise ModuleNotFoundError("No module named 'tensorboard'")
+
+    monkeypatch.setattr("lightning.pytorch.loggers.TensorBoardLogger", absent)
+    folders = [f"logger.{name}.save_dir='{tmp_path}'" for name in ("csv", "tensorboard")]
+    with pytest.raises(Exception, match="TensorBoard is not installed") as error:
+        train(compose(*brief(spectra_file), "logger=tensorboard", *folders), tmp_path)
+    message = "logger=tensorboard: TensorBoard is not installed; say pip install"
+    assert one_line(error.value).startswith(message)
+
+
+@pytest.mark.parametrize("given", [["trainer.max_steps=3", "seed=1"], ["seed=1"]])
+def test_options_without_a_gradient_are_said_to_be_unused(given, spectra_file, tmp_path, monkeypatch, caplog):
+    caplog.set_level(logging.DEBUG)
+    hydra = SimpleNamespace(overrides=SimpleNamespace(task=given))
+    monkeypatch.setattr(run, "HydraConfig", SimpleNamespace(initialized=lambda: True, get=lambda: hydra))
+    train(plain(spectra_file, "nearest"), tmp_path)
+    (record,) = [r for r in caplog.records if "does not train by gradient" in r.message]
+    loud = len(given) > 1
+    assert record.levelno == (logging.WARNING if loud else logging.DEBUG)
+    assert ("(trainer.max_steps=3)" in record.message) == loud
+
+
+@pytest.mark.parametrize("name", ["model.ckpt", "last.ckpt"])
+def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra_file, halfway):
+    path = halfway.checkpoints[0].with_name(name)
+    module = module_of(path)
+    data = datamodule({"name": "own", "file": str(spectra_file)}).measurements
+    rows = np.arange(20)
+    loaded = Loaded(data, 8).use(Fold(rows, rows[:0], rows))
+    trainer = Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_checkpointing=False)
+    predicted = torch.cat(trainer.predict(module, loaded))
+    expected = gsparc.load(path).spectrum(tx=data.tx[rows] + data.site.origin)
+    assert predicted.shape == (20, 16, 32) and np.abs(predicted.numpy() - expected).max() < 1e-5
+
+
+def test_a_method_without_a_field_has_no_module(others):
+    with pytest.raises(checkpoint.CheckpointError, match="nearest holds no Gaussian field"):
+        module_of(others["nearest"])
+
+
+# -- the objective of a search --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_objective_is_a_figure_of_the_kind(kind):
+    config = compose("eval_on=val")
+    assert run.objective_of(config, kind) == DECIDING[kind] and DECIDING[kind] in figure_names(kind)
+    for figure in (*figure_names(kind), "skill"):
+        config.objective = f"val/{figure}"
+        assert run.objective_of(config, kind) == figure
+    config.objective = "val/nmsee"
+    with pytest.raises(ValueError, match=r"objective=val/nmsee: no such figure; did you mean 'val/nmse'\?"):
+        run.objective_of(config, kind)
+
+
+def test_every_figure_grows_when_the_prediction_is_better():
+    """Each of them by name: what is not listed as smaller-is-better is maximised."""
+    better_is_larger = {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "snr_db"}
+    better_is_larger |= {f"snr_db_p{p}" for p in (10, 50, 90)}
+    for figure in (figure for kind in DECIDING for figure in figure_names(kind)):
+        assert lower_is_better(figure) == (figure not in better_is_larger), figure
+        assert (score_of(figure, 0.2) > score_of(figure, 0.1)) == (figure in better_is_larger)
+
+
+@pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
+def test_the_objective_is_for_searches_alone(tmp_path, way):
+    """One power heard of sixty: everything was written, then `error: objective=test/rmse_db`, exit 1."""
+    where, heard = np.random.default_rng(0).uniform(0, 20, (60, 3)), np.full(60, np.nan)
+    heard[7] = -60.0
+    powers = {"rssi_db": heard, "sensitivity_db": -90.0}
+    np.savez(tmp_path / "own.npz", rx_position=where, tx_position=np.zeros(3), **powers)
+    folder = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'run'}"]
+    given = ["dataset=own", f"dataset.file={tmp_path / 'own.npz'}", "model=mean", "baselines=[]"]
+    answer = knock(main, "train.py", [*way, *given, *folder, "logger=none", "threads=1", "split.seed=0"])
+    assert answer.status == 0 and not [line for line in answer.err if line.startswith("error")], answer
+    written = list((tmp_path / "run").rglob("summary.json"))
+    assert len(written) == (2 if way else 1)
+    assert all(json.loads(file.read_text())["test/rmse_db"] is None for file in written)
+
+
+# -- the command in a process of its own ------------------------------------------------------------------
 
 
 def start(file: Path, folder: Path, *more: str) -> subprocess.Popen:
@@ -305,40 +457,29 @@ def start(file: Path, folder: Path, *more: str) -> subprocess.Popen:
     )  # fmt: skip
 
 
-def test_an_interrupt_leaves_a_checkpoint_that_goes_on(tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    more = (
-        "trainer.max_steps=100000",
-        "callbacks.checkpoint.every_n_train_steps=10",
-        "model.refit=false",
-        "trainer.val_check_interval=50000",
-    )
-    run = start(file, tmp_path / "run", *more)
+def test_an_interrupt_leaves_a_checkpoint_that_goes_on(spectra_file, tmp_path):
+    rare = "model.refit=false", "trainer.val_check_interval=50000"
+    often = "callbacks.checkpoint.every_n_train_steps=10"
+    process = start(spectra_file, tmp_path / "run", *rare, "trainer.max_steps=100000", often)
     last = tmp_path / "run" / "last.ckpt"
     until = time.monotonic() + 120
     while not last.exists() and time.monotonic() < until:
         time.sleep(0.01)
-    run.send_signal(signal.SIGINT)
-    _, said = run.communicate(timeout=60)
-    assert run.returncode == 130 and f"go on with ckpt_path={last}" in said and "Traceback" not in said
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and f"go on with ckpt_path={last}" in err and "Traceback" not in err
     reached = checkpoint.read(last).extra["trainer"]["global_step"]
-    more = (
-        f"trainer.max_steps={reached + 5}",
-        f"ckpt_path={last}",
-        "model.refit=false",
-        "trainer.val_check_interval=50000",
-    )
-    facts, _ = train(compose(*brief(file, *more)), tmp_path / "on")
+    more = f"trainer.max_steps={reached + 5}", f"ckpt_path={last}"
+    facts, _ = train(compose(*brief(spectra_file, *rare, *more)), tmp_path / "on")
     assert np.isfinite(facts["test/psnr_db"])
     assert checkpoint.read(tmp_path / "on" / "model.ckpt").method == "gsparc"
 
 
 @pytest.mark.slow
-def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    run = start(file, tmp_path / "run", "logger=wandb")
-    _, said = run.communicate(timeout=240)
-    assert run.returncode == 0, said
+def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(spectra_file, tmp_path):
+    process = start(spectra_file, tmp_path / "run", "logger=wandb")
+    _, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err
     (folder,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
     (stored,) = folder.glob("*.wandb")
     names = (b"train/loss", b"val/psnr_db", b"model/num_gaussians", b"rate/", b"final/test/psnr_db")
@@ -347,27 +488,3 @@ def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(tmp_pa
     assert list(media.glob("images/test rows*.png")) and list(media.glob("images/predictions*.png"))
     (table,) = (json.loads(file.read_text()) for file in media.glob("table/results*.json"))
     assert table["columns"][0] == "method" and "gsparc" in [row[0] for row in table["data"]]
-
-
-@pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
-def test_the_objective_is_for_searches_alone(tmp_path, way):
-    """One power heard of sixty: everything was written, then `error: objective=test/rmse_db`, exit 1."""
-    where = np.random.default_rng(0).uniform(0, 20, (60, 3))
-    heard = np.full(60, np.nan)
-    heard[7] = -60.0
-    np.savez(
-        tmp_path / "own.npz", rx_position=where, tx_position=np.zeros(3), rssi_db=heard, sensitivity_db=-90.0
-    )
-    folder = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'run'}"]
-    given = [
-        "dataset=own",
-        f"dataset.file={tmp_path / 'own.npz'}",
-        "model=mean",
-        "baselines=[]",
-        "logger=none",
-    ]
-    answer = knock(main, "train.py", [*way, *given, *folder, "threads=1", "split.seed=0"])
-    assert answer.status == 0 and not [line for line in answer.err if line.startswith("error")], answer
-    written = list((tmp_path / "run").rglob("summary.json"))
-    assert len(written) == (2 if way else 1)
-    assert all(json.loads(file.read_text())["test/rmse_db"] is None for file in written)

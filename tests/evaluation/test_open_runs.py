@@ -100,3 +100,57 @@ def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations(tmp_path, 
         assert baseline("idw", data, split, cache=tmp_path).scores.figures()["rmse_db"] < 4
     found = baseline("idw", aligned(other, town().site), split, "train", cache=tmp_path)
     assert found.scores.figures()["rmse_db"] < 1e-3
+
+
+@pytest.fixture
+def room():
+    """Complex channels of one transmitter in a small room, a kilometre from the origin."""
+    rx = np.random.default_rng(0).uniform([1000, 0, 0], [1004, 4, 4], (40, 3))
+    distance = np.linalg.norm(rx - [1002, 2, 1], axis=1)
+    csi = np.exp(-1j * distance) / distance
+    ends = {"tx_position": np.array([1002.0, 2, 1]), "rx_position": rx}
+    return from_arrays({**ends, "csi": csi, "frequency_hz": 2.4e9})
+
+
+def test_data_centred_elsewhere_are_moved_not_misread(room):
+    shift, site = np.array([0.25, -0.5, 0.125]), room.site
+    there = replace(
+        site, origin=site.origin + shift, static_position=site.static_position - shift,
+        target_scale=site.target_scale * 4,
+    )  # fmt: skip
+    back = aligned(
+        replace(
+            room, site=there, tx=room.tx - shift, rx_position=room.rx_position - shift, target=room.target / 4
+        ),
+        site,
+    )
+    assert np.allclose(back.moving, room.moving) and np.allclose(back.target, room.target)
+    assert np.allclose(back.tx, room.tx) and np.array_equal(back.site.origin, site.origin)
+    assert aligned(room, site) is room
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("static_position", lambda place: place + np.eye(3)[0], "is 1 m from"),
+        ("kind", lambda kind: "rssi", "with kind csi"),
+    ],
+)
+def test_data_of_another_place_or_kind_are_refused(room, name, change, message):
+    other = replace(room, site=replace(room.site, **{name: change(getattr(room.site, name))}))
+    with pytest.raises(ValueError, match=message):
+        aligned(other, room.site)
+
+
+def test_what_is_in_target_units_is_converted_with_the_target(room):
+    """An uplink kept its own unit: whoever hears it and predicts a downlink was wrong by the ratio."""
+    heard = np.full((len(room), 2, 3), 1 + 1j, np.complex64)
+    noise = np.full(len(room), 0.5, np.float32)
+    louder = replace(room.site, target_scale=room.site.target_scale * 4)
+    back = aligned(
+        replace(room, site=louder, target=room.target / 4, uplink=heard / 4, noise_variance=noise / 16),
+        room.site,
+    )
+    assert np.allclose(back.target, room.target)
+    assert np.allclose(back.uplink, heard) and np.allclose(back.noise_variance, noise)
+    assert back.uplink.dtype == np.complex64 and back.noise_variance.dtype == np.float32

@@ -17,13 +17,13 @@ import pytest
 from crashes import small_campaign
 
 from gsparc.commands.check import main as check
-from gsparc.commands.simulate_pictures import effect_shares, floor_plan
 from gsparc.data import blocks
 from gsparc.data.datasets.sionna import _heard
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
 from gsparc.data.schema import LIGHT
+from gsparc.evaluation.simulated import effect_shares, floor_plan
 from gsparc.simulate import campaign as campaigns
 from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays

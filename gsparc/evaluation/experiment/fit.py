@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
-from lightning import Callback, Trainer
+from lightning import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.executor import each, elsewhere
@@ -28,18 +28,11 @@ from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import Clock, less_repeatable
 
 
-def context_of(
-    config: DictConfig,
-    trainer: partial[Trainer] | None = None,
-    callbacks: Callable[[], Sequence[Callback]] | None = None,
-    **others: Any,
-) -> FitContext:
-    """The context of a fit: seed, budget, split, `init_from`, `dataset.batch_size`, and what is given.
+def context_of(config: DictConfig, **others: Any) -> FitContext:
+    """The context of a fit as a composed configuration says, and what is given.
 
     Args:
-        config: a composed configuration.
-        trainer: makes a Trainer from further options, once per fold; None: as `config` says.
-        callbacks: makes them anew, once per Trainer; None: as `config` says.
+        config: its seed, budget, split, `init_from`, batch size, Trainer and callbacks.
         **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
     """
     init_from, split = config.get("init_from"), config.get("split")
@@ -51,8 +44,8 @@ def context_of(
         split=None if split is None else split_settings(plain(split)),
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),
-        trainer=trainer or instantiate(config.trainer, _partial_=True),
-        callbacks=callbacks or partial(callbacks_of, config.get("callbacks")),
+        trainer=instantiate(config.trainer, _partial_=True),
+        callbacks=partial(callbacks_of, config.get("callbacks")),
         config_yaml=OmegaConf.to_yaml(config, resolve=True),
         **others,
     )

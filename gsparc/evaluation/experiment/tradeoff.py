@@ -25,7 +25,8 @@ from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.models import loading
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Point, Settings, cost_of_halving, worded
-from gsparc.models.reduced import View
+from gsparc.models.per_station import PerStation
+from gsparc.models.reduced import View, knobs
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import Call, ClockSettings, interleaved
 
@@ -263,3 +264,24 @@ def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
         rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
     return ["point", "ms p50", "ms p95", figure, "difference to full"], rows
+
+
+def irreducible(method: Method) -> list[str]:
+    """A sentence where there is nothing to weigh against time."""
+    if knobs(method):
+        return []
+    why = "it has no Gaussians, sources, components or variances to spare"
+    if isinstance(method, PerStation):
+        why = "one of several stations is asked as it was trained"
+    return [f"{method.name}: nothing of it can be reduced, so that there is one point ({why})"]
+
+
+def slope(facts: Mapping[str, Any]) -> list[str]:
+    """A sentence on what a halving of the latency costs along the front."""
+    names = ("front", "span", "per_halving", "front_beaten_by_others")
+    count, span, slope, beaten = (facts[f"tradeoff/{name}"] for name in names)
+    rest = f" ({count - beaten} that no baseline beats)" if beaten else ""
+    text = (
+        f"{count} points span {span:.1f} times in latency; each halving costs {slope or 0:.2g} dB on average"
+    )
+    return [] if slope is None else [f"{text} along the front{rest}"]

@@ -1,24 +1,53 @@
-"""The ratios that are promised, each measured against its counterpart in the same rounds."""
+"""What is timed, and the ratios that are promised, each against its counterpart in the same rounds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import torch
 
-from gsparc.commands.bench import kernels, layers
-from gsparc.commands.bench.measure import Call, Case, Machine, measure, timed, undisturbed
-from gsparc.commands.bench.scene import Scene, scene
 from gsparc.ops.projection import Projection
+from gsparc.prediction.bench import kernels, layers
+from gsparc.prediction.bench.measure import Call, Case, Machine, measure, timed, undisturbed
+from gsparc.prediction.bench.scene import NETWORK, Scene, scene
 from gsparc.prediction.timing import ClockSettings
 
+log = logging.getLogger(__name__)
+
+MOVING = (kernels.plan, kernels.moving, kernels.weights)  # a batch is as many plans
+RASTERIZER = (*MOVING[:2], kernels.static, kernels.frozen, kernels.backward, kernels.weights)
+MOST_PLANNED = 1_000_000  # Gaussians times poses in one call
 # Of forward / limit: for fewer Gaussians than MANY, and for more. Where it comes from: docs/kernels.md.
 FORWARD: dict[Projection, tuple[float, float]] = {"tangent": (4.0, 5.0), "equirect": (3.0, 4.0)}
 MANY = 25_000
 FROZEN = 1.5  # times the bytes that it must read
+
+
+def cases(counts: Sequence[int], projections: Sequence[Projection], batches: Sequence[int]) -> Iterator[Case]:
+    """All rows of the table, one alive at a time."""
+    for count in counts:
+        for projection in projections:
+            field = scene(count, projection)
+            for make in RASTERIZER:
+                for batch in batches:
+                    if make in MOVING and count * batch > MOST_PLANNED:
+                        log.info("%s of %d x %d Gaussians left out: too long", make.__name__, batch, count)
+                        continue
+                    yield make(field, batch)
+            yield layers.channel(field, 1, 1)
+            yield layers.channel(field, *layers.MANY)
+        for batch in batches:
+            yield layers.emission(count, batch)
+            yield layers.emission(count, batch, NETWORK)
+            yield layers.emission_backward(count, batch)
+    for batch in batches:
+        yield layers.loss(batch)
+    for projection in projections:
+        yield layers.step(projection)
 
 
 @dataclass(frozen=True)
@@ -72,7 +101,7 @@ def claims(
         found.append(Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True))
         for field in fields[1:]:
             found.append(_limit("frozen / bytes", kernels.frozen(field, 1), FROZEN, machine, clock))
-        one, many = (_whole(layers.channel(middle, *shape, 1)) for shape in ((1, 1), layers.MANY))
+        one, many = (_whole(layers.channel(middle, *shape)) for shape in ((1, 1), layers.MANY))
         found.append(Claim(f"1664 channels / 1 at {size}", _ratio(many, one, clock), 2.0))
         return [*found, *_growth(fields, clock), _learning(projection)]
     finally:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.commands.bench.measure import Call, Case, Work, size
-from gsparc.commands.bench.scene import COMPLEX, GRID, Scene, places, receiver, receivers
 from gsparc.field.frozen import frozen_view
 from gsparc.ops import composite, freeze, machine_limits, mean_weights, rasterize
 from gsparc.ops.geometry import Pose
+from gsparc.prediction.bench.measure import Call, Case, Work, size
+from gsparc.prediction.bench.scene import COMPLEX, GRID, Scene, places, receiver, receivers
 
 REFERENCE_BYTES = 3 * 2**30  # of one forward pass in dense tensors
 DENSE_TENSORS = 12  # (N, H W) tensors alive at once in the reference

@@ -1,4 +1,4 @@
-"""Pictures of a simulation: the floor plan, and what `auto` measured."""
+"""A simulation for a reader: its floor plan, what `auto` measured, the scenes there are."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import bounded, draw_stations, draw_walls, legend_below
+from gsparc.evaluation.summary import table
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
+from gsparc.simulate.raytracer import RayTracer
+from gsparc.simulate.scenes.shipped import shipped
+
+CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
 
 
 def floor_plan(outcome: Outcome, path: Path) -> None:
@@ -93,3 +99,16 @@ def effect_shares(choice: Choice, path: Path) -> None:
     right.set_xscale("log")
     figure.suptitle(f"blue: needed; grey: not. {choice.deliverable}")
     save(figure, path)
+
+
+def shipped_scenes() -> tuple[Table, dict[str, np.ndarray]]:
+    """Size, triangles and materials of every scene that comes with Sionna, and what `plans` draws of them."""
+    rows, drawn = [], {}
+    for name in shipped():
+        tracer = RayTracer(name, np.zeros(3), CARRIER_HZ)
+        size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.box(), axis=0))
+        triangles = drawn[f"{name}, {size} m"] = tracer.triangles()
+        used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
+        rows.append([name, size, f"{len(triangles):,}", used])
+    heads = ["scene", "size [m]", "triangles", "materials"]
+    return table("scene=NAME: scenes that come with Sionna", heads, [], rows), drawn

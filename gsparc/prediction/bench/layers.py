@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from gsparc.commands.bench.measure import Call, Case, Work, size
-from gsparc.commands.bench.scene import GRID, NETWORK, PAPER, Scene, places, receiver, receivers, scene
 from gsparc.field.emission import Emission, EmissionSettings
 from gsparc.field.model import GaussianModel
 from gsparc.ops import Pose, mean_weights
 from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products
 from gsparc.ops.projection import Projection
+from gsparc.prediction.bench.measure import Call, Case, Work, size
+from gsparc.prediction.bench.scene import GRID, NETWORK, PAPER, Scene, places, receiver, receivers, scene
 from gsparc.training.losses import spectrum_loss
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
@@ -82,13 +82,13 @@ def loss(batch: int) -> Case:
     )
 
 
-def channel(field: Scene, antennas: int, subcarriers: int, batch: int) -> Case:
+def channel(field: Scene, antennas: int, subcarriers: int) -> Case:
     """Antennas x subcarriers at a moving receiver: the factored sum (kernel); all of the query (whole)."""
     count, draw = len(field), torch.Generator().manual_seed(0)
     steering = torch.randn(count, antennas, 2, generator=draw)
     delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
-    gains = torch.randn(batch, count, 2, generator=draw)
-    poses, tx = receivers(batch), places(batch) + 1
+    gains = torch.randn(1, count, 2, generator=draw)
+    poses, tx = receivers(1), places(1) + 1
 
     def whole() -> Tensor:
         share = mean_weights(field.plan(poses, channels=True), *field.geometry).share
@@ -96,8 +96,8 @@ def channel(field: Scene, antennas: int, subcarriers: int, batch: int) -> Case:
         return channels(share.unsqueeze(-1) * emitted, steering, delays, *TONES, subcarriers)
 
     return Case(
-        *(f"channel of {antennas} x {subcarriers}", field.projection, count, batch),
-        work=Work(size((gains, steering, delays)) + 8 * batch * antennas * subcarriers),
+        *(f"channel of {antennas} x {subcarriers}", field.projection, count, 1),
+        work=Work(size((gains, steering, delays)) + 8 * antennas * subcarriers),
         kernel=lambda: channels(gains, steering, delays, *TONES, subcarriers),
         whole=whole,
         reference=lambda: summed(gains, steering, delays, TONES, subcarriers),

@@ -7,12 +7,12 @@ import sys
 import pytest
 import torch
 
-from gsparc.commands.bench import kernels, layers
-from gsparc.commands.bench.claims import Claim
-from gsparc.commands.bench.command import markdown
-from gsparc.commands.bench.measure import Case, Machine, Work, measure
-from gsparc.commands.bench.scene import receiver, scene
+from gsparc.commands.bench import claims_table, page
 from gsparc.ops import composite, machine_limits, make_plan
+from gsparc.prediction.bench import kernels, layers
+from gsparc.prediction.bench.claims import Claim
+from gsparc.prediction.bench.measure import Case, Machine, Work, measure
+from gsparc.prediction.bench.scene import receiver, scene
 from gsparc.prediction.timing import ClockSettings
 
 
@@ -78,5 +78,5 @@ def test_a_step_learns_with_either_backend():
 def test_the_page_names_every_promise():
     facts = {"machine/cpu": "x", "machine/instruction_set": "y", "machine/cores": 2, "git": "abc"}
     facts |= {"machine/load": 0.5, "machine/load_before": 0.1}
-    page = markdown(facts, [], [("tangent", Claim("forward / limit", 4.0, 3.0))])
-    assert "| forward / limit | tangent | 4.00 | at most 3 | no |" in page and "abc" in page
+    text = page(facts, [claims_table([("tangent", Claim("forward / limit", 4.0, 3.0))])])
+    assert "| forward / limit | tangent | 4.00 | at most 3 | no |" in text and "abc" in text

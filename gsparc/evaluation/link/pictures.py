@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from gsparc.commands.link.adaptation import Rates
-from gsparc.commands.link.study import Curve
 from gsparc.evaluation.drawing import GREY, PALETTE, panels, save
+from gsparc.evaluation.link.adaptation import Rates
 from gsparc.prediction.risk_threshold import binomial_interval
 
 STYLES = {
@@ -37,7 +37,7 @@ RATES = {
 LEAST_RATE = 3e-4
 
 
-def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path) -> None:
+def draw_errors(drawn: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
     """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
     figure, axes = panels(5.6 * len(drawn), 8, 2, len(drawn), grid=False)
     for column, (modulation, curves) in enumerate(drawn.items()):
@@ -45,15 +45,13 @@ def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path
             if name not in curves:
                 continue
             curve, style = curves[name], {"color": colour, "linestyle": line, "marker": "."}
-            shown = np.maximum(curve.bler, LEAST_RATE)
+            shown = curve.bler.clip(LEAST_RATE).to_numpy()
             counts = zip(curve.errors, curve.blocks, strict=True)
-            low, high = np.maximum(
-                np.array([binomial_interval(int(e), int(n)) for e, n in counts]).T, LEAST_RATE
-            )
-            reach = [np.maximum(shown - low, 0), np.maximum(high - shown, 0)]
+            ends = np.array([binomial_interval(int(e), int(n)) for e, n in counts]).clip(LEAST_RATE)
+            reach = np.maximum([[-1], [1]] * (ends.T - shown), 0)
             style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
-            axes[0, column].errorbar(curve.ebno_db, shown, reach, **style_above)
-            axes[1, column].plot(curve.ebno_db, np.maximum(curve.ber, 1e-6), **style)
+            axes[0, column].errorbar(curve.index, shown, reach, **style_above)
+            axes[1, column].plot(curve.index, curve.ber.clip(1e-6), **style)
         axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
         for row, what in enumerate(("block error rate", "bit error rate")):
@@ -81,17 +79,16 @@ def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) ->
 
 
 def draw_acceptance(
-    found: Mapping[str, Mapping[str, np.ndarray]], threshold_share: float, path: Path
+    found: Mapping[str, tuple[float, pd.DataFrame]], threshold_share: float, path: Path
 ) -> None:
-    """Block error rate of the surest share of positions, a panel a modulation."""
+    """Block error rate of the surest share of positions, as of `acceptance`, a panel a modulation."""
     figure, grid = panels(5.5 * len(found), 4, 1, len(found))
-    for axis, (modulation, trade) in zip(grid[0], found.items(), strict=True):
-        for name, rates in trade.items():
-            if name in SHORT:
-                style, label = SHORT[name]
-                axis.plot(trade["share"], rates, style, label=label)
+    for axis, (modulation, (ebno_db, rates)) in zip(grid[0], found.items(), strict=True):
+        for name in filter(SHORT.__contains__, rates):
+            style, label = SHORT[name]
+            axis.plot(rates.index, rates[name], style, label=label)
         axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
-        axis.set_title(f"{modulation.upper()} at {float(trade['ebno_db']):g} dB")
+        axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")
         axis.legend(fontsize=8)
     save(figure, path)

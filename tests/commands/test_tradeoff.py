@@ -15,8 +15,8 @@ from hydra.core.hydra_config import HydraConfig
 from towns import town_model
 
 import gsparc
-from gsparc.commands.tradeoff import _alone, task
-from gsparc.evaluation.experiment.tradeoff import Recorded, closeness
+from gsparc.commands.tradeoff import task
+from gsparc.evaluation.experiment.tradeoff import Recorded, closeness, irreducible
 from gsparc.evaluation.scores import score
 from gsparc.models import checkpoint
 from gsparc.models.baselines.distance_law import DistanceLaw
@@ -51,16 +51,6 @@ def test_dashboards_get_the_points_that_nothing_beats(swept):
     ((loggers, name, heads, rows),) = said
     assert (loggers, name, heads[:2]) == (1, "operating points", ["point", "ms p50"])
     assert len(rows) == facts["tradeoff/front"] and {len(row) for row in rows} == {len(heads)}
-
-
-def test_a_misspelt_subset_is_refused_in_words_before_anything_is_measured(field, tmp_path, monkeypatch):
-    """Without baselines it was an AttributeError, after every combination had been made."""
-    monkeypatch.setattr(
-        HydraConfig, "get", lambda: type("C", (), {"runtime": type("R", (), {"output_dir": tmp_path})})
-    )
-    config = compose(f"ckpt='{field.checkpoints[0]}'", "baselines=[]", "eval_on=tset", config="tradeoff")
-    with pytest.raises(ValueError, match="eval_on='tset' is none of train, val, test"):
-        task(config)
 
 
 def test_it_leaves_a_table_a_picture_and_a_summary(swept):
@@ -154,8 +144,8 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
 def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
     whole = gsparc.load(town_model())
     method, single = whole.method, whole.at("west").method
-    assert "of several stations is asked as it was trained" in _alone(method)[0]
-    assert "no Gaussians, sources" in _alone(DistanceLaw())[0] and not _alone(single)
+    assert "of several stations is asked as it was trained" in irreducible(method)[0]
+    assert "no Gaussians, sources" in irreducible(DistanceLaw())[0] and not irreducible(single)
 
 
 def test_a_model_of_several_stations_could_not_be_timed():

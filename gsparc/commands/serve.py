@@ -38,7 +38,7 @@ def task(config: DictConfig) -> None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
     import uvicorn
 
-    from gsparc.commands.serve.app import application
+    from gsparc.prediction.serving import application
 
     predictor = load(config.ckpt)
     predictor = predictor if config.station is None else predictor.at(config.station)

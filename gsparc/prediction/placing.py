@@ -75,9 +75,9 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
 
 def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
     """In words that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
-    given = [world[end] for end, where in queries.ends.items() if not where.degrees]
+    metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
     low, high = site.moving_box
-    wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in given), default=0.0)
+    wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in metres), default=0.0)
     side = float((high - low).max())
     if not 0 < wide <= SPECK * side:
         return None
@@ -85,8 +85,8 @@ def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -
     return f"{here}: degrees or km as x and y?"
 
 
-def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> list[tuple[int, int | None]]:
-    """(row of the places, number of a station) of each prediction; None where the model has no stations.
+def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
+    """Row of the places and number of the station (N,) int64 of each prediction; -1 without stations.
 
     Args:
         queries: a row about the station it names; where none are named, about every station.
@@ -96,27 +96,28 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> list[tu
     Raises:
         DataError: a station that the model does not have, or no row is about `wanted`.
     """
-    stations = site.stations
+    rows, stations = np.arange(len(queries)), site.stations
     if stations is None:
         if wanted is not None:
             raise DataError(f"station={wanted}: the model of {site.name} has no stations; leave it out")
-        return [(row, None) for row in range(len(queries))]
+        return rows, np.full(len(rows), -1)
     names = list(stations.name)
     only = None if wanted is None else station_number(wanted, names, len(names))
     if wanted is not None and only is None:
         raise DataError(f"station={wanted}: no such station{suggest(wanted, names)}")
     if queries.station is None:
-        every = range(len(stations)) if only is None else [only]
-        return [(row, number) for row in range(len(queries)) for number in every]
-    number_of: dict[str, int | None] = {
+        every = np.arange(len(names)) if only is None else np.array([only])
+        return np.repeat(rows, len(every)), np.tile(every, len(rows))
+    numbers = {
         name: number for number, name in enumerate(names)
-    }  # names alone: a number is one, or wrong
-    for row, word in enumerate(queries.station.tolist()):
-        if word not in number_of:
-            fault = f"{word!r} is no station of the model{suggest(word, names)}"
-            raise DataError(f"{queries.source}, column of stations, {queries.rows[row]}: {fault}")
-    pairs = [(row, number_of[word]) for row, word in enumerate(queries.station.tolist())]
-    pairs = [pair for pair in pairs if only is None or pair[1] == only]
-    if not pairs:
+    }  # by name alone: a number is a name, or wrong
+    number = np.array([numbers.get(word, -1) for word in queries.station.tolist()], np.int64)
+    if (number < 0).any():
+        row = int(np.argmax(number < 0))
+        word = str(queries.station[row])
+        fault = f"{word!r} is no station of the model{suggest(word, names)}"
+        raise DataError(f"{queries.source}, column of stations, {queries.rows[row]}: {fault}")
+    rows = rows if only is None else np.flatnonzero(number == only)
+    if not len(rows):
         raise DataError(f"station={wanted}: no row of {queries.source} is about it; leave out one of the two")
-    return pairs
+    return rows, number[rows]

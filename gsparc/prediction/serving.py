@@ -1,4 +1,4 @@
-"""The application: places in, answers out, those of many clients computed together."""
+"""A model's answers over HTTP: places in, answers out, those of many clients computed together."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Batcher:
         self.waiting: asyncio.Queue[tuple[np.ndarray, asyncio.Future]] = asyncio.Queue()
 
     async def ask(self, place: np.ndarray) -> np.ndarray:
-        """Answers (n, ...) at world places (n, 3) [m]."""
+        """Answers (n, ...) at world places (n, 3) [m]; raises what the model does."""
         found: asyncio.Future = asyncio.get_running_loop().create_future()
         self.waiting.put_nowait((place, found))
         return await found
 
     async def run(self) -> None:
-        """Until cancelled; a request whose client left is answered to nobody."""
+        """Until cancelled; a request whose client left is dropped."""
         clock = asyncio.get_running_loop().time
         while True:
             batch = [await self.waiting.get()]
@@ -65,8 +65,7 @@ class Batcher:
                 for one in batch:
                     await self._serve([one])
             elif not batch[0][1].done():
-                status = 422 if isinstance(error, ValueError) else 500
-                batch[0][1].set_exception(HTTPException(status, str(error)))
+                batch[0][1].set_exception(error)
 
 
 def application(predictor: Predictor, delay_s: float, most: int, token: str | None) -> FastAPI:
@@ -114,7 +113,10 @@ def application(predictor: Predictor, delay_s: float, most: int, token: str | No
             raise HTTPException(422, f"expected {wanted}, finite metres") from None
         if len(place) > most:
             raise HTTPException(413, f"at most {most} places")
-        found = await batcher.ask(place)
+        try:
+            found = await batcher.ask(place)
+        except Exception as error:
+            raise HTTPException(422 if isinstance(error, ValueError) else 500, str(error)) from error
         found = np.stack([found.real, found.imag], -1) if np.iscomplexobj(found) else found
         shape = {"x-shape": ",".join(map(str, found.shape))}
         if raw:

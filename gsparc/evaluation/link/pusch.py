@@ -3,34 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
+
+from gsparc.evaluation.link.adaptation import Band
 
 Prior = Callable[[], tuple[Tensor, Tensor] | None]
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 RECEIVERS = ("perfect", "ls", "lmmse", "predicted", "predicted_variance", "predicted_pilots")
-LEAST_DOUBT = 1e-6  # of a channel's power: pilots are never told that there is nothing to learn
+LEAST_VARIANCE = 1e-6  # of a channel's power: pilots always correct a little
 MODULATIONS = {"qpsk": 5, "qam16": 14}  # MCS of table 1: rates 0.37 and 0.54
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """What became of n blocks at one Eb/N0.
-
-    Attributes:
-        ebno_db: [dB].
-        position: (n,) index of each block's position.
-        failed: by receiver, (n,) bool, the transport block's checksum was wrong.
-        bit_errors: by receiver, (n,) share of wrong bits.
-    """
-
-    ebno_db: float
-    position: np.ndarray
-    failed: dict[str, np.ndarray]
-    bit_errors: dict[str, np.ndarray]
 
 
 class Pusch:
@@ -89,44 +74,40 @@ class Pusch:
         return float(self.grid.num_pilot_symbols) / float(self.grid.num_resource_elements)
 
     def _known_channel(self, name: str) -> Estimator:
-        """An estimator that was told the channel beforehand."""
+        """An estimator that knows the channel beforehand."""
         return lambda y, no: self._known[name]
 
-    def run(
-        self,
-        true: Tensor,
-        predicted: Tensor,
-        variance: Tensor,
-        ebno_db: float,
-        position: np.ndarray,
-        batch: int,
-    ) -> Blocks:
-        """Send a block over each of `position` (n,): indices into channels (P, K) and variances (P,)."""
+    def run(self, band: Band, ebno_db: float, position: np.ndarray, batch: int) -> pd.DataFrame:
+        """Send a block over each of `position` (n,), indices into the band.
+
+        Returns:
+            A row per block and receiver: `ebno_db` [dB], `position`, `receiver`, `failed` (whether the
+            transport block's checksum was wrong) and `wrong` (share of wrong bits).
+        """
         from sionna.phy.channel import ApplyOFDMChannel
         from sionna.phy.utils import ebnodb2no
 
         no = ebnodb2no(ebno_db, self.bits, self.rate, self.grid)
-        apply = ApplyOFDMChannel(add_awgn=True)
-        failed: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
-        wrong: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
+        apply, parts = ApplyOFDMChannel(add_awgn=True), []
         for start in range(0, len(position), batch):
-            at = torch.from_numpy(position[start : start + batch])
-            scale = true[at].abs().square().mean(1).sqrt()[:, None]
-            there, guess = (self._slots(h[at] / scale) for h in (true, predicted))
-            sure = torch.zeros(1)
-            doubt = (variance[at] / scale[:, 0] ** 2).view(-1, *[1] * 6).expand(there.shape).contiguous()
+            rows = position[start : start + batch]
+            at = torch.from_numpy(rows)
+            scale = band.true[at].abs().square().mean(1).sqrt()[:, None]
+            self._prior = band.predicted[at] / scale, band.variance[at] / scale[:, 0] ** 2
+            there, guess = (self._slots(h[at] / scale) for h in (band.true, band.predicted))
+            exact, doubt = torch.zeros(1), self._prior[1].view(-1, *[1] * 6).expand(there.shape).contiguous()
             self._known = {
-                "perfect": (there, sure), "predicted": (guess, sure), "predicted_variance": (guess, doubt)
+                "perfect": (there, exact), "predicted": (guess, exact), "predicted_variance": (guess, doubt)
             }  # fmt: skip
-            self._prior = predicted[at] / scale, variance[at] / scale[:, 0] ** 2
             sent, bits = self.transmitter(len(at))
             received = apply(sent, there, no)
             for name, receiver in self.receivers.items():
                 decoded, fine = receiver(received, no)
-                failed[name].append(~fine.bool().flatten().cpu().numpy())
-                wrong[name].append((decoded != bits).double().mean(-1).flatten().cpu().numpy())
-        joined = [{name: np.concatenate(x) for name, x in parts.items()} for parts in (failed, wrong)]
-        return Blocks(ebno_db, position, *joined)
+                failed = ~fine.bool().flatten().cpu().numpy()
+                wrong = (decoded != bits).double().mean(-1).flatten().cpu().numpy()
+                own = {"position": rows, "receiver": name, "failed": failed, "wrong": wrong}
+                parts.append(pd.DataFrame({"ebno_db": ebno_db, **own}))
+        return pd.concat(parts, ignore_index=True)
 
     def _slots(self, channel: Tensor) -> Tensor:
         """(n, K) as [n, rx 1, rx_ant 1, tx 1, tx_ant 1, 14, K]."""
@@ -160,9 +141,9 @@ class _Wiener:
         energy = self.pilots.abs().square().sum(0)
         matched = (heard * self.pilots.conj()).sum(1) / energy
         noise = float(torch.as_tensor(no).flatten()[0]) / energy.double()
-        told = None if self.prior is None else self.prior()
-        mean, variance = (torch.zeros(1, self.whole.shape[0]), torch.ones(1)) if told is None else told
-        variance = variance.double().clamp_min(LEAST_DOUBT)[:, None]
+        prior = None if self.prior is None else self.prior()
+        mean, variance = (torch.zeros(1, self.whole.shape[0]), torch.ones(1)) if prior is None else prior
+        variance = variance.double().clamp_min(LEAST_VARIANCE)[:, None]
         # In units of the prior variance: R_c (R_cc + N / v)^-1, a matrix for each position with its own.
         known = self.whole[self.comb][:, self.comb] + torch.diag_embed(
             (noise / variance).to(self.whole.dtype)

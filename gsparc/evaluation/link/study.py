@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
-from gsparc.commands.link.adaptation import Adaptation, Band, Rates, Rule
-from gsparc.commands.link.pusch import Blocks, Pusch
+from gsparc.evaluation.link.adaptation import Adaptation, Band, Rates, Rule
+from gsparc.evaluation.link.pusch import Pusch
 from gsparc.prediction.risk_threshold import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
 FALLBACK = "lmmse"
+LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 dB off, not infinitely
 
 
-def crossing(x: np.ndarray, rate: np.ndarray, target: float = 0.1) -> float | None:
-    """Where a falling curve (n,) first crosses `target`, linear in its logarithm; None if it never does."""
-    floor = np.maximum(rate, 1e-6)
+def crossing(rate: pd.Series, target: float = 0.1) -> float | None:
+    """Where a falling curve over its index first crosses `target`, linear in its logarithm; None: never."""
+    x, floor = rate.index.to_numpy(), np.maximum(rate.to_numpy(), 1e-6)
     for i in range(len(x) - 1):
         if floor[i] > target >= floor[i + 1]:
             share = np.log(floor[i] / target) / np.log(floor[i] / floor[i + 1])
@@ -28,15 +29,18 @@ def crossing(x: np.ndarray, rate: np.ndarray, target: float = 0.1) -> float | No
     return None
 
 
-@dataclass(frozen=True)
-class Curve:
-    """Block and bit error rates of one receiver over some positions."""
+def gain(true: Tensor, predicted: Tensor) -> Tensor:
+    """Power gain over one average antenna, beams from `predicted` (n, A, K): mean over tones (n,), linear."""
+    weight = predicted / torch.linalg.vector_norm(predicted, dim=1, keepdim=True).clamp_min(1e-30)
+    received = (true * weight.conj()).sum(1).abs().square()
+    single = true.abs().square().mean(1)
+    return received.mean(1) / single.mean(1).clamp_min(1e-30)
 
-    ebno_db: np.ndarray
-    bler: np.ndarray
-    ber: np.ndarray
-    errors: np.ndarray
-    blocks: np.ndarray
+
+def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
+    """What is lost against beams from the true channel (n,) [dB], at most 100; NaN where that is silent."""
+    best = gain(true, true)
+    return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))
 
 
 def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[str, Any]:
@@ -93,11 +97,11 @@ def adapt(
         raise ValueError("every test channel of this antenna is silent: there is no rate to adapt")
     noises = [median / 10 ** (level / 10) for level in snr_db]
     # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
-    carried = {
+    delivered = {
         c: sum(loop.rates(aside, n, c, "expected").chosen_bps.mean() for n in noises)
         for c in settings["care"]
     }
-    care = max(carried, key=lambda c: carried[c])
+    care = max(delivered, key=lambda c: delivered[c])
     found: dict[Rule, list[Rates]] = {"expected": [], "target": []}
     for noise in noises:
         found["expected"].append(loop.rates(band, noise, care, "expected"))
@@ -116,8 +120,8 @@ def rate_facts(found: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: n
     facts: dict[str, Any] = {}
     for rule, ones in found.items():
         for one in ones:
-            room = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
-            facts |= {f"{room}/{name}": value for name, value in _rates_of(one, accepted, score).items()}
+            stem = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
+            facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted, score).items()}
     return facts
 
 
@@ -147,9 +151,9 @@ def _rates_of(one: Rates, accepted: np.ndarray, score: np.ndarray) -> dict[str, 
     return facts
 
 
-def _shortfall(taken: np.ndarray, oracle: np.ndarray) -> float | None:
+def _shortfall(chosen: np.ndarray, oracle: np.ndarray) -> float | None:
     """Share of the oracle's throughput that is missed; None where nothing can be carried."""
-    return float(1 - taken.mean() / oracle.mean()) if len(oracle) and oracle.mean() > 0 else None
+    return float(1 - chosen.mean() / oracle.mean()) if len(oracle) and oracle.mean() > 0 else None
 
 
 def _by_regret(one: Rates) -> dict[str, float | None]:
@@ -168,116 +172,89 @@ def _by_regret(one: Rates) -> dict[str, float | None]:
 
 
 def transmit(
-    pusch: Pusch, true: Tensor, predicted: Tensor, variance: Tensor, levels: list[float],
-    sizes: tuple[int, int, int], tick: Callable[[str], None],
-) -> list[Blocks]:  # fmt: skip
-    """Blocks at every Eb/N0: a few everywhere, all where curves fall; channels (P, K).
+    pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int], tick: Callable[[str], None]
+) -> pd.DataFrame:
+    """Blocks at every Eb/N0, as of `Pusch.run`: a few everywhere, all where curves fall.
 
     Args:
+        band: of the positions that blocks are sent over, by turns.
         sizes: blocks of the coarse look, of a full point, and of a batch.
-        tick: told what is being done.
+        tick: called with what is being done.
     """
     coarse, fine, batch = sizes
-    order = np.arange(max(coarse, fine)) % len(true)
-    found = []
+    order = np.arange(max(coarse, fine)) % len(band.true)
+    parts = []
     for level in levels:
         tick(f"{level:g} dB")
-        some = pusch.run(true, predicted, variance, level, order[:coarse], batch)
-        worst = max(
-            some.failed[name].mean() for name in ("perfect", "predicted")
-        )  # it may have an error floor
-        if fine > coarse and STEEP[0] < worst and some.failed["perfect"].mean() < STEEP[1]:
-            rest = pusch.run(true, predicted, variance, level, order[coarse:fine], batch)
-            some = Blocks(
-                level, np.concatenate([some.position, rest.position]),
-                {name: np.concatenate([some.failed[name], rest.failed[name]]) for name in some.failed},
-                {name: np.concatenate([e, rest.bit_errors[name]]) for name, e in some.bit_errors.items()},
-            )  # fmt: skip
-        found.append(some)
-    return found
+        parts.append(pusch.run(band, level, order[:coarse], batch))
+        rate = parts[-1].groupby("receiver").failed.mean()
+        worst = max(rate["perfect"], rate["predicted"])  # which may have an error floor
+        if fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]:
+            parts.append(pusch.run(band, level, order[coarse:fine], batch))
+    return pd.concat(parts, ignore_index=True)
 
 
-def curves(found: list[Blocks], accepted: np.ndarray) -> dict[str, Curve]:
-    """Curves by name: each receiver on all and on accepted positions, prediction with fallback on all."""
+def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:
+    """Each receiver's curve on all and on accepted positions, and prediction with fallback on all.
 
-    def curve(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> Curve:
-        """Of the failed blocks and the shares of wrong bits at every Eb/N0."""
-        failed, wrong = zip(*parts, strict=True)
-        bler, ber = (np.array([x.mean() if len(x) else np.nan for x in some]) for some in (failed, wrong))
-        errors, blocks = np.array([f.sum() for f in failed]), np.array([len(f) for f in failed])
-        return Curve(np.array([b.ebno_db for b in found]), bler, ber, errors, blocks)
-
-    wanted: dict[str, Curve] = {}
-    taken = [accepted[b.position] for b in found]
-    for name in found[0].failed:
-        every = [(b.failed[name], b.bit_errors[name]) for b in found]
-        wanted[name] = curve(every)
-        wanted[f"{name}@accepted"] = curve((f[t], w[t]) for (f, w), t in zip(every, taken, strict=True))
-    wanted["fallback"] = curve(
-        (np.where(t, b.failed["predicted"], b.failed[FALLBACK]),
-         np.where(t, b.bit_errors["predicted"], b.bit_errors[FALLBACK]))
-        for b, t in zip(found, taken, strict=True)
-    )  # fmt: skip
-    return wanted
+    A curve's index is the Eb/N0 [dB], its columns `bler`, `ber` (NaN without a block), `errors`, `blocks`.
+    """
+    parts: dict[str, pd.DataFrame] = {}
+    for name, own in blocks.groupby("receiver", sort=False):
+        parts[str(name)], parts[f"{name}@accepted"] = own, own[accepted[own.position]]
+    pilots = parts[FALLBACK]
+    parts["fallback"] = pd.concat([parts["predicted@accepted"], pilots[~accepted[pilots.position]]])
+    levels, counts = blocks.ebno_db.unique(), {"errors": 0, "blocks": 0}
+    columns = {
+        "bler": ("failed", "mean"), "ber": ("wrong", "mean"), "errors": ("failed", "sum"),
+        "blocks": ("failed", "size"),
+    }  # fmt: skip
+    return {
+        name: part.groupby("ebno_db").agg(**columns).reindex(levels).fillna(counts)
+        for name, part in parts.items()
+    }
 
 
-def pusch_facts(modulation: str, drawn: Mapping[str, Curve]) -> dict[str, Any]:
+def pusch_facts(modulation: str, drawn: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
     """`pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %, and how far behind perfect."""
     facts: dict[str, Any] = {}
-    crossings = {name: crossing(curve.ebno_db, curve.bler) for name, curve in drawn.items()}
+    crossings = {name: crossing(curve.bler) for name, curve in drawn.items()}
     for name, curve in drawn.items():
-        room, at = f"pusch/{modulation}/{name}", crossings[name]
+        stem, at = f"pusch/{modulation}/{name}", crossings[name]
         reference = crossings["perfect@accepted" if name.endswith("@accepted") else "perfect"]
-        facts[f"{room}/ebno_at_bler_0.1"] = at
-        facts[f"{room}/behind_perfect_db"] = None if at is None or reference is None else at - reference
-        for i, level in enumerate(curve.ebno_db):
-            bler, ber = (None if np.isnan(rate[i]) else float(rate[i]) for rate in (curve.bler, curve.ber))
-            low, high = binomial_interval(int(curve.errors[i]), int(curve.blocks[i]))
-            there = {
-                "bler": bler, "bler_low": low, "bler_high": high, "ber": ber, "blocks": int(curve.blocks[i])
-            }  # fmt: skip
-            facts |= {f"{room}/{level:g}dB/{key}": value for key, value in there.items()}
+        facts[f"{stem}/ebno_at_bler_0.1"] = at
+        facts[f"{stem}/behind_perfect_db"] = None if at is None or reference is None else at - reference
+        for level, row in curve.iterrows():
+            low, high = binomial_interval(int(row.errors), int(row.blocks))
+            point = {key: None if np.isnan(row[key]) else float(row[key]) for key in ("bler", "ber")}
+            point |= {"bler_low": low, "bler_high": high, "blocks": int(row.blocks)}
+            facts |= {f"{stem}/{level:g}dB/{key}": value for key, value in point.items()}
     return facts
 
 
-def acceptance(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> dict[str, np.ndarray]:
-    """Block error rates of the surest `shares` by `score` (P,), by receiver, with `share` and `ebno_db`.
+def acceptance(
+    blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]
+) -> tuple[float, pd.DataFrame]:
+    """The Eb/N0 [dB] where perfect knowledge fails in about a tenth, and block error rates there.
 
-    At the Eb/N0 where perfect knowledge fails in about a tenth.
+    Of the surest `shares` of positions by `score` (P,), the index; receivers are the columns.
     """
-    rates = np.array([b.failed["perfect"].mean() for b in found])
-    at = found[int(np.argmin(np.abs(np.log(np.maximum(rates, 1e-3) / 0.1))))]
-    surest = [score[at.position] >= np.quantile(score, 1 - share) for share in shares]
-    curves = {name: np.array([failed[t].mean() for t in surest]) for name, failed in at.failed.items()}
-    return {"share": shares, "ebno_db": np.array(at.ebno_db), **curves}
+    perfect = blocks[blocks.receiver == "perfect"].groupby("ebno_db", sort=False).failed.mean()
+    level = float(np.log(perfect.clip(1e-3) / 0.1).abs().idxmin())
+    there = blocks[blocks.ebno_db == level]
+    rates = {share: _surest(there, score, share).groupby("receiver").failed.mean() for share in shares}
+    return level, pd.DataFrame(rates).T
 
 
-def tradeoff(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> dict[str, Any]:
+def tradeoff(blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]) -> dict[str, Any]:
     """`<share>/behind_db`: dB behind perfect knowledge at 10 % failed blocks, on the surest shares."""
     facts: dict[str, Any] = {}
-    levels = np.array([b.ebno_db for b in found])
     for share in shares:
-        least = np.quantile(score, 1 - share)
-        own, perfect = (
-            crossing(levels, np.array([b.failed[name][score[b.position] >= least].mean() for b in found]))
-            for name in ("predicted", "perfect")
-        )
+        some = _surest(blocks, score, share).pivot_table("failed", "ebno_db", "receiver", sort=False)
+        own, perfect = (crossing(some[name]) for name in ("predicted", "perfect"))
         facts[f"{share:.0%}/behind_db"] = None if own is None or perfect is None else own - perfect
     return facts
 
 
-LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 dB off, not infinitely
-
-
-def gain(true: Tensor, predicted: Tensor) -> Tensor:
-    """Power gain over one average antenna, beams from `predicted` (n, A, K): mean over tones (n,), linear."""
-    weight = predicted / torch.linalg.vector_norm(predicted, dim=1, keepdim=True).clamp_min(1e-30)
-    received = (true * weight.conj()).sum(1).abs().square()
-    single = true.abs().square().mean(1)
-    return received.mean(1) / single.mean(1).clamp_min(1e-30)
-
-
-def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
-    """What is lost against beams from the true channel (n,) [dB], at most 100; NaN where that is silent."""
-    best = gain(true, true)
-    return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))
+def _surest(blocks: pd.DataFrame, score: np.ndarray, share: float) -> pd.DataFrame:
+    return blocks[score[blocks.position] >= np.quantile(score, 1 - share)]

@@ -13,6 +13,7 @@ from torch import Tensor
 from gsparc.data.datasets.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.evaluation.link.adaptation import Band
 from gsparc.models.image_sources.phase_offsets import estimate
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
@@ -48,6 +49,10 @@ class Channels:
         at = torch.from_numpy(index)
         rest = self.variance[at], self.confidence[at], self.source
         return Channels(self.true[at], self.predicted[at], *rest)
+
+    def band(self) -> Band:
+        """The first antenna's; what states no variance is taken for exact."""
+        return Band(self.true[:, 0], self.predicted[:, 0], self.variance.nan_to_num(0.0))
 
 
 def channels(

@@ -1,0 +1,97 @@
+"""`gsparc bench`: timings of kernels and queries as ratios to the machine's limit."""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+from rich.table import Table
+
+from gsparc.commands.output import run_directory
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.summary import provenance, shown, table, write_summary
+from gsparc.ops.native import instruction_set
+from gsparc.prediction.bench.claims import Claim, cases, claims
+from gsparc.prediction.bench.measure import Machine, Row, facts, measure
+from gsparc.prediction.timing import ClockSettings, machine_facts, peak_memory
+
+log = logging.getLogger(__name__)
+
+QUICK = {"counts": [200, 400], "batches": [1, 2], "threads": [1], "rounds": 2, "budget_s": 0.01}
+ROWS = ("N", "batch", "threads", "kernel", "end to end", "PyTorch", "limit", "kernel / limit")
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    if config.quick:
+        config = config.copy()
+        config.update(QUICK)
+    clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
+    machine, before, rows = Machine(), machine_facts()["machine/load"], list[Row]()
+    gc.collect()
+    gc.freeze()  # what the imports left behind is not searched again in the middle of a call
+    for case in cases(config.counts, config.projections, config.batches):
+        for turn, threads in enumerate(config.threads):
+            references = turn == 0 and not config.quick
+            rows.append(measure(case, machine, threads, clock, references=references))
+        log.info("%s: %.3g ms, %.1f x the limit", case.key, float(rows[-1].kernel.mean()), rows[-1].over)
+    promises = [
+        (f"{projection}, {threads} threads", claim)
+        for projection, threads in product(config.projections, config.threads)
+        for claim in claims(projection, list(config.counts), threads, max(config.batches), machine, clock)
+    ]
+    found: dict[str, Any] = {**machine_facts(), **peak_memory(), **provenance()}
+    found |= {"machine/instruction_set": instruction_set(), "machine/load_before": before}
+    for row in rows:
+        found |= facts(row)
+    for where, claim in promises:
+        stem = f"claim/{claim.name}/{where}".replace(",", "").replace(" ", "_")
+        found |= {f"{stem}/ratio": claim.ratio, f"{stem}/promised": claim.bound, f"{stem}/met": claim.met}
+    run_dir, console = run_directory(), open_console()
+    write_summary(run_dir / "summary.json", found)
+    tables = rows_table(rows), claims_table(promises)
+    (run_dir / "bench.md").write_text(page(found, tables[::-1]), encoding="utf-8")
+    tables[0].title = f"{found['machine/cpu']}, {found['machine/instruction_set']}"
+    console.print(*tables, sep="\n")
+    return found
+
+
+def rows_table(rows: Sequence[Row]) -> Table:
+    """Every row: time, limit, ratio."""
+    found = table("", ["operation", "projection"], ROWS, [])
+    found.caption = "ms, median; limit: see gsparc/prediction/bench/measure.py"
+    for row in rows:
+        case, whole = row.case, None if row.whole is None else float(np.median(row.whole))
+        numbers = case.count, case.batch, row.threads, f"{np.median(row.kernel):.3g}", shown(whole, ".3g")
+        reference = (case.unaffordable or "-") if row.reference is None else f"{row.reference:.3g}"
+        ratio = reference, f"{row.limit:.3g} ({row.bound})", f"{row.over:.1f}"
+        found.add_row(case.name, case.projection, *map(str, numbers), *ratio)
+    return found
+
+
+def claims_table(claims: Sequence[tuple[str, Claim]]) -> Table:
+    """Every promise and whether it holds here."""
+    found = table("Promises", ["promise", "where"], ["ratio", "promised", "met"], [])
+    for where, claim in claims:
+        bound = f"{'at least' if claim.at_least else 'at most'} {claim.bound:g}"
+        cells = claim.name, where, f"{claim.ratio:.2f}", bound, "yes" if claim.met else "no"
+        found.add_row(*cells, style=None if claim.met else "yellow")
+    return found
+
+
+def page(facts: Mapping[str, object], tables: Sequence[Table]) -> str:
+    """Tables as Markdown, under the machine, its load and the commit they were measured at."""
+    load = f"load per core {facts['machine/load_before']:.2f} before and {facts['machine/load']:.2f} after"
+    head = f"{facts['machine/cpu']}, {facts['machine/instruction_set']}, {facts['machine/cores']} cores"
+    lines = [f"# {head}, {load}, commit {facts['git']}"]
+    lines += ["", "Ratios of interleaved rounds (fastest fifth), times in ms (median)."]
+    for columns in (found.columns for found in tables):
+        rule = ["---:" if column.justify == "right" else "---" for column in columns]
+        cells = zip(*(column.cells for column in columns), strict=True)
+        lines += ["", *(f"| {' | '.join(row)} |" for row in ([str(c.header) for c in columns], rule, *cells))]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,100 @@
+"""`gsparc link ckpt=FILE`: rate adaptation, PUSCH and beams with predicted channels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from rich.progress import Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from gsparc.commands.output import finish, run_directory
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.evaluation.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
+from gsparc.evaluation.link.run import LinkStudy
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.summary import shown, table, write_summary
+
+RATES = {
+    "oracle_mbps": ("oracle Mbit/s", ".1f"), "chosen_mbps": ("chosen", ".1f"), "shortfall": ("short", ".1%"),
+    "shortfall_accepted": ("short, accepted", ".1%"), "tbler": ("TBLER", ".1%"), "outage": ("outage", ".1%"),
+}  # fmt: skip
+BEAMS = {
+    "gain_db": "gain dB", "predicted_gain_db": "predicted", "loss_db": "loss dB", "loss_db_mean": "mean loss",
+    "loss_db_p95": "95 %", "loss_db_max": "worst", "loss_db_accepted": "mean, accepted",
+}  # fmt: skip
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """All three experiments on one checkpoint; returns the facts of `summary.json`."""
+    if find_spec("sionna") is None:
+        raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
+    RunSettings.of(config)
+    torch.manual_seed(int(config.seed))
+    run_dir, settings = run_directory(), plain(config)
+    run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
+    started = time.perf_counter()
+    study = LinkStudy(run, settings)
+    facts = {**run.facts(), **study.facts, **study.beams()}
+    title = f"{run.data.site.name}, {study.method.name}"
+    levels = settings["mcs"]["snr_db"]
+    points = {name: values for name, values in settings["pusch"]["ebno_db"].items() if values}
+    drawn, surest = {}, {}
+    columns = *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
+    with Progress(*columns) as bar:
+        adapting = bar.add_task("rate adaptation", total=len(levels), now="")
+        rates, own = study.rates(lambda: bar.advance(adapting))
+        facts |= own | {"time/mcs_s": time.perf_counter() - started}
+        draw_rates(rates["expected"], study.score, title, run_dir / "mcs.png")
+        write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
+        sending = bar.add_task("PUSCH", total=sum(map(len, points.values())), now="")
+        for modulation, ebno_db in points.items():
+
+            def tick(now: str, modulation: str = modulation) -> None:
+                bar.update(sending, advance=1, now=f"{modulation} {now}")
+
+            drawn[modulation], surest[modulation], own = study.send(modulation, ebno_db, tick)
+            facts |= own
+            write_summary(run_dir / "summary.json", facts)
+    if drawn:
+        draw_errors(drawn, title, run_dir / "bler.png")
+        draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
+    facts["time/total_s"] = time.perf_counter() - started
+    return finish(run_dir, facts, *tables(facts, title, list(points), levels))
+
+
+def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
+    """Rates, block errors and beams; what was not computed has no table."""
+    kind = facts["confidence/kind"]
+    accepted = f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {kind}"
+    rates = [
+        [
+            f"{level:g}",
+            *(shown(facts.get(f"mcs/{level:.0f}dB/{key}"), form) for key, (_, form) in RATES.items()),
+        ]
+        for level in levels
+    ]
+    heads = ["median SNR dB", *(head for head, _ in RATES.values())]
+    found = [table(f"{title}: throughput, {accepted}", [], heads, rates)]
+    if modulations:
+        keys = ("ebno_at_bler_0.1", "behind_perfect_db")
+        errors = [
+            [label, *(shown(facts[f"pusch/{m}/{name}/{key}"], ".2f") for m in modulations for key in keys)]
+            for name, (label, _, _) in STYLES.items()
+            if f"pusch/{modulations[0]}/{name}/behind_perfect_db" in facts
+        ]
+        heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
+        numbers = [column for modulation in modulations for column in (modulation, "behind")]
+        found.append(table(heading, ["receiver"], numbers, errors))
+    antennas = sorted(
+        int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
+    )
+    if antennas:
+        beams = [[str(n), *(shown(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas]
+        heads = ["antennas", *BEAMS.values()]
+        found.append(table("maximum-ratio beams, all test positions", [], heads, beams))
+    return found

@@ -1,1 +1,0 @@
-"""`gsparc predict ckpt=FILE places=FILE`: see `command.py`."""

@@ -1,1 +1,0 @@
-"""A model's answers over HTTP (extra `serve`)."""

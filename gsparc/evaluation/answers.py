@@ -1,0 +1,267 @@
+"""Predictions at the places of a file, station by station, and their CSV or npz file."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.errors import DataError
+from gsparc.data.executor import each
+from gsparc.data.files import whole_file
+from gsparc.data.query_places import QueryPlaces, read_query_places
+from gsparc.data.schema import End, Kind, Site
+from gsparc.evaluation.intervals import in_decibels
+from gsparc.evaluation.summary import write_samples
+from gsparc.models.method import Prediction
+from gsparc.prediction.placing import far_outside, in_a_speck, in_world, stations_of, with_heights
+from gsparc.prediction.predictor import Predictor
+
+log = logging.getLogger(__name__)
+
+CHUNK = 512  # places predicted at a time
+MOST_ENTRIES = 16  # of a channel, as columns of a table
+ENDINGS = (".csv", ".npz")
+
+
+@dataclass(frozen=True)
+class Answers:
+    """N predictions in the order of their places.
+
+    Attributes:
+        place: (N,) int64, row of the places.
+        station: (N,) names; None where the model has no stations.
+        mean: (N, ...) in the units of the measurements.
+        variance: (N,) float64, expected squared error per entry; None where the method has none.
+        confidence: (N,) float32; None where the method has none.
+    """
+
+    place: np.ndarray
+    station: np.ndarray | None
+    mean: np.ndarray
+    variance: np.ndarray | None
+    confidence: np.ndarray | None
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+
+def predict(
+    predictor: Predictor,
+    places: str | Path,
+    out: str | Path | None = None,
+    *,
+    station: str | None = None,
+    columns: dict[str, object] | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Predict at the places of a file and write the answers; what was guessed is logged.
+
+    Args:
+        predictor: of the model.
+        places: see `read_query_places`.
+        out: *.csv or *.npz; None: beside the places.
+        station: name or number of the only one to predict.
+        columns: of a table of places, by quantity, where a guess will not do.
+        overwrite: whether a file that is there may be replaced.
+
+    Returns:
+        Facts for `summary.json`.
+
+    Raises:
+        DataError: anything that is wrong with the places, the station or the file to write.
+    """
+    site, places = predictor.site, Path(places)
+    path = target(None if out is None else str(out), places, overwrite)
+    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
+    queries = with_heights(read_query_places(places, moving, columns or {}), site)
+    for note in _notes(queries, site):
+        log.info("%s: %s", places, note)
+    world = in_world(queries, site)
+    row, number = stations_of(queries, site, station)
+    named = station is not None or queries.station is not None
+    far, margin = far_outside(world, site)
+    found = answers(predictor, queries, world, row, number, named, partial(check_fits, path, site.kind))
+    speck = in_a_speck(queries, world, site)
+    if speck is not None:
+        log.warning("%s: %s", places, speck)
+    if far.any():
+        log.warning(
+            "%s: %d of %d places lie more than %.3g m outside the box of the training places, the first in "
+            "%s: expect little of the predictions there",
+            places, int(far.sum()), len(far), margin, queries.rows[int(np.argmax(far))],
+        )  # fmt: skip
+    write(path, queries, found, site.kind)
+    facts = {
+        "predict/places": len(queries), "predict/predictions": len(found),
+        "predict/far_outside": int(far.sum()),
+        "predict/stations": 0 if found.station is None else len(np.unique(found.station)),
+        "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
+        "places": str(places), "out": str(path),
+    }  # fmt: skip
+    level = decibels(found)[0] if site.kind == "rssi" else np.zeros(0)
+    level = level[np.isfinite(level)]
+    if len(level):
+        facts |= {"predict/lowest_db": float(level.min()), "predict/highest_db": float(level.max())}
+    return facts
+
+
+def _notes(queries: QueryPlaces, site: Site) -> list[str]:
+    notes, origin = list(queries.notes), site.georeference
+    if origin is not None and not any(where.degrees for where in queries.ends.values()):
+        notes.append(f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees")
+    if queries.station is not None and site.stations is None:
+        notes.append("not used: stations; the model has none")
+    return notes
+
+
+def answers(
+    predictor: Predictor,
+    queries: QueryPlaces,
+    world: dict[End, np.ndarray],
+    row: np.ndarray,
+    number: np.ndarray,
+    named: bool,
+    accept: Callable[[tuple[int, ...]], None],
+) -> Answers:
+    """Predict; stations that cannot be are left out, which is logged.
+
+    Args:
+        predictor: of the model.
+        queries: for messages.
+        world: (n, 3) [m] by end.
+        row, number: (N,) of each prediction, see `stations_of`.
+        named: whether somebody asked for these stations; then one without a model is refused.
+        accept: raises where predictions of a shape are not wanted; called after the first ones.
+
+    Raises:
+        DataError: a station that was asked for had too few training rows, or none has a model.
+    """
+    stations = predictor.site.stations
+    blocks: list[tuple[Predictor, np.ndarray]] = []
+    silent: list[str] = []
+    for one in np.unique(number):
+        chosen = np.flatnonzero(number == one)
+        try:
+            own = predictor if stations is None else predictor.at(stations.name[one])
+        except ValueError as error:
+            if named:
+                raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
+            silent.append(f"left out: {error}")
+            continue
+        blocks += [(own, rows) for rows in np.split(chosen, range(CHUNK, len(chosen), CHUNK))]
+    if not blocks:
+        raise DataError(silent[0])
+
+    def predicted(block: int) -> Prediction:
+        own, rows = blocks[block]
+        ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
+        return own.predict(**ends)
+
+    parts: list[tuple[np.ndarray, Prediction]] = []
+    for block, prediction in each(predicted, range(len(blocks)), "blocks of places"):
+        if not parts:
+            accept(tuple(prediction.mean.shape[1:]))
+        parts.append((blocks[block][1], prediction))
+    for line in silent:
+        log.warning(line)
+    rows = np.concatenate([rows for rows, _ in parts])
+    order = np.argsort(rows, kind="stable")
+    whole = Prediction.joined([prediction for _, prediction in parts], torch.from_numpy(order))
+    variance, confidence = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
+    rows = rows[order]
+    names = None if stations is None else np.array(stations.name)[number[rows]]
+    return Answers(row[rows], names, whole.mean.numpy(), variance, confidence)
+
+
+def target(out: str | None, places: Path, overwrite: bool) -> Path:
+    """Where predictions go: `out`, or beside the places.
+
+    Raises:
+        DataError: another ending, the places themselves, or a file that is there already.
+    """
+    path = places.with_name(f"{places.stem}.predicted.csv") if out is None else Path(out)
+    if path.suffix.lower() not in ENDINGS:
+        raise DataError(f"out={path}: expected a name ending in {' or '.join(ENDINGS)}")
+    if path.exists() and path.samefile(places):
+        raise DataError(f"out={path}: these are the places themselves; give another out=FILE")
+    if path.exists() and not overwrite:
+        raise DataError(f"out={path}: is there already; say overwrite=true, or another out=FILE")
+    return path
+
+
+def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
+    """Refuse what is no table: spectra, and channels of many entries."""
+    if path.suffix.lower() == ".npz":
+        return
+    count = int(np.prod(shape))
+    if kind == "spectrum":
+        size = " x ".join(map(str, shape))
+        raise DataError(f"out={path}: spectra of {size} directions are no columns; say out=FILE.npz")
+    if kind == "csi" and count > MOST_ENTRIES:
+        size = f"{shape[0]} antennas x {shape[1]} subcarriers"
+        raise DataError(f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz")
+
+
+def write(path: Path, queries: QueryPlaces, found: Answers, kind: Kind) -> None:
+    """Write all predictions, whole or not at all."""
+    archive = path.suffix.lower() == ".npz"
+    columns = _places(queries, found)
+    if kind == "rssi":
+        named = zip(("rssi_db", "rssi_db_std"), decibels(found), strict=True)
+        columns |= {name: values.astype(np.float32) for name, values in named if values is not None}
+    elif found.variance is not None:
+        columns[f"{kind}_std"] = np.sqrt(found.variance).astype(np.float32)
+    if archive and kind != "rssi":
+        columns[kind] = found.mean
+    elif kind == "csi":
+        columns |= _entries(found.mean)
+    columns |= {} if found.confidence is None else {"confidence": found.confidence}
+    if not archive:
+        write_samples(path, {name: _cells(values) for name, values in columns.items()})
+        return
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **columns)
+
+
+def decibels(found: Answers) -> tuple[np.ndarray, np.ndarray | None]:
+    """Level and standard deviation (N,) [dB] of powers, NaN where the power is 0; None without a variance."""
+    power = found.mean[:, 0].astype(np.float64)
+    variance = np.zeros(len(power)) if found.variance is None else found.variance
+    level, spread = in_decibels(np.where(power > 0, power, np.nan), variance)
+    return level, None if found.variance is None else spread
+
+
+def _places(queries: QueryPlaces, found: Answers) -> dict[str, np.ndarray]:
+    """Coordinates as they were given, and the station."""
+    columns = {} if queries.name is None else {"row_name": queries.name[found.place]}
+    for end, where in queries.ends.items():
+        before = "" if len(queries.ends) == 1 else f"{end}_"
+        axes = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
+        for axis, values in zip(axes, where.all().T, strict=True):
+            columns[before + axis] = values[found.place]
+    return columns if found.station is None else {**columns, "station": found.station}
+
+
+def _entries(channels: np.ndarray) -> dict[str, np.ndarray]:
+    """Real and imaginary parts; numbers of antenna and subcarrier where there are several."""
+    columns: dict[str, np.ndarray] = {}
+    for place in np.ndindex(channels.shape[1:]):
+        counts = zip(place, channels.shape[1:], strict=True)
+        number = "".join(f"_{index}" for index, count in counts if count > 1)
+        entry = channels[:, *place]
+        columns |= {f"csi_re{number}": entry.real, f"csi_im{number}": entry.imag}
+    return columns
+
+
+def _cells(values: np.ndarray) -> list[object]:
+    """Text of numbers with as many digits as tell them from their neighbours; NaN stays a number."""
+    if values.dtype.kind != "f":
+        return values.tolist()
+    return [value if np.isnan(value) else str(value) for value in values]

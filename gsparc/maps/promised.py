@@ -1,0 +1,101 @@
+"""The promise of a map: stored with its model or gathered anew, and what its reader must know."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from gsparc.data.errors import DataError
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.evaluation.open_runs import open_files
+from gsparc.maps.field_map import FieldMap
+from gsparc.maps.intervals import Coverage
+from gsparc.maps.promise import Promise, PromiseSettings, gather, stored_promise
+from gsparc.models import checkpoint
+from gsparc.models.method import Method
+from gsparc.models.registry import build
+from gsparc.training.context import FitContext
+
+log = logging.getLogger(__name__)
+
+
+def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
+    """The evidence stored with a model, or gathered from its training data and then stored.
+
+    Args:
+        path: the model's file.
+        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of conf/map.yaml.
+
+    Raises:
+        DataError: the training data are gone, or are others.
+    """
+    how = PromiseSettings(**settings["promise"])
+    if not settings["promised"]:
+        return None
+    stored = checkpoint.read(path)
+    found = None if settings.get("renew") else stored_promise(stored.extra)
+    if found is not None and how.block_m in (None, found.block_m):
+        return found
+    if "model" not in stored.configuration:
+        raise DataError(
+            f"{path}: does not say how it was trained; say promised=false for a map without promise"
+        )
+    method, make, data, fold, context = trained(path, settings["dataset"])
+    log.info("a promise for this map: %d fits without blocks of places", how.folds)
+    found = gather(method, make, data, fold, how, context)
+    found.coverage(how.share)  # too little evidence is said before anything is stored
+    found.keep(path)
+    return found
+
+
+def trained(
+    path: str, dataset: dict[str, Any]
+) -> tuple[Method, Callable[[], Method], Measurements, Fold, FitContext]:
+    """A model, an unfitted copy, the very data and rows that it was trained on, and how.
+
+    Raises:
+        DataError: they are gone, or are others.
+    """
+    try:
+        run = open_files([path], dataset)
+    except (ValueError, OSError) as error:
+        raise DataError(
+            f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
+        ) from None
+    if run.learned != 0 or run.foreign is not None:
+        raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
+    config = run.stored[0].configuration
+    context = FitContext(
+        seed=int(config.get("seed", 0)), budget_s=config.get("budget_s"),
+        budget_clock=config.get("budget_clock", "wall"), stations=config.get("stations", "each"),
+    )  # fmt: skip
+    make = partial(build, config["model"], trusted=False)
+    return run.methods[0], make, run.data, run.split.folds[0], context
+
+
+def notes_of(found: FieldMap, coverage: Coverage | None) -> list[str]:
+    """What a reader of the map must know."""
+    notes = [*found.notes]
+    figures = found.figures()
+    share = figures["map/server_unsure"]
+    if share and len(found.stations) > 1:
+        notes.append(
+            f"best_server: in {share:.1%} of the cells (hatched) the station named is less likely than not "
+            "the strongest and above its floor; noise_db=... says where noise lies"
+        )
+    if coverage is None:
+        own = "intervals are the model's own deviations, and places far from data are not refused"
+        return [*notes, f"no promise: {own}"]
+    ours = f"{coverage.share:.1%} did (mean width {coverage.width_db:.1f} dB"
+    own = f"the model's own deviations: {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB)"
+    notes.append(
+        f"in {found.share:.0%} of the cells a measurement is promised to lie in its interval: of "
+        f"{coverage.rows} rows in {coverage.blocks} held-out blocks {ours}; {own}"
+    )
+    if figures["map/refused"]:
+        cells = f"{figures['map/refused']} of {int(found.grid.inside.sum())} cells"
+        notes.append(f"{cells} are refused: too far from what was measured")
+    return notes

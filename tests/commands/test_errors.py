@@ -1,0 +1,105 @@
+"""What a command refuses: one line that says what is wrong, status 1, nothing half-written."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from doors import assert_refused, knock
+from towns import town_model
+
+from gsparc.commands.listing import COMMANDS
+
+MAP = "map ckpt={town}"
+LOCATE = "locate calibrate=0 ckpt={spectra}"
+PRINTS = "locate calibrate=0 dataset=fingerprints"
+HALL = f"{PRINTS} dataset.split=walks dataset.file={{prints}}/walks.npz"
+COMPARE = "compare +datasets.own.file={file} splits.random.datasets=[own] cells={folder}/cells"
+REFUSED = [
+    ("evaluate ckpt=none.ckpt", "^error: none.ckpt: no such checkpoint$"),
+    ("study kind=efects", "kind=efects: no such choice; did you mean 'effects'?"),
+    ("study baselines=[gpp]", "baselines=['gpp']: a list of methods is needed, 'gpp' is none"),
+    ("study model.field.count=-1", "model.field.count=-1: a whole number of at least 0"),
+    ("report", "runs is not set; give runs=..."),
+    ("serve ckpt=none.ckpt host=0.0.0.0", "others reach it; set GSPARC_TOKEN, or say token=WORD"),
+    # Without baselines it was an AttributeError, after every combination had been made.
+    ("tradeoff ckpt={spectra} baselines=[] eval_on=tset", "eval_on='tset' is none of train, val, test"),
+    (f"{COMPARE} only=[own/random/meen/*]", "matches no cell"),
+    (f"{COMPARE} only=[own/random/mean/*] train=false", "no cell is filled"),
+    (f"{MAP} step_m=0", "above 0 metres"),
+    (f"{MAP} stations=[nord]", "no station 'nord'"),
+    (f"{MAP} plan=missing.png", "no such file"),
+    (f"{MAP} plan_points=[[0,0,0,0],[1,1,1,1]]", "goes with an image"),
+    (f"{MAP} promise.share=1.5", "share=1.5"),
+    (f"{MAP} dataset.file=gone.npz renew=true", "gone.npz"),
+    ("plan ckpt={town} count=0", "at least 1"),
+    ("place ckpt={town}", "train with stations=together"),
+    ("locate calibrate=0", "ckpt is not set"),
+    ("locate calibrate=0 ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
+    (f"{LOCATE} prior=wall", "prior='wall': one of box, trained is needed"),
+    (f"{LOCATE} share=1.5", "share=1.5: a number above 0 and below 1"),
+    (f"{LOCATE} share=many", "share='many': a number"),
+    (f"{LOCATE} offset_db=-1", "offset_db=-1: a number of at least 0"),
+    (f"{LOCATE} calibrate=-1", "calibrate=-1: a whole number of at least 0"),
+    (f"{LOCATE} rows=0", "rows=0: a whole number of at least 1"),
+    (f"{LOCATE} track=perhaps", "track='perhaps': one of true, false"),
+    (f"{LOCATE} against=[wknn]", "against='wknn': one of nearest, knn, weighted_knn"),
+    (f"{LOCATE} data=none.npz", "none.npz: no such file"),
+    (f"{LOCATE} data={{prints}}/walks.npz", "walks.npz"),
+    (PRINTS, "give dataset.file=FILE, and no ckpt"),
+    (f"{HALL} ckpt={{spectra}}", "give dataset.file=FILE, and no ckpt"),
+    (f"{PRINTS} dataset.file=none.npz", "none.npz: no such file"),
+    (f"{PRINTS} dataset.file={{prints}}/text.npz", "text.npz"),
+    (f"{PRINTS} dataset.file={{prints}}/table.csv", "no column LATITUDE"),
+    (f"{PRINTS} dataset.file={{prints}}/unplaced.npz", "position: missing"),
+    (f"{PRINTS} dataset.file={{prints}}/silent.npz", "no row heard an access point"),
+    (f"{PRINTS} dataset.file={{prints}}/loud.npz", "found 100 in row"),
+    (f"{PRINTS} dataset.file={{prints}}/short.npz", "position: expected shape"),
+    (f"{PRINTS} dataset.file={{prints}}/endless.npz", "finite coordinates"),
+    (f"{PRINTS} dataset.file={{prints}}/timeless.npz track=true", "does not say when its rows were heard"),
+    (f"{HALL} data={{prints}}/others.npz", "no access point of"),
+    (f"{HALL} dataset.split=walk", "'walk' is none of .*; did you mean 'walks'"),
+    (f"{HALL} dataset.split=released", "split=released: the file names no such rows"),
+    (f"{HALL} dataset.held_out=2", "dataset.held_out=2: a number above 0 and below 1"),
+    (f"{HALL} dataset.side_m=-1 dataset.split=blocks", "dataset.side_m=-1: a number above 0"),
+]
+
+
+@pytest.fixture(scope="module")
+def prints(fingerprints, tmp_path_factory) -> Path:
+    """Fingerprints of a hall, and beside them one spoilt file each."""
+    folder = tmp_path_factory.mktemp("prints")
+    level, position = fingerprints["rss_dbm"], fingerprints["position"]
+    changes = {
+        "walks": {},
+        "unplaced": {"position": None},
+        "timeless": {"time_s": None},
+        "silent": {"rss_dbm": np.full_like(level, np.nan)},
+        "loud": {"rss_dbm": np.where(np.isnan(level), 100, level)},
+        "short": {"position": position[1:]},
+        "others": {"access_point": np.array([f"x{name}" for name in fingerprints["access_point"]])},
+        "endless": {"position": np.full_like(position, np.inf)},
+    }
+    for name, change in changes.items():
+        parts = {key: part for key, part in {**fingerprints, **change}.items() if part is not None}
+        np.savez(folder / f"{name}.npz", **parts)
+    (folder / "table.csv").write_text("WAP001,LONGITUDE\n-60,1\n")
+    (folder / "text.npz").write_text("no archive")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(prints, spectra_gp, spectra_file) -> dict[str, Path]:
+    """What stands in braces above."""
+    return {"town": town_model(), "spectra": spectra_gp, "prints": prints, "file": spectra_file}
+
+
+@pytest.mark.parametrize(("line", "message"), REFUSED)
+def test_what_cannot_be_done_is_one_line(line, message, made, tmp_path, monkeypatch):
+    monkeypatch.delenv("GSPARC_TOKEN", raising=False)
+    name, *overrides = line.format(**made, folder=tmp_path).split()
+    overrides = [f"hydra.run.dir={tmp_path / 'run'}", *overrides]
+    pattern = message if message.startswith("^") or ".*" in message else re.escape(message)
+    assert_refused(knock(COMMANDS[name].run, name, overrides), pattern, tmp_path / "run")
