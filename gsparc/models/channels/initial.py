@@ -341,8 +341,8 @@ class _Search:
             for gain in GAINS if direct else GAINS[:1]:
                 if tried and budget.over(LENGTHS_SHARE):
                     break
-                lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
-                trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
+                envelope, vary = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
+                trial = replace(values, envelope=envelope, gain=vary)
                 tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
         return self._moved(self._fitted(min(tried, key=lambda each: each[1])[0]))
 
