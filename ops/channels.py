@@ -75,7 +75,7 @@ def _outputs(fixed: Any, gains: Tensor, steering: Tensor, delays: Tensor) -> Ten
     return fill("channels", gains, out, gains, steering, delays, tones)
 
 
-def _gradients(fixed: Any, slope: Tensor, outputs: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+def _gradients(fixed: Any, slope: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
     out = tuple(part.new_empty(part.shape) for part in inputs)
     return fill("channels_backward", slope, out, slope, *inputs, fixed[0])
 

@@ -64,9 +64,7 @@ def _outputs(_: None, encoded: Tensor, *weights: Tensor) -> Tensor:
     return fill("networks", encoded, out, encoded, layers)
 
 
-def _gradients(
-    _: None, slope: Tensor, outputs: Tensor, encoded: Tensor, *weights: Tensor
-) -> tuple[Tensor | None, ...]:
+def _gradients(_: None, slope: Tensor, encoded: Tensor, *weights: Tensor) -> tuple[Tensor | None, ...]:
     layers = Layers(*weights)
     return None, *fill("networks_backward", encoded, empty_like(layers), slope, encoded, layers)
 

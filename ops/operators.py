@@ -88,29 +88,35 @@ class _Gradient(torch.autograd.Function):
 
 class _Operator(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, operator, gradient, fixed, *tensors):
+    def forward(ctx, operator, gradient, reads_outputs, fixed, *tensors):
         outputs = operator(fixed, *tensors)
         ctx.gradient, ctx.fixed = gradient, fixed
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*(outputs if isinstance(outputs, tuple) else (outputs,)), *tensors)
+        ctx.save_for_backward(*(outputs if reads_outputs else ()), *tensors)
         return outputs
 
     @staticmethod
     def backward(ctx, *slopes):
         if all(slope is None for slope in slopes):
             return (None,) * len(ctx.needs_input_grad)
-        return None, None, None, *_Gradient.apply(ctx.gradient, ctx.fixed, *slopes, *ctx.saved_tensors)
+        gradients = _Gradient.apply(ctx.gradient, ctx.fixed, *slopes, *ctx.saved_tensors)
+        return None, None, None, None, *gradients
 
 
 def differentiable(
-    operator: Callable[..., Any], gradient: Callable[..., Any], fixed: Any, *tensors: Tensor | None
+    operator: Callable[..., Any],
+    gradient: Callable[..., Any],
+    fixed: Any,
+    *tensors: Tensor | None,
+    reads_outputs: bool = False,
 ) -> Any:
-    """`operator(fixed, *tensors)`; `gradient(fixed, *slopes, *outputs, *tensors)` is its derivative.
+    """`operator(fixed, *tensors)`; `gradient(fixed, *slopes, *tensors)` is its derivative.
 
-    A slope is None where nothing depends on that output; at least one is given.
+    A slope is None where nothing depends on that output; at least one is given. Where the gradient reads the
+    outputs they stand behind the slopes, and nobody may write into them.
     """
     if torch.is_grad_enabled():
-        return _Operator.apply(operator, gradient, fixed, *tensors)
+        return _Operator.apply(operator, gradient, reads_outputs, fixed, *tensors)
     return operator(fixed, *tensors)
 
 
@@ -178,7 +184,8 @@ def composite_gradient(
 
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W), transmittance (P, H, W) of features (B, N, C); `means2d` only gets a gradient."""
-    return differentiable(_composite, composite_gradient, plan, means2d, features, *gaussians)
+    inputs = means2d, features, *gaussians
+    return differentiable(_composite, composite_gradient, plan, *inputs, reads_outputs=True)
 
 
 def _weights(plan: Plan, *parts: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,16 +195,11 @@ def _weights(plan: Plan, *parts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _weights_gradient(
-    plan: Plan,
-    grad_seen: Tensor | None,
-    grad_total: Tensor | None,
-    seen: Tensor,
-    total: Tensor,
-    *parts: Tensor,
+    plan: Plan, grad_seen: Tensor | None, grad_total: Tensor | None, *parts: Tensor
 ) -> Gaussians:
-    gaussians = Gaussians(*parts)
-    slopes = [torch.zeros_like(seen) if slope is None else slope for slope in (grad_seen, grad_total)]
-    return fill("weights_backward", seen, empty_like(gaussians), plan, gaussians, *slopes)
+    gaussians, size = Gaussians(*parts), (plan.num_poses, plan.num_gaussians)
+    slopes = [gaussians.means.new_zeros(size) if s is None else s for s in (grad_seen, grad_total)]
+    return fill("weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes)
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
