@@ -228,7 +228,7 @@ def levels_at(
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
     parts = []
     for part in _chunks(places, CHUNK):
-        ends: dict[str, Any] = {**ends_of(predictor.site, part, other, station)}
+        ends: dict[str, Any] = dict(ends_of(predictor.site, part, other, station).items())
         parts.append(predicted(predictor.predict(**ends), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread

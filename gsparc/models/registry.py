@@ -56,7 +56,7 @@ class _Chosen(ConfigNode):
 
 def method_node(path: str) -> dict[str, Any]:
     """What `model=` holds of the class that an import path names; some of it follows the run's settings."""
-    kind = get_class(path)
+    kind: type[Method] = get_class(path)
     return node_of(kind, kind.linked)
 
 
