@@ -16,7 +16,7 @@ from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 from gsparc.training.processes import largest, total
 from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
-from gsparc.training.tracking import noted
+from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)
 
@@ -159,7 +159,7 @@ def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int, 
             "step %d: %d Gaussians removed or split, %d added: %d -> %d",
             step, gone, len(planned.parents), before, after,
         )  # fmt: skip
-        noted(trainer, module, {"densify/removed": gone, "densify/added": len(planned.parents)})
+        log_event(trainer, module, {"densify/removed": gone, "densify/added": len(planned.parents)})
 
 
 def _sample_inside(scales: Tensor, quats: Tensor, generator: torch.Generator) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 
 from gsparc.data.limits import SHARE, Checked, setting
 from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
-from gsparc.training.tracking import noted
+from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)
 
@@ -57,4 +57,4 @@ class OpacityReset(Checked, L.Callback):
             field.version += 1
         count = int(lowered.sum())
         log.info("step %d: opacities of %d Gaussians lowered to %g", step, count, self.ceiling)
-        noted(trainer, module, {"reset/lowered": count})
+        log_event(trainer, module, {"reset/lowered": count})

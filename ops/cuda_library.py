@@ -127,7 +127,7 @@ def fingerprint(*also: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def units() -> list[str]:
+def cuda_sources() -> list[str]:
     """The sources to compile."""
     return sorted(str(unit) for unit in (SOURCES / "cuda").glob("*.cu"))
 
@@ -143,7 +143,7 @@ def build(path: Path, *architectures: str) -> None:
     targets = [target(nvcc, arch) for arch in architectures]
     LOG.info("building the CUDA kernels for sm_%s (about a minute, once)", ", sm_".join(architectures))
     started = time.perf_counter()
-    compile_to(path, [nvcc, *FLAGS, *targets, f"-I{SOURCES}", *units()])
+    compile_to(path, [nvcc, *FLAGS, *targets, f"-I{SOURCES}", *cuda_sources()])
     LOG.info("built in %.0f s: %s", time.perf_counter() - started, path)
 
 

@@ -85,7 +85,7 @@ def table(loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Sequenc
             logger.experiment.add_text(name, "\n".join(f"| {' | '.join(line)} |" for line in lines))
 
 
-def noted(trainer: L.Trainer, module: L.LightningModule, figures: Mapping[str, float]) -> None:
+def log_event(trainer: L.Trainer, module: L.LightningModule, figures: Mapping[str, float]) -> None:
     """Give the loggers the figures of an event, at the number of steps taken, not the schedule's."""
     for logger in trainer.loggers:
         logger.log_metrics(dict(figures), step=module.global_step)

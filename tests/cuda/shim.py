@@ -31,7 +31,7 @@ def library() -> cuda_library.Library:
     """The sources of the kernels, executed by fibers; built when they have changed."""
     path = KEPT / f"{fingerprint()}.so"
     if not path.exists():
-        cuda_library.compile_to(path, ["g++", *FLAGS, *INCLUDES, *cuda_library.units(), str(SHIM)])
+        cuda_library.compile_to(path, ["g++", *FLAGS, *INCLUDES, *cuda_library.cuda_sources(), str(SHIM)])
     return cuda_library.Library(path)
 
 

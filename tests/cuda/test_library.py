@@ -223,5 +223,5 @@ def test_compiles(arch, tmp_path, monkeypatch):
 
 
 def test_sources_stay_beside_the_package():
-    found = {Path(unit).stem for unit in cuda_library.units()}
+    found = {Path(unit).stem for unit in cuda_library.cuda_sources()}
     assert {"plan", "composite", "frozen", "networks", "similarity"} <= found

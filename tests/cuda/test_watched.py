@@ -140,7 +140,7 @@ def record(tmp_path_factory):
 def test_watched_kernels_have_nothing_to_report(watch, record):
     path = KEPT / f"watched-{fingerprint(*watch, REPLAY.read_text())}"
     if not path.exists():
-        compiled(path, watch, *cuda_library.units(), str(REPLAY))
+        compiled(path, watch, *cuda_library.cuda_sources(), str(REPLAY))
     done = ends(str(path), str(record))
     assert done.returncode == 0, done.stdout + done.stderr[:4000]
     assert int(done.stdout.split()[0]) > 60

@@ -42,7 +42,7 @@ class Condition:
         return self.what if self.what == "none" else f"{self.what} {self.amount:g}"
 
     @property
-    def trained(self) -> bool:
+    def changes_training(self) -> bool:
         """Whether it changes what is learned from."""
         return self.what not in ("none", "query")
 
@@ -150,12 +150,12 @@ class Study:
         seed, plain = self.seed + turn, None
         for condition in self.conditions:
             outcome = plain
-            if outcome is None or condition.trained:
+            if outcome is None or condition.changes_training:
                 folder = context.run_dir / variant / str(condition).replace(" ", "-") / str(turn)
                 settings = in_folders(replace(context, run_dir=folder, seed=seed))
                 learned_from = partial(condition.learned_from, seed=seed)
                 outcome = fit_and_score(self.variants[variant], data, split, settings, learned=learned_from)
-                plain = plain if condition.trained else outcome
+                plain = plain if condition.changes_training else outcome
             if condition.what == "query":
                 outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)
             by_condition[condition] = outcome
