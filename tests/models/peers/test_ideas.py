@@ -85,7 +85,7 @@ def test_deformed_gaussians_follow_what_moves(tmp_path, name, share):
     """A few Gaussians are enough when they move along; standing still they would show the mean picture."""
     data, fold = wandering()
     known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
-    method = fitted(name, data, fold, tmp_path, count=40, max_steps=150, rate=8e-3, octaves=1)
+    method = fitted(name, data, fold, tmp_path, count=40, max_steps=150, batch_size=8, rate=8e-3, octaves=1)
     assert error(method, data, fold.test) < share * known
 
 
