@@ -1,4 +1,4 @@
-"""What a field found to stand in a site: mirror planes, boxes, and Gaussians that paths lose power in."""
+"""What a field found to stand in a site (mirror planes, boxes), and Gaussians as they are shown."""
 
 from __future__ import annotations
 
@@ -15,34 +15,19 @@ class SiteObjects:
     Attributes:
         planes: (P, 4) of mirrors, see `gsparc.physics.mirror_planes` [unit normal; m].
         boxes: (B, 2, 3) lower and upper corners of what lets nothing through [m].
-        means: (N, 3) of Gaussians in the way [m].
-        scales: (N, 3) their standard deviations along their own axes, the third upwards [m].
-        turns: (N,) angles from x to their first axes [rad].
-        losses: (N,) what the straight path through the middle of each loses [dB]; negative: gains.
     """
 
     planes: np.ndarray
     boxes: np.ndarray
-    means: np.ndarray
-    scales: np.ndarray
-    turns: np.ndarray
-    losses: np.ndarray
 
     @classmethod
-    def of(
-        cls,
-        planes: np.ndarray | None = None,
-        boxes: np.ndarray | None = None,
-        gaussians: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None,
-    ) -> SiteObjects:
-        """Planes (P, 4), boxes (B, 2, 3), Gaussians as means, scales, turns, losses; None: there are none."""
-        flat = np.zeros(0)
+    def of(cls, planes: np.ndarray | None = None, boxes: np.ndarray | None = None) -> SiteObjects:
+        """Planes (P, 4), boxes (B, 2, 3); None: there are none."""
         planes = np.zeros((0, 4)) if planes is None else planes
-        boxes = np.zeros((0, 2, 3)) if boxes is None else boxes
-        return cls(planes, boxes, *(gaussians or (flat.reshape(0, 3), flat.reshape(0, 3), flat, flat)))
+        return cls(planes, np.zeros((0, 2, 3)) if boxes is None else boxes)
 
     def __len__(self) -> int:
-        return len(self.planes) + len(self.boxes) + len(self.means)
+        return len(self.planes) + len(self.boxes)
 
     def joined(self, other: SiteObjects) -> SiteObjects:
         """These and others."""

@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.collections import PatchCollection
-from matplotlib.colors import TwoSlopeNorm
-from matplotlib.patches import Ellipse, Polygon, Rectangle
+from matplotlib.patches import Polygon, Rectangle
 
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
@@ -19,12 +17,11 @@ from gsparc.evaluation.site_plan import still_ends
 
 INCHES = 6.5  # longer side of the map
 UPRIGHT = 0.3  # vertical part of a unit normal, below which a plane is drawn as a wall
-LEAST_DB = 0.5  # of a Gaussian that is drawn
 AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them with walls and without
 
 
 def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None) -> None:
-    """Save a map of mirror planes, boxes and Gaussians over the measured places as PNG.
+    """Save a map of mirror planes and boxes over the measured places as PNG.
 
     `objects` are in local coordinates, `known` walls and boxes in those of the measurements.
     """
@@ -38,9 +35,6 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     axis.scatter(*places[:, :2].T, s=3, c="0.75", linewidths=0, label="measured places")
     if known is not None:
         _draw_known(axis, known, float(np.median(places[:, 2])))
-    drawn = _draw_gaussians(axis, objects, origin)
-    if drawn is not None:
-        figure.colorbar(drawn, ax=axis, label="loss of a path through the middle [dB]", shrink=0.85, pad=0.02)
     for number, box in enumerate(objects.boxes + origin):
         label = f"boxes found ({len(objects.boxes)})" if not number else None
         axis.add_patch(
@@ -73,27 +67,6 @@ def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndar
     heights = sorted((planes[n, 3] + planes[n, :3] @ origin) / planes[n, 2] for n in lying)
     heights_text = ", ".join(f"{height:.2f}" for height in heights)
     return f"horizontal planes at z = {heights_text} m" if heights_text else ""
-
-
-def _draw_gaussians(axis: Any, objects: SiteObjects, origin: np.ndarray) -> PatchCollection | None:
-    """Ellipses at one standard deviation, coloured by what they take."""
-    rows = np.flatnonzero(np.abs(objects.losses) >= LEAST_DB)
-    if not len(rows):
-        return None
-    rows = rows[np.argsort(np.abs(objects.losses[rows]))]  # the strongest above
-    patches = [
-        Ellipse(
-            (objects.means[i] + origin)[:2], *(2 * objects.scales[i, :2]), angle=np.degrees(objects.turns[i])
-        )
-        for i in rows
-    ]
-    most = float(np.abs(objects.losses[rows]).max())
-    collection = PatchCollection(
-        patches, cmap="PuOr_r", norm=TwoSlopeNorm(0.0, -most, most), alpha=0.6, edgecolor="0.3", linewidth=0.3
-    )
-    collection.set_array(objects.losses[rows])
-    axis.add_collection(collection)
-    return collection
 
 
 def _draw_known(axis: Any, known: SceneWalls, height: float) -> None:

@@ -150,11 +150,7 @@ def _cloud_parts(cloud: GaussianCloud, legends: dict[str, Legend], extent: float
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
-    """What colours mean, and those (N, 3) uint8 of Gaussians: losses, or emissions below the strongest."""
-    if "[dB]" in cloud.label:
-        most = max(float(np.abs(cloud.strengths).max(initial=0.0)), 1e-3)
-        legend = Legend(cloud.label, -most, most, "PuOr_r")
-        return legend, legend.of(cloud.strengths)
+    """What colours mean, and those (N, 3) uint8 of Gaussians by emission, below the strongest."""
     most = float(np.abs(cloud.strengths).max(initial=0.0))
     level = 20 * np.log10(np.maximum(np.abs(cloud.strengths), most * 1e-6 + 1e-300) / (most or 1.0))
     legend = Legend(f"{cloud.label} [dB of the strongest]", -RANGE_DB, 0.0, "plasma")
@@ -163,7 +159,7 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
 
 @torch.no_grad()
 def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
-    """Gaussians in world coordinates: those that are rendered, or those that paths lose power in."""
+    """Gaussians that are rendered, in world coordinates; None: of a model without."""
     predictor = viewed.predictor_of(station)
     method, site = predictor.method, predictor.site
     if isinstance(method, HasGaussians):
@@ -172,15 +168,7 @@ def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> 
             return replace(found, means=found.means + site.origin)
         except ValueError:
             pass  # of this kind are only some of those that it fits
-    objects = method.objects()
-    if not len(objects.means):
-        return None
-    half = objects.turns / 2
-    quats = np.column_stack([np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)])
-    share = 1 - 10 ** (-np.abs(objects.losses) / 20)
-    label = "loss through the middle [dB]"
-    means = objects.means + site.origin
-    return GaussianCloud(means, objects.scales, quats, share, objects.losses, label)
+    return None
 
 
 def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]:

@@ -1,4 +1,4 @@
-"""What stands on the straight line between two places: known walls, boxes that were found, and Gaussians."""
+"""What stands on the straight line between two places: known walls, and boxes that were found."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 
 APART_M = 0.5  # faces that are nearer to each other along a line are sides of one wall [m]
@@ -71,22 +70,3 @@ def fans(faces: Sequence[np.ndarray]) -> np.ndarray:
     """Triangles (T, 3, 3) of flat faces (C, 3), each a fan about its first corner."""
     triangles = [face[[0, i, i + 1]] for face in faces for i in range(1, len(face) - 1)]
     return np.array(triangles).reshape(-1, 3, 3)
-
-
-def crossed_losses(objects: SiteObjects, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Losses (N,) [dB] of Gaussians on the straight line between two local places (3,) [m].
-
-    What a line through the middle loses, times exp(-d^2 / 2) of its least distance d in standard deviations.
-    """
-    cos, sin = np.cos(objects.turns), np.sin(objects.turns)
-
-    def own(vector: np.ndarray) -> np.ndarray:
-        x, y, z = vector.T
-        return np.column_stack([cos * x + sin * y, cos * y - sin * x, z]) / objects.scales
-
-    begin = own(start - objects.means)
-    along = own(np.broadcast_to(end - start, objects.means.shape))
-    square = np.maximum((along**2).sum(1), 1e-30)
-    share = np.clip(-(begin * along).sum(1) / square, 0, 1)
-    nearest = begin + share[:, None] * along
-    return np.asarray(objects.losses * np.exp(-0.5 * (nearest**2).sum(1)))

@@ -9,16 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.site_objects import SiteObjects
 from gsparc.maps.pictures import Legend
 from gsparc.view.answer import SILENT_DB, Answer, azimuth_elevation
 from gsparc.view.building import SURFACES
-from gsparc.view.crossed import Obstacles, crossed_losses
+from gsparc.view.crossed import Obstacles
 from gsparc.view.scene import Faces, Part
 
 NEAREST_M = 0.1  # where a distance law ends
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
-LEAST_LOSS_DB = 0.5  # of a Gaussian that is counted
 
 
 @dataclass(frozen=True)
@@ -72,16 +70,12 @@ class Surroundings:
     Attributes:
         usual: what was measured at what distance; None without data.
         values: (n,) what was measured [dB], of spectra their means; NaN where nothing was heard.
-        objects: that the model found, local coordinates.
-        origin: (3,) of the local coordinates, world [m].
         walls: that are known, and boxes that the model found, world; None: neither.
         unit: of powers.
     """
 
     usual: Usual | None = None
     values: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    objects: SiteObjects = field(default_factory=SiteObjects.of)
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     walls: Obstacles | None = None
     unit: str = "dB"
 
@@ -124,12 +118,7 @@ def _between(answer: Answer, here: np.ndarray, there: np.ndarray, about: Surroun
         lines.append(
             f"the straight path crosses {walls or 'no'} {'wall or box' if walls == 1 else 'walls or boxes'}"
         )
-    if len(about.objects.means):
-        crossed = crossed_losses(about.objects, here - about.origin, there - about.origin)
-        strong = crossed[np.abs(crossed) >= LEAST_LOSS_DB]
-        word = "Gaussian that takes" if len(strong) == 1 else "Gaussians that take"
-        lines.append(f"the straight path crosses {len(strong)} {word} {crossed.sum():.1f} dB by the model")
-    elif weak and about.walls is None and answer.paths is None:
+    elif weak and answer.paths is None:
         lines.append(
             "what takes the rest is not known: this model holds no obstacles, and no walls=FILE is given"
         )

@@ -94,13 +94,12 @@ class SiteView:
             levels = values if viewed.site.kind in MAPPED else np.full(len(values), np.nan)
             known = usual(measured.places, levels, viewed.others(name))
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        objects, origin = viewed.predictor_of(name).method.objects(), viewed.site.origin
         faces = () if self.given.walls is None else self.given.walls.faces
-        boxes = objects.boxes + origin
+        boxes = viewed.predictor_of(name).method.objects().boxes + viewed.site.origin
         if self.given.walls is not None:
             boxes = np.concatenate([boxes, self.given.walls.boxes])
         walls = Obstacles.of(SceneWalls(faces, boxes)) if len(faces) or len(boxes) else None
-        about = Surroundings(known, values, objects, origin, walls, self.unit)
+        about = Surroundings(known, values, walls, self.unit)
         return StationView(scene, measured, about, power)
 
     def extent(self, name: str | None) -> float:
