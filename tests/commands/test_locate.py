@@ -49,6 +49,7 @@ def column(rows, name):
     return np.array([float(row[name]) for row in rows])
 
 
+@pytest.mark.slow
 def test_places_areas_and_pictures_are_written(trained, tmp_path):
     against = "against=[nearest,weighted_knn]"
     facts, rows = located(tmp_path, f"ckpt={trained}", "calibrate=2", against)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from gsparc.locate.calibration import calibrated
@@ -31,6 +32,7 @@ def looked(values, cells):
     return [Looked(cells, found.of(number)) for number in range(len(values))]
 
 
+@pytest.mark.slow
 def test_areas_hold_the_promised_share():
     rng = np.random.default_rng(0)
     cells = cover(CORNERS, 900, False)

@@ -56,6 +56,7 @@ def test_peak_is_between_middles_of_cells():
     assert found.peak()[2] == 1.5
 
 
+@pytest.mark.slow
 def test_errors_of_recorded_places_widen_an_area():
     cells = cover(PLACES, 20_000, False)
     sharp = gaussians(cells, [[2.0, 1.0]])

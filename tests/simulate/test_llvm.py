@@ -50,6 +50,7 @@ def test_missing_sionna_names_the_remedy(monkeypatch):
         llvm.prepare()
 
 
+@pytest.mark.slow
 def test_imports_leave_the_ray_tracer_alone():
     """Only `gsparc.simulate` may, and even there not before it is asked to trace."""
     code = (

@@ -112,6 +112,7 @@ def test_one_field_of_all_ends_is_better_than_plain_processes():
     assert answer_error(field, data, fold.test) < 0.7 * answer_error(plain, data, fold.test)
 
 
+@pytest.mark.slow
 def test_an_end_that_was_never_heard_has_the_direct_wave():
     data = _ceiling(ends=9, turned=0.2)
     known, left = np.flatnonzero(data.station < 7), np.flatnonzero(data.station >= 7)
@@ -128,6 +129,7 @@ def test_an_end_that_was_never_heard_has_the_direct_wave():
     assert found.unknown.mean() > 3 * heard.unknown.mean()
 
 
+@pytest.mark.slow
 def test_phases_that_nothing_tells_leave_little_to_say_of_an_end():
     data = _ceiling(ends=9, turned=30.0)
     field, _ = initialise(data, np.flatnonzero(data.station < 7), QUICK)
@@ -141,6 +143,7 @@ def test_phases_that_nothing_tells_leave_little_to_say_of_an_end():
     assert overlap > 0.3  # its shape is right
 
 
+@pytest.mark.slow
 def test_runs_of_all_ends_differ_by_one_phase():
     runs = np.arange(80) % 2
     data = _ceiling(runs=runs)

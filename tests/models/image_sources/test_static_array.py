@@ -169,6 +169,7 @@ def test_rotated_array_and_tones(tmp_path):
         method.fit(turned, fold, FitContext(tmp_path))
 
 
+@pytest.mark.slow
 def test_antennas_with_phases_of_their_own(tmp_path):
     """Cables of unknown length: no source was found."""
     data, fold = _uplink(100)
@@ -205,6 +206,7 @@ def _ofdm(count, noise):
     return data, make_split(data.moving, SplitSettings(seed=0)).folds[0]
 
 
+@pytest.mark.slow
 def test_ofdm_with_hardly_any_noise(tmp_path):
     """It ended in "cholesky: not positive-definite": rows over noise exceeded what float32 can add to 1."""
     data, fold = _ofdm(100, 1e-9)
