@@ -16,7 +16,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Expected, check_layout
 from gsparc.data.errors import DataError, nearest, reason, some
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import LABELS
+from gsparc.data.schema import FLAGS, LABELS
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables import is_table
 
@@ -30,7 +30,7 @@ LAYOUT = {
     "rss_dbm": Expected(("S", "P")),
     "position": Expected(("S", "D"), place=True),
     "access_point": Expected(("P",), LABELS, optional=True),
-    "test": Expected(("S",), "b", optional=True),
+    "test": Expected(("S",), FLAGS, optional=True),
     "time_s": Expected(("S",), optional=True),
 }
 UNPLACED = LAYOUT | {"position": Expected(("S", "D"))}  # NaN where nobody knows
@@ -111,7 +111,7 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         raise DataError(f"{path}, access_point: a name twice in {some(list(names))}; expected each once")
     return Fingerprints(
         level=level, position=np.pad(position, ((0, 0), (0, 3 - dimensions))), **numbers,
-        test=checked.get("test", np.zeros(count, bool)),
+        test=checked.get("test", np.zeros(count)).astype(bool),
         time_s=checked.get("time_s", np.zeros(count)).astype(np.float64),
         access_point=names,
     )  # fmt: skip

@@ -49,6 +49,7 @@ def test_archive_is_read(tmp_path):
         ({"floor": np.zeros(3, np.int64)}, "floor: expected 4 whole numbers"),
         ({"floor": np.zeros(4)}, "floor: expected 4 whole numbers, found float64"),
         ({"access_point": np.array(["a", "a"])}, "expected each once"),
+        ({"test": np.array(["no"] * 4)}, "test: expected True and False"),  # was a KeyError
     ],
 )
 def test_bad_archives_are_refused_in_one_line(tmp_path, other, said):
