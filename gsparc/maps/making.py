@@ -228,8 +228,8 @@ def levels_at(
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
     parts = []
     for part in _chunks(places, CHUNK):
-        ends: dict[str, Any] = dict(ends_of(predictor.site, part, other, station).items())
-        parts.append(predicted(predictor.predict(**ends), predictor.site.kind))
+        ends = ends_of(predictor.site, part, other, station)
+        parts.append(predicted(predictor.predict(rx=ends.get("rx"), tx=ends.get("tx")), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread
 
