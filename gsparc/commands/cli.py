@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import logging
 import os
@@ -12,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial, wraps
 from types import FrameType
 
 import hydra
@@ -25,6 +25,7 @@ from gsparc.commands.plugins import offer, offer_scenes
 from gsparc.commands.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, one_line
 
+WHILE_LOGGING = 0.01  # [s] until an interrupt that came inside `logging` is tried again
 LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
 
 
@@ -89,7 +90,14 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
         yield  # nothing arrives here, or Ctrl-C is ignored
         return
 
+    later: list[threading.Timer] = []
+
     def noted(signum: int, frame: FrameType | None) -> object:
+        if _in_logging(frame):  # whose lock every thread needs, and would be left taken: again when it is out
+            again = partial(signal.pthread_kill, threading.get_ident(), signum)
+            later.append(threading.Timer(WHILE_LOGGING, again))
+            later[-1].start()
+            return None
         interrupts.append(signum)
         return before(signum, frame)
 
@@ -97,7 +105,15 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
     try:
         yield
     finally:
+        for timer in later:
+            timer.cancel()
         signal.signal(signal.SIGINT, before)
+
+
+def _in_logging(frame: FrameType | None) -> bool:
+    while frame is not None and frame.f_code.co_filename != logging.__file__:
+        frame = frame.f_back
+    return frame is not None
 
 
 def _began_as_interrupt(error: BaseException | None) -> bool:
@@ -137,7 +153,7 @@ def _explained(task: Callable[[DictConfig], object], config: str) -> str:
 
 
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
-    @functools.wraps(task)
+    @wraps(task)
     def wrapped(config: DictConfig) -> object:
         try:
             return task(config)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import signal
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from doors import Answer, knock
@@ -81,6 +84,21 @@ def in_compiled_code(config):
     raise ValueError("Invalid bounding box")
 
 
+def while_it_logs(config):
+    """The lock of `logging` stayed taken for good: every other thread that logged, as a server's, then hung."""
+    lock = logging._lock
+
+    class Interrupted:
+        def acquire(self):
+            lock.acquire()
+            logging._lock = lock
+            signal.raise_signal(signal.SIGINT)
+
+    logging._lock = Interrupted()
+    logging.getLogger("gsparc.never.asked").isEnabledFor(logging.INFO)
+    time.sleep(60)
+
+
 def with_advice(config):
     raise KeyboardInterrupt("go on with ckpt_path=last.ckpt")
 
@@ -90,6 +108,7 @@ def with_advice(config):
     [
         (while_a_library_cleans_up, "error: interrupted"),
         (in_compiled_code, "error: interrupted: Invalid bounding box"),
+        (while_it_logs, "error: interrupted"),
         (with_advice, "error: go on with ckpt_path=last.ckpt"),
     ],
 )
@@ -99,6 +118,8 @@ def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeyp
     answer = gsparc("train", "dataset=rfid", "model=gsparc", f"hydra.run.dir={tmp_path}")
     assert answer.status == 130 and answer.err[-1] == line
     assert signal.getsignal(signal.SIGINT) is before
+    with ThreadPoolExecutor() as other:
+        other.submit(logging.getLogger("gsparc.never.asked.either").isEnabledFor, 20).result(timeout=5)
 
 
 def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch):
