@@ -85,7 +85,7 @@ def in_compiled_code(config):
 
 
 def while_it_logs(config):
-    """The lock of `logging` stayed taken for good: every other thread that logged, as a server's, then hung."""
+    """The lock of `logging` stayed taken: every other thread that logged, as a server's, hung for good."""
     lock = logging._lock
 
     class Interrupted:
