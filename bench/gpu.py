@@ -127,11 +127,11 @@ def table(file: Path) -> None:
     sys.stdout.write("\n".join(lines) + "\n")
 
 
-def flat(found: Any, before: str = "") -> list[tuple[str, str]]:
+def flat(value: Any, before: str = "") -> list[tuple[str, str]]:
     """Nested keys joined by dots, numbers to four digits."""
-    if isinstance(found, dict):
-        return [row for key, inner in found.items() for row in flat(inner, f"{before}.{key}".lstrip("."))]
-    return [(before, f"{found:.4g}" if isinstance(found, float) else str(found).replace("\n", " ")[:300])]
+    if isinstance(value, dict):
+        return [row for key, inner in value.items() for row in flat(inner, f"{before}.{key}".lstrip("."))]
+    return [(before, f"{value:.4g}" if isinstance(value, float) else str(value).replace("\n", " ")[:300])]
 
 
 SUMMARY_WORDS = ("passed", "failed", "skipped", "SUMMARY", " error")

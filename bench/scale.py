@@ -122,9 +122,9 @@ def aside(work: Callable[[], Any]) -> None:
     os.waitpid(child, 0)
 
 
-def decibels(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+def decibels(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Squared errors (B,) of powers [dB^2]."""
-    return ((10 * np.log10(found / target)) ** 2)[:, 0]
+    return ((10 * np.log10(predicted / target)) ** 2)[:, 0]
 
 
 def powers(source: str, counts: Sequence[int], methods: Sequence[str] = POWERS) -> None:
@@ -136,10 +136,10 @@ def powers(source: str, counts: Sequence[int], methods: Sequence[str] = POWERS) 
         each(source, methods, data, fold, decibels)
 
 
-def relative(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+def relative(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Squared errors (B,) of channels or spectra, of the mean power of these targets."""
     axes = tuple(range(1, target.ndim))
-    return (np.abs(found - target) ** 2).mean(axes) / (np.abs(target) ** 2).mean()
+    return (np.abs(predicted - target) ** 2).mean(axes) / (np.abs(target) ** 2).mean()
 
 
 def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNELS) -> None:
@@ -158,9 +158,9 @@ def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNEL
         path.unlink()
 
 
-def squares(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+def squares(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Mean squared errors (B,) of spectra."""
-    return ((found - target) ** 2).mean((1, 2))
+    return ((predicted - target) ** 2).mean((1, 2))
 
 
 def spectra(folder: Path, counts: Sequence[int], methods: Sequence[str] = SPECTRA) -> None:

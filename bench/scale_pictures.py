@@ -48,6 +48,6 @@ def _curves(place: Axes, lines: pd.DataFrame, quantity: str) -> None:
     """A figure of every method against rows; slopes of seconds stand in the legend."""
     for name, own in lines.sort_values("rows", kind="stable").groupby("method", sort=False):
         errors = 2 * own["rmse_error"] if quantity == "rmse" else None
-        found = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
-        label = name if np.isnan(found) else f"{name}, slope {found:.2f}"
+        exponent = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
+        label = name if np.isnan(exponent) else f"{name}, slope {exponent:.2f}"
         place.errorbar(own["rows"], own[quantity], errors, label=label, capsize=2, **look(name).marked)

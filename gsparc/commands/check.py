@@ -41,8 +41,8 @@ def check(
     levels = link_levels(reading.data)
     steps = [] if levels is None else steps_of(levels)
     warnings = [] if levels is None else plausibility_warnings(levels, steps)
-    found = [*describe(reading.data), *(("note", note) for note in reading.notes)]
-    for topic, sentence in [*found, *(("warning", warning) for warning in warnings)]:
+    topics = [*describe(reading.data), *(("note", note) for note in reading.notes)]
+    for topic, sentence in [*topics, *(("warning", warning) for warning in warnings)]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it

@@ -53,10 +53,10 @@ def task(config: DictConfig) -> pd.DataFrame:
     with locked(cells_dir, "cells"):
         filled = fill_all(prepared, bool(settings["train"]), limit_s)
         if locating:
-            found = compare_places(filled, settings["locate"], cells_dir, locate)
-            write_samples(run_dir / "places.csv", {name: found[name].tolist() for name in found})
-            finish(run_dir, *facts_and_table(found))
-            return found
+            errors = compare_places(filled, settings["locate"], cells_dir, locate)
+            write_samples(run_dir / "places.csv", {name: errors[name].tolist() for name in errors})
+            finish(run_dir, *facts_and_table(errors))
+            return errors
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each

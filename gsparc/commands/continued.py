@@ -69,15 +69,15 @@ def once(
 def _files(dataset: Any, run_dir: Path) -> dict[str, list[int]]:
     """Number, bytes and last change [ns] of the files that settings of a dataset name, but for runs' own."""
     named = {Path(value) for value in dict(dataset or {}).values() if isinstance(value, str) and value}
-    found = {}
+    stats = {}
     for path in sorted(one.resolve() for one in named if one.exists()):
         runs = {run_dir.resolve(), *(one.parent for one in path.rglob(RECORD))}
         runs = {one for one in runs if path in one.parents}  # as with dataset.root=.
         every = path.rglob("*") if path.is_dir() else [path]
         inside = [one.stat() for one in every if one.is_file() and runs.isdisjoint(one.parents)]
         newest = max((one.st_mtime_ns for one in inside), default=0)
-        found[str(path)] = [len(inside), sum(one.st_size for one in inside), newest]
-    return found
+        stats[str(path)] = [len(inside), sum(one.st_size for one in inside), newest]
+    return stats
 
 
 def _beside(run_dir: Path, record: dict[str, Any]) -> Path | None:

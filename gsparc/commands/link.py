@@ -79,7 +79,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         for level in levels
     ]
     heads = ["median SNR dB", *(head for head, _ in RATES.values())]
-    found = [table(f"{title}: throughput, {accepted}", [], heads, rates)]
+    sections = [table(f"{title}: throughput, {accepted}", [], heads, rates)]
     if modulations:
         keys = ("ebno_at_bler_0.1", "behind_perfect_db")
         errors = [
@@ -89,12 +89,12 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         ]
         heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
         numbers = [column for modulation in modulations for column in (modulation, "behind")]
-        found.append(table(heading, ["receiver"], numbers, errors))
+        sections.append(table(heading, ["receiver"], numbers, errors))
     antennas = sorted(
         int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
     )
     if antennas:
         beams = [[str(n), *(shown(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas]
         heads = ["antennas", *BEAMS.values()]
-        found.append(table("maximum-ratio beams, all test positions", [], heads, beams))
-    return found
+        sections.append(table("maximum-ratio beams, all test positions", [], heads, beams))
+    return sections

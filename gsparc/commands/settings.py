@@ -52,7 +52,7 @@ class RunSettings(Checked):
         given = OmegaConf.to_container(config, resolve=True)
         assert isinstance(given, dict)
         known: dict[str, Any] = {f.name: given[f.name] for f in fields(cls) if f.name in given}
-        found = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
+        settings = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
         trainer = given.get("trainer") or {}
         clip = trainer.get("gradient_clip_val")
         or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
@@ -69,14 +69,14 @@ class RunSettings(Checked):
         for key, value in _leaves(given):
             if isinstance(value, float):
                 Limit("a finite number", math.isfinite).check(key, value)
-        if found.threads is not None:
-            torch.set_num_threads(found.threads)
+        if settings.threads is not None:
+            torch.set_num_threads(settings.threads)
         address = (given.get("ray") or {}).get("address")
         executor.use(Engine(given.get("engine", "process"), given.get("workers"), address))
         threadpool_limits(
             1, "blas"
         )  # NumPy's: two threads beside other work took 10 to 400 times as long as one
-        return found
+        return settings
 
 
 def _accelerators() -> list[str]:

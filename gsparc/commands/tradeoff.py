@@ -89,8 +89,8 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def _threads(given: Sequence[int] | None) -> list[int]:
-    found = sorted({1, torch.get_num_threads()}) if given is None else sorted({int(n) for n in given})
+    counts = sorted({1, torch.get_num_threads()}) if given is None else sorted({int(n) for n in given})
     cores = os.cpu_count() or 1
-    if found and found[0] >= 1 and found[-1] <= cores:
-        return found
-    raise ValueError(f"threads={found}: numbers between 1 and the {cores} cores of this machine are needed")
+    if counts and counts[0] >= 1 and counts[-1] <= cores:
+        return counts
+    raise ValueError(f"threads={counts}: numbers between 1 and the {cores} cores of this machine are needed")

@@ -63,8 +63,8 @@ def view_of(settings: dict[str, Any]) -> SiteView:
     viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
     made: tuple[Any, ...] = ()
     if settings["map"] is not None:
-        found = FieldMap.read(settings["map"])
-        made = tuple((found.grid, layer) for layer in layers(found, viewed.unit) if not layer.words)
+        field = FieldMap.read(settings["map"])
+        made = tuple((field.grid, layer) for layer in layers(field, viewed.unit) if not layer.words)
     at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
     return SiteView(viewed, given, grid_for(viewed, settings, plan), made, at, other)
 

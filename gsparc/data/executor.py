@@ -98,12 +98,12 @@ def each(
     began = logged = time.monotonic()
     if not elsewhere():
         here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
-        found = _jobs(here, threads, "threading")
+        results = _jobs(here, threads, "threading")
     else:
         blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
-        found = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
-    with closing(found):  # what has begun is cancelled
-        for count, (number, result) in enumerate(found, 1):
+        results = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
+    with closing(results):  # what has begun is cancelled
+        for count, (number, result) in enumerate(results, 1):
             if isinstance(result, Exception):
                 raise result
             ended += cost(pieces[number])

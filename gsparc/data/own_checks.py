@@ -70,9 +70,9 @@ class Checker:
             return present[0]
         if named in present:
             return str(named)
-        found = " and ".join(present) or "none of them"
+        names = " and ".join(present) or "none of them"
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
-        return self.problems.add(self.source, f"{wanted}; found {found}")
+        return self.problems.add(self.source, f"{wanted}; found {names}")
 
     def name_rows(self, rows: int) -> list[str]:
         """What messages call each row: `row_name`, or its number."""
@@ -108,9 +108,9 @@ class Checker:
         turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
         constrained = any(count is not None for shape in shapes for count in shape)
         here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
-        found = f"{array.shape}{'; transposed?' if turned else ''}"
+        actual = f"{array.shape}{'; transposed?' if turned else ''}"
         known = f" {FIELDS[name].shape}" if name in FIELDS else ""
-        self.refuse(name, f"expected shape{known}{here}, found {found}")
+        self.refuse(name, f"expected shape{known}{here}, found {actual}")
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
@@ -160,10 +160,10 @@ class Checker:
             if values is None:
                 continue
             if values.size == 0 or not np.all((values >= LOWEST_HZ) & (values <= HIGHEST_HZ)):
-                found = (
+                fault = (
                     f"{np.array2string(values, threshold=4)} is outside {LOWEST_HZ:.0e} to {HIGHEST_HZ:.0e}"
                 )
-                self.refuse(name, f"{found}; expected Hz (not MHz or GHz)")
+                self.refuse(name, f"{fault}; expected Hz (not MHz or GHz)")
                 return None, None
             if len(np.unique(values)) != values.size:
                 self.refuse(name, "the same frequency twice; expected distinct ones [Hz]")
@@ -233,9 +233,9 @@ class Checker:
         if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any():
             return self.refuse("path_offsets", "expected integers that start at 0 and never decrease")
         for name in per_path:
-            found, count = self.raw.arrays[name].shape[:1], int(offsets[-1])
-            if found != (count,):
-                return self.refuse(name, f"expected {count} paths as path_offsets says, found {found}")
+            shape, count = self.raw.arrays[name].shape[:1], int(offsets[-1])
+            if shape != (count,):
+                return self.refuse(name, f"expected {count} paths as path_offsets says, found {shape}")
         return offsets.astype(np.int64)
 
     def release_split(self, rows: int) -> tuple[np.ndarray, np.ndarray] | None:

@@ -109,14 +109,14 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     sheet.problems.raise_if_any()
     given = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
     sheet.problems.raise_if_any()
-    found = {end: where for end, where in given.items() if where is not None}
+    rest = {end: where for end, where in given.items() if where is not None}
     ends: dict[End, Places] = {}
     for end in moving:
-        named = f"{end}_" if f"{end}_" in found else ""
-        if named not in found or (len(moving) > 1 and not named and "" in ends):
+        named = f"{end}_" if f"{end}_" in rest else ""
+        if named not in rest or (len(moving) > 1 and not named and "" in ends):
             raise DataError(_missing(sheet, end, len(moving) > 1))
-        ends[end] = found.pop(named)
-    other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in found] + ["without a name"] * ("" in found)
+        ends[end] = rest.pop(named)
+    other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * ("" in rest)
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
     station = _words(sheet, chosen, "station")

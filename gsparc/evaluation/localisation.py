@@ -73,43 +73,43 @@ class Localisation:
         """Of `locate.csv`, in the world's coordinates [m]."""
         located = next(iter(self.answers.values()))
         place, true = np.array([one.place for one in located]), self.heard.place
-        found: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
+        columns: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
         if self.placed:
-            found |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
-            found |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
-        found |= {"area_m2": [one.area for one in located]}
-        found |= {"inside": [int(one) for one in inside]} if self.placed else {}
-        return {**found, "modes": [one.modes for one in located]}
+            columns |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
+            columns |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
+        columns |= {"area_m2": [one.area for one in located]}
+        columns |= {"inside": [int(one) for one in inside]} if self.placed else {}
+        return {**columns, "modes": [one.modes for one in located]}
 
 
 def report(
-    found: Localisation, against: Sequence[str], run_dir: Path
+    result: Localisation, against: Sequence[str], run_dir: Path
 ) -> tuple[dict[str, Any], list[Table], list[str]]:
     """Write `locate.csv` and pictures; facts, and where places are known, a table and a sentence of errors.
 
     Args:
-        found: what was located.
+        result: what was located.
         against: names of plain methods beside it.
         run_dir: where files go.
     """
-    (ours, located), heard, facts = next(iter(found.answers.items())), found.heard, dict(found.facts)
-    inside = [one.posterior.level(p) <= found.level for one, p in zip(located, heard.place, strict=True)]
-    write_samples(run_dir / "locate.csv", found.columns(inside))
+    (ours, located), heard, facts = next(iter(result.answers.items())), result.heard, dict(result.facts)
+    inside = [one.posterior.level(p) <= result.level for one, p in zip(located, heard.place, strict=True)]
+    write_samples(run_dir / "locate.csv", result.columns(inside))
     facts |= {
-        "locate/snapshots": len(heard), "locate/track": int(len(found.answers) > 1),
+        "locate/snapshots": len(heard), "locate/track": int(len(result.answers) > 1),
         "locate/area_m2": float(np.median([one.area for one in located])),
         "time/locate_ms_p50": float(np.median([one.seconds for one in located]) * 1e3),
     }  # fmt: skip
-    shown_at = [locating.in_world(one, found.origin) for one in located]
-    true = heard.place + found.origin if found.placed else None
-    draw_posteriors(shown_at, true, found.trained.place + found.origin, run_dir / "posteriors.png")
-    if not found.placed:
+    shown_at = [locating.in_world(one, result.origin) for one in located]
+    true = heard.place + result.origin if result.placed else None
+    draw_posteriors(shown_at, true, result.trained.place + result.origin, run_dir / "posteriors.png")
+    if not result.placed:
         return facts, [], []
-    places = {name: np.array([one.place for one in answers]) for name, answers in found.answers.items()}
+    places = {name: np.array([one.place for one in answers]) for name, answers in result.answers.items()}
     stems = {name: "locate" if name == ours else f"locate/{name}" for name in places}
     for name in against:
         stems[name] = stem = f"baseline/{name}"
-        beside = located_by(name, found.trained, heard)
+        beside = located_by(name, result.trained, heard)
         places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
     errors = {name: np.linalg.norm(place - heard.place, axis=1) for name, place in places.items()}
     facts |= {"locate/coverage": float(np.mean(inside))}
@@ -122,7 +122,7 @@ def report(
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
     sentence = (
         f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places, "
-        f"{found.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
+        f"{result.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
     )
     return facts, [table(title, ["method"], ["median [m]", "p90 [m]"], rows)], [sentence]
 
@@ -179,9 +179,9 @@ def _trust(
     )  # fmt: skip
     make = partial(build, settings.model)
     folds = int(config.calibrate)
-    found = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
-    log.info("trust learned from %d snapshots that were left out: %s", found[1], found[0])
-    return found
+    result = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
+    log.info("trust learned from %d snapshots that were left out: %s", result[1], result[0])
+    return result
 
 
 def _heard(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:

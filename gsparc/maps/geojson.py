@@ -82,14 +82,14 @@ def read_shapes(
                 lines.append(_points(line, where, origin, 2))
     if not polygons and not (lines and lines_too):
         raise DataError(f"{key}={path}: holds no polygon; draw the area as a Polygon or MultiPolygon")
-    found = Shapes(tuple(polygons), tuple(lines))
-    low, high = found.bounds()
+    shapes = Shapes(tuple(polygons), tuple(lines))
+    low, high = shapes.bounds()
     if origin is None and (high - low).max() < SPECK * site_m:
         raise DataError(
             f"{key}={path}: all of it is {(high - low).max():.2g} m wide, the site {site_m:.3g} m; the model "
             "was trained in metres about an unknown origin, which degrees mean nothing to"
         )
-    return found
+    return shapes
 
 
 def _geometries(content: Any) -> Iterator[dict[str, Any]]:

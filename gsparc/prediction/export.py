@@ -129,11 +129,11 @@ def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any =
 
 def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     """The sources of uplinks (B, U, L), physical units; see `heard`."""
-    found = _separator(method).sources(_snapshots(method, site, uplink))
+    sources = _separator(method).sources(_snapshots(method, site, uplink))
     assert site.uplink_hz is not None
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
-    gain, delay = (found.gain * site.target_scale).numpy(), (found.delay.double() / spacing).numpy()
-    return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=found.direction.numpy())
+    gain, delay = (sources.gain * site.target_scale).numpy(), (sources.delay.double() / spacing).numpy()
+    return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=sources.direction.numpy())
 
 
 def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:

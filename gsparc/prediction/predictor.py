@@ -230,12 +230,12 @@ class Predictor:
 
         if uplink is not None:
             channel = export.uplink_channels(self.method, self.site, uplink, frequency_hz)
-            found = export.on_grid(channel, self.site, None, symbols)
-            return found if isinstance(uplink, Tensor) else found.numpy()
+            answer = export.on_grid(channel, self.site, None, symbols)
+            return answer if isinstance(uplink, Tensor) else answer.numpy()
         channel = torch.as_tensor(self._ask("csi", tx, rx))
         channel = channel[None] if channel.ndim == 2 else channel
-        found = export.on_grid(channel, self.site, frequency_hz, symbols)
-        return found if any(isinstance(end, Tensor) for end in (tx, rx)) else found.numpy()
+        answer = export.on_grid(channel, self.site, frequency_hz, symbols)
+        return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
         """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
@@ -352,8 +352,8 @@ class Predictor:
                 f"call .{self.site.kind}(...)"
             )
         if grad:
-            found, single = self._followed(self.method, tx, rx)
-            return found.mean[0] if single else found.mean
+            moments, single = self._followed(self.method, tx, rx)
+            return moments.mean[0] if single else moments.mean
         query = self._query(tx, rx)
         mean = _predicted(self.method, query).mean
         scale = self.site.target_scale
@@ -385,15 +385,15 @@ class Predictor:
                 self._prepared.append(method)
                 with torch._C._DisableFuncTorch(), torch.no_grad():
                     method.predict(query.tx, query.rx)
-            found = method.predict(local.get("tx", query.tx), at)
+            moments = method.predict(local.get("tx", query.tx), at)
         dtype = torch.float32
         for value in ends.values():
             dtype = torch.promote_types(dtype, value.dtype)
         scale, own = self.site.target_scale, (self.kind or self.trusted.kind) in (None, "learned")
-        mean = (found.mean * scale).to(dtype.to_complex() if found.mean.is_complex() else dtype)
-        sure = None if found.confidence is None or not own else found.confidence.to(dtype)
+        mean = (moments.mean * scale).to(dtype.to_complex() if moments.mean.is_complex() else dtype)
+        sure = None if moments.confidence is None or not own else moments.confidence.to(dtype)
         return Prediction(
-            mean, sure, None if found.variance is None else found.variance * scale**2
+            mean, sure, None if moments.variance is None else moments.variance * scale**2
         ), query.single
 
     def _query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Query:

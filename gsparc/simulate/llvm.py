@@ -112,8 +112,8 @@ def prepare(fetch_missing: bool = False) -> Path:
     if fetch_missing and not os.environ.get(VARIABLE):
         fetch()
         return prepare()
-    found = "; ".join(faults) or "no LLVM library was found"
-    raise SimulatorMissing(f"Sionna needs LLVM 19 (15 and 16 abort): {found}; {REMEDY}")
+    causes = "; ".join(faults) or "no LLVM library was found"
+    raise SimulatorMissing(f"Sionna needs LLVM 19 (15 and 16 abort): {causes}; {REMEDY}")
 
 
 def fetch() -> None:

@@ -164,8 +164,8 @@ def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> 
     method, site = predictor.method, predictor.site
     if isinstance(method, HasGaussians):
         try:
-            found = method.gaussians(*_queries(site, measured))
-            return replace(found, means=found.means + site.origin)
+            cloud = method.gaussians(*_queries(site, measured))
+            return replace(cloud, means=cloud.means + site.origin)
         except ValueError:
             pass  # of this kind are only some of those that it fits
     return None

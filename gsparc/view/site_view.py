@@ -115,13 +115,13 @@ class SiteView:
         """World places (3,) where the ends that move first stand."""
         viewed, first = self.viewed, self.viewed.moving[-1]
         at = start_place(viewed, self.station(name).measured) if self.at is None else self.at
-        found: dict[str, np.ndarray] = {first: at}
+        places: dict[str, np.ndarray] = {first: at}
         if len(viewed.moving) > 1:
             other = (viewed.site.box + viewed.site.origin).mean(axis=0)
             if viewed.data is not None:
                 other = viewed.data.tx[len(viewed.data) // 2] + viewed.site.origin
-            found["tx"] = other if self.other is None else self.other
-        return found
+            places["tx"] = other if self.other is None else self.other
+        return places
 
     def plane(self, name: str | None, grid: Grid) -> Plane:
         """Power over all of some cells, the transmitter where it first stands if both ends move."""

@@ -34,8 +34,8 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
         levels: of powers.
         steps: `steps_of` them.
     """
-    found = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
-    return [*found, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
+    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
+    return [*warnings, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
@@ -162,7 +162,7 @@ def wild_rows(levels: LinkLevels) -> list[str]:
 
 def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
     """(station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
-    found = []
+    outliers = []
     for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
             continue
@@ -174,8 +174,8 @@ def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
         # A single row: where the neighbour differs as much it is a place, not a fault.
         bad = np.flatnonzero(wild & ~np.roll(wild, 1) & ~np.roll(wild, -1))
         if 0 < len(bad) <= max(NAMED, len(used) // 100):
-            found.append((t, used[bad], float(difference[bad].max())))
-    return found
+            outliers.append((t, used[bad], float(difference[bad].max())))
+    return outliers
 
 
 def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:

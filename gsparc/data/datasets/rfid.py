@@ -132,8 +132,8 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     while rows and not any(cell.strip() for cell in rows[-1]):
         rows.pop()
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
-        found = ",".join(rows[0]) if rows else "an empty file"
-        return problems.add(f"{path}, line 1", f"expected the header x,y,z, found {found}")
+        header = ",".join(rows[0]) if rows else "an empty file"
+        return problems.add(f"{path}, line 1", f"expected the header x,y,z, found {header}")
     if len(rows) == 1:
         return problems.add(path, "no rows; expected one position per spectrum")
     positions = np.full((len(rows) - 1, 3), np.nan)

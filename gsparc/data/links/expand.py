@@ -74,9 +74,9 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     stations = station_table(check, measured in POWERS)
     given = check.given("rx_position", "tx_position")
     if len(given) != 1:
-        found = " and ".join(given) or "neither"
+        names = " and ".join(given) or "neither"
         wanted = "expected rx_position or tx_position, of the end that moves"
-        return check.refuse("station_position", f"{wanted}; found {found}")
+        return check.refuse("station_position", f"{wanted}; found {names}")
     if stations is None:
         return None
     moving: End = "rx" if given == ["rx_position"] else "tx"

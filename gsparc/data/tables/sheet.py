@@ -330,7 +330,7 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
         fault = f"{count} heads, but every line below has {counts[0]} cells{hint}"
         raise DataError(f"{source}, line {min(lines)}: {fault}")
     problems, below = Problems(source), list(lines)[1:]
-    names = (f"line {n} ({found} cells)" for n, found in zip(below, counts, strict=True) if found != count)
+    names = (f"line {n} ({width} cells)" for n, width in zip(below, counts, strict=True) if width != count)
     mark = DELIMITERS.get(delimiter, delimiter)
     problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")
     problems.raise_if_any()

@@ -139,8 +139,8 @@ class Adaptation:
         """Transport-block error rates (n, 28); infinite where there is no such MCS."""
         allocated = torch.full((len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32)
         effective = (10 ** (effective_db / 10))[..., None]
-        found = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
-        return found[3][..., 0].cpu().double()
+        rates = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
+        return rates[3][..., 0].cpu().double()
 
     def _highest(self, fails: Tensor) -> Tensor:
         """The highest MCS (n,) that meets the target; the lowest there is where none does."""

@@ -107,8 +107,8 @@ class LinkStudy:
             channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        found = adapt(own, other, self.mcs["snr_db"], self.mcs, tick)
-        return found, rate_facts(found, self.accepted, self.score)
+        rates = adapt(own, other, self.mcs["snr_db"], self.mcs, tick)
+        return rates, rate_facts(rates, self.accepted, self.score)
 
     def send(
         self, modulation: str, levels: list[float], tick: Callable[[str], None]

@@ -102,23 +102,23 @@ def adapt(
         for c in settings["care"]
     }
     care = max(delivered, key=lambda c: delivered[c])
-    found: dict[Rule, list[Rates]] = {"expected": [], "target": []}
+    rates: dict[Rule, list[Rates]] = {"expected": [], "target": []}
     for noise in noises:
-        found["expected"].append(loop.rates(band, noise, care, "expected"))
+        rates["expected"].append(loop.rates(band, noise, care, "expected"))
         backed = {b: loop.rates(aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
-        found["target"].append(loop.rates(band, noise, max(backed, key=lambda b: backed[b])))
+        rates["target"].append(loop.rates(band, noise, max(backed, key=lambda b: backed[b])))
         tick()
-    return found
+    return rates
 
 
-def rate_facts(found: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
     """`mcs/<snr>dB/*` of rule `expected`, `mcs/<snr>dB/target/*` of the other: throughput against the oracle.
 
     `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
     most; of all positions, of accepted ones, and of all where the others send pilots.
     """
     facts: dict[str, Any] = {}
-    for rule, ones in found.items():
+    for rule, ones in rates.items():
         for one in ones:
             stem = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
             facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted, score).items()}

@@ -346,16 +346,16 @@ class _Search:
                 tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
         return self._moved(self._fitted(min(tried, key=lambda each: each[1])[0]))
 
-    def _moved(self, found: Candidate) -> Candidate:
+    def _moved(self, candidate: Candidate) -> Candidate:
         """With static ends where they really are."""
-        values = found.values
+        values = candidate.values
         if not values.direct or not self.one_end:
-            return found
+            return candidate
         offset = best_offset(self._compressed(values), values, self.wavelength)
         if offset is None:
-            return found
+            return candidate
         moved = self._fitted(replace(values, offset=offset))
-        return moved if moved.nll < found.nll else found
+        return moved if moved.nll < candidate.nll else candidate
 
     def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
@@ -377,13 +377,13 @@ class _Search:
         mirrored = replace(values, sequences=sequences, planes=planes, power=power)
         return self._without_weak(self._fitted(mirrored))
 
-    def _without_weak(self, found: Candidate) -> Candidate:
+    def _without_weak(self, candidate: Candidate) -> Candidate:
         """Without the images that have no power."""
-        values, power = found.values, found.values.power
+        values, power = candidate.values, candidate.values.power
         fixed, varying = (torch.tensor(values.where(name)) for name in ("source", "source_smooth"))
         heard = power[fixed] + power[varying] > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
-            return found
+            return candidate
         silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
         rest = power[[i for i in range(len(power)) if i not in silent]]
         seen = tuple(one for one, has in zip(values.sequences, heard.tolist(), strict=True) if has)
@@ -395,8 +395,8 @@ class _Search:
         parts = self._compressed(values)
         errors = self._crossed(parts, values)
         values, _ = fit_powers(parts, values, SHRINKAGE, 2 * SHORT)
-        found = self._fitted(_strongest(values))
-        return replace(found, errors=np.maximum(found.errors, errors))
+        after = self._fitted(_strongest(values))
+        return replace(after, errors=np.maximum(after.errors, errors))
 
     def _of_all_ends(self, kept: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
@@ -443,11 +443,11 @@ class _Search:
         values, gain = drift.with_drift(groups, known, before.values)
         errors = np.zeros((2, 1 + len(DEPTHS)))
         for group, signal in zip(groups, known, strict=True):
-            for found, at in zip(errors, (before.values, values), strict=True):
+            for sums, at in zip(errors, (before.values, values), strict=True):
                 other = disturbance(at, group).to(torch.complex128)
                 given = Conditioned.of(signal + other, group.target)
                 left = [given.left_out_signal(other, rows)[0] for rows in _groupings(group.places)]
-                found += [float(error.abs().square().mean()) / len(groups) for error in left]
+                sums += [float(error.abs().square().mean()) / len(groups) for error in left]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
         after = Candidate(values, worth - gain, errors[1])
         start = replace(before, nll=0.0, errors=errors[0])

@@ -127,9 +127,9 @@ class DirectionalGP(FramedMethod):
             known = np.sort(np.random.default_rng(self.seed).choice(known, MAX_RECEIVERS, replace=False))
         places = data.rx_position[known].astype(np.float64)
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
-        found = Rays.of(places, rays)
-        clusters = triangulate(found, self.seed)
-        seen = torch.from_numpy(clusters.seen(found))
+        all_rays = Rays.of(places, rays)
+        clusters = triangulate(all_rays, self.seed)
+        seen = torch.from_numpy(clusters.seen(all_rays))
         kept = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
         if not len(kept):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")

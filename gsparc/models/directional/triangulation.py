@@ -105,10 +105,10 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
     points: list[np.ndarray] = []
     free = np.ones(len(rays), bool)
     for _ in range(ROUNDS):
-        found = _matching_round(rays, free, error, rng)
-        if not found:
+        new = _matching_round(rays, free, error, rng)
+        if not new:
             break
-        points += found
+        points += new
         clusters = expectation_maximisation(rays, np.stack(points), error)
         points, error = list(clusters.points), clusters.error
         free = clusters.responsibility.sum(0) < 0.5
@@ -223,21 +223,21 @@ def _matching_round(rays: Rays, free: np.ndarray, error: float, rng: np.random.G
     if not len(proposed):
         return []
     gain = np.maximum(_gain(left.squared_error(proposed), error), 0).astype(np.float32)
-    score, found, failed = gain.sum(1), [], 0
+    score, points, failed = gain.sum(1), [], 0
     while failed < MAX_FAILURES and score.max() > MIN_EVIDENCE:
         top = int(score.argmax())
         near = left.take(left.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
         point, evidence = _refined(near, proposed[top], error)
         assigned = gain[top] > 0
         if evidence >= MIN_EVIDENCE:
-            found.append(point)
+            points.append(point)
             assigned |= _gain(left.squared_error(point[None])[0], error) > 0
         else:
             failed += 1
         score -= gain[:, assigned].sum(1)
         gain[:, assigned] = 0
         score[top] = 0
-    return found
+    return points
 
 
 def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, most: int) -> np.ndarray:
@@ -256,8 +256,8 @@ def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mos
         near = gap < 3 * error * np.hypot(s, t)
         i, j = np.nonzero(near)
         points.append((here + s[i, j, None] * one[i] + there + t[i, j, None] * two[j]) / 2)
-    found = np.concatenate([np.zeros((0, 3)), *points])
-    found = found[np.linalg.norm(found - rays.places.mean(0), axis=1) < REACH_M]
-    if len(found) > most:
-        found = found[rng.choice(len(found), most, replace=False)]
-    return found
+    midpoints = np.concatenate([np.zeros((0, 3)), *points])
+    midpoints = midpoints[np.linalg.norm(midpoints - rays.places.mean(0), axis=1) < REACH_M]
+    if len(midpoints) > most:
+        midpoints = midpoints[rng.choice(len(midpoints), most, replace=False)]
+    return midpoints

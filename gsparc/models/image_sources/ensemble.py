@@ -114,12 +114,12 @@ def search_many(
     try:
         running = [pool.submit(search, number) for number in range(len(row_sets))]
         _watch(running, budget)
-        found = [member for each in running if (member := each.result()) is not None]
+        members = [member for each in running if (member := each.result()) is not None]
     finally:
         stopped.set()
         pool.shutdown(cancel_futures=True)  # waits for the step of each search
         torch.set_num_threads(threads)
-    return sorted(found, key=lambda member: member.left_out)
+    return sorted(members, key=lambda member: member.left_out)
 
 
 def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
@@ -165,16 +165,16 @@ def beaten(error: float, rival: float) -> bool:
     return error > BEATEN * rival
 
 
-def affordable_rows(rows: Rows, found: list[Member], budget: TimeBudget) -> int:
+def affordable_rows(rows: Rows, members: list[Member], budget: TimeBudget) -> int:
     """Rows of final processes that fit into the rest of the budget; all of one search at least.
 
     A covariance of n rows takes n^3; that of a search's rows is timed.
     """
     started = budget.spent
-    assert Posterior(rows, found[0].scene).conditioned
+    assert Posterior(rows, members[0].scene).conditioned
     each = max(budget.spent - started, 1e-6)
     rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
-    return max(int(len(rows) * (rest / (each * len(found))) ** (1 / 3)), len(rows))
+    return max(int(len(rows) * (rest / (each * len(members))) ** (1 / 3)), len(rows))
 
 
 def ensemble_weights(members: list[Member]) -> Tensor:

@@ -170,12 +170,12 @@ class Search:
             if number and late():
                 break
             spread = partial(self._spread, parent)
-            found = search_box(
+            sources = search_box(
                 self.rows, posterior.conditioned, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
                 self.generator, spread,
             )  # fmt: skip
             added = 0
-            for position, gained, amplitude in found:
+            for position, gained, amplitude in sources:
                 if gained < FREE_SCORE:
                     continue
                 sequence, plane = self._parent(position, posterior)

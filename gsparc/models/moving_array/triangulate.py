@@ -64,15 +64,15 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     gram = atoms @ atoms.mT
     gram.diagonal(dim1=-2, dim2=-1).add_(ridge)
     correlation = (atoms @ lags[..., None])[..., 0]
-    found = torch.linalg.solve(gram, correlation).clamp_(min=0)
-    slope = (gram @ found[..., None])[..., 0] - correlation
+    power = torch.linalg.solve(gram, correlation).clamp_(min=0)
+    slope = (gram @ power[..., None])[..., 0] - correlation
     curvature = gram.diagonal(dim1=-2, dim2=-1)
     for _ in range(SWEEPS):
-        for k in range(found.shape[1]):
-            step = (found[:, k] - slope[:, k] / curvature[:, k]).clamp_(min=0) - found[:, k]
-            found[:, k] += step
+        for k in range(power.shape[1]):
+            step = (power[:, k] - slope[:, k] / curvature[:, k]).clamp_(min=0) - power[:, k]
+            power[:, k] += step
             slope += step[:, None] * gram[:, k]
-    return found
+    return power
 
 
 def mixture(power: Tensor, atoms: Tensor) -> Tensor:
@@ -118,23 +118,23 @@ def find_sources(
         atoms = space.atoms(bearings(sources, receivers, rotation))
         return lags - mixture(powers(lags, atoms, settings.ridge), atoms)
 
-    found, residual = known, left(lags, receivers, known) if len(known) else lags
+    positions, residual = known, left(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())
-    while len(found) < settings.sources:
+    while len(positions) < settings.sources:
         candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
         amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
         new = _best(candidates, amplitude, receivers, rotation, grid, settings)
         if not len(new):
             break
-        found = torch.cat([found, new[: settings.sources - len(found)]])
-        residual = left(lags, receivers, found)
+        positions = torch.cat([positions, new[: settings.sources - len(positions)]])
+        residual = left(lags, receivers, positions)
         before, energy = energy, float(residual.square().sum())
         if energy > (1 - settings.least_gain) * before or seconds() <= end:
             break
-    if settings.steps == 0 or len(found) == len(known):
-        return found
+    if settings.steps == 0 or len(positions) == len(known):
+        return positions
     # Powers are optimal at every step, so that their derivative does not enter the gradient.
-    free = found[len(known) :].clone().requires_grad_(True)
+    free = positions[len(known) :].clone().requires_grad_(True)
     optimiser = torch.optim.Adam([free], lr=settings.rate)
     whole = seconds()
     for step in range(settings.steps):

@@ -131,11 +131,11 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
     """
     method, site = predictor.method, predictor.site
     if isinstance(method, PlannedField) and method.field is None and method._average is not None:
-        found = _rendered(method, site)  # without the process that it is averaged with
-        if found is not None:
+        own_form = _rendered(method, site)  # without the process that it is averaged with
+        if own_form is not None:
             alone = LearnedField.__new__(type(method))
             alone.__dict__.update(method.__dict__, _average=None)
-            return replace(found, predictor=Predictor(alone, site))
+            return replace(own_form, predictor=Predictor(alone, site))
     sources = _sources_of(method) if site.kind == "csi" else None
     data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
     if sources is not None:

@@ -71,10 +71,10 @@ def _trees(near: Neighbourhood, most: int) -> tuple[np.ndarray, np.ndarray, np.n
     order, sets, boxes = [], [], []
     for rows, neighbours in near.shares(most):
         depth = max(0, math.ceil(math.log2(len(rows) / LEAF)))
-        own, found = _tree(near.places[rows], depth)
+        own, tree = _tree(near.places[rows], depth)
         order.append(rows[own])
         sets.append((len(rows), min(neighbours, len(rows)), depth))
-        boxes.append(found.ravel())
+        boxes.append(tree.ravel())
     return np.concatenate(order), np.array(sets, np.int64), np.concatenate(boxes)
 
 

@@ -220,13 +220,13 @@ class Session:
         moving = self.view.viewed.moving[-1]
         place = self.view.starts(self.station)[moving]
         if where == WEAKEST and self.plane is not None:
-            found = weakest(self.plane, self.visited)
-            if found is None:  # all were visited
+            weak_place = weakest(self.plane, self.visited)
+            if weak_place is None:  # all were visited
                 self.visited.clear()
-                found = weakest(self.plane)
-            if found is not None:
-                self.visited.append(found)
-                place = found
+                weak_place = weakest(self.plane)
+            if weak_place is not None:
+                self.visited.append(weak_place)
+                place = weak_place
         self._move(moving, place)
 
     def _shown(self, parts: Mapping[str, str], choice: str) -> None:

@@ -150,7 +150,7 @@ def _equivalent_sequences(
     transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]
 ) -> list[list[Reflections]]:
     """Each sequence, then its permutations with the same image."""
-    found = []
+    groups = []
     for sequence in sequences:
         others = [
             other
@@ -161,5 +161,5 @@ def _equivalent_sequences(
             places = images(transmitter, planes, [sequence, *others])
             same = (places[1:] - places[0]).norm(dim=1) < SAME_M
             others = [other for other, alike in zip(others, same.tolist(), strict=True) if alike]
-        found.append([sequence, *others])
-    return found
+        groups.append([sequence, *others])
+    return groups

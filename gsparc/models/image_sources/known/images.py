@@ -66,12 +66,12 @@ class Mirrors:
                 ends = torch.from_numpy(part) @ along.T
                 patches.append(torch.cat([ends.amin(0), ends.amax(0)]))
                 indices.append(number)
-        found = torch.stack(patches) if patches else torch.zeros(0, 4, dtype=torch.float64)
-        size = (found[:, 2:] - found[:, :2]).prod(1)
+        rectangles = torch.stack(patches) if patches else torch.zeros(0, 4, dtype=torch.float64)
+        size = (rectangles[:, 2:] - rectangles[:, :2]).prod(1)
         kept = size.topk(min(MOST_PATCHES, len(size))).indices.sort().values.tolist()
         boxes = torch.from_numpy((walls.boxes - origin).reshape(-1, 6)).float()
         plane = tuple(indices[i] for i in kept)
-        return Mirrors(planes, Clutter(boxes, found[kept].float(), plane), len(found) - len(kept))
+        return Mirrors(planes, Clutter(boxes, rectangles[kept].float(), plane), len(rectangles) - len(kept))
 
     def mirroring(self, smallest: float) -> list[int]:
         """Numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
@@ -103,18 +103,18 @@ def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> 
 
 def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:
     """Planes (4,) and the faces on each; the largest face gives the plane."""
-    found: list[tuple[np.ndarray, list[np.ndarray]]] = []
+    planes: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for face in sorted(faces, key=area, reverse=True):
         normal = normal_of(face)
         normal = normal / np.linalg.norm(normal)
-        for plane, members in found:
+        for plane, members in planes:
             apart = np.abs(face @ plane[:3] - plane[3]).max()
             if abs(float(normal @ plane[:3])) > PARALLEL and apart < SAME_PLANE_M:
                 members.append(face)
                 break
         else:
-            found.append((np.append(normal, normal @ face.mean(0)), [face]))
-    return found
+            planes.append((np.append(normal, normal @ face.mean(0)), [face]))
+    return planes
 
 
 def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
