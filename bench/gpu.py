@@ -21,10 +21,10 @@ def machine() -> dict[str, Any]:
     import torch
 
     commit = output_of("git", "describe", "--always", "--dirty")
-    asked = "--query-gpu=name,driver_version,clocks.max.sm,clocks.max.mem"
+    query = "--query-gpu=name,driver_version,clocks.max.sm,clocks.max.mem"
     return {
         "gpu": torch.cuda.get_device_name(),
-        "driver": output_of("nvidia-smi", asked, "--format=csv,noheader"),
+        "driver": output_of("nvidia-smi", query, "--format=csv,noheader"),
         "capability": ".".join(map(str, torch.cuda.get_device_capability())),
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
@@ -144,8 +144,8 @@ def note(file: Path, name: str, status: str, seconds: str) -> None:
     log = file.parent / f"{name}.log"
     if log.exists() and name in ("tests", "hard", "sanitize"):
         lines = log.read_text(errors="replace").splitlines()
-        kept = [line for line in lines if any(word in line for word in SUMMARY_WORDS)]
-        stages[name]["said"] = kept[-6:]
+        summary = [line for line in lines if any(word in line for word in SUMMARY_WORDS)]
+        stages[name]["said"] = summary[-6:]
     file.write_text(json.dumps(known | {"stages": stages}, indent=1))
 
 

@@ -99,8 +99,8 @@ def graph_of(function: Callable[[], Any], inner: int = 1) -> torch.cuda.CUDAGrap
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph), torch.no_grad():
-        kept = [function() for _ in range(inner)]
-    del kept
+        outputs = [function() for _ in range(inner)]
+    del outputs
     return graph
 
 

@@ -77,7 +77,7 @@ def peak_gb() -> float:
 
 def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
     """A line of one method."""
-    held, private, method = peak_gb(), Private(), for_links(lambda: make(name), data)
+    before, private, method = peak_gb(), Private(), for_links(lambda: make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
         cpu, wall = time.process_time(), time.perf_counter()
@@ -95,7 +95,7 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
         method.predict(one.tx, one.rx)
     query = (time.process_time() - began) / SINGLE * 1e3
     spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
-    values = (cpu, wall, query, rmse, spread, held, peak_gb(), private.most, os.getloadavg()[0])
+    values = (cpu, wall, query, rmse, spread, before, peak_gb(), private.most, os.getloadavg()[0])
     count = len(fold.train) + len(fold.val)
     csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))
     sys.stdout.flush()

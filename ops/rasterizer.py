@@ -89,13 +89,13 @@ def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
 
 def _trained(plan: Plan, *tensors: Tensor | None) -> bool:
     """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
-    asked = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
-    if asked and plan.means2d.is_inference():
+    requires_grad = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    if requires_grad and plan.means2d.is_inference():
         raise RuntimeError(
             "this plan was made in torch.inference_mode, so nothing can be trained over it: plan outside, "
             "or under torch.no_grad"
         )
-    return asked
+    return requires_grad
 
 
 def composite(

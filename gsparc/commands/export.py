@@ -61,7 +61,7 @@ def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) 
     shutil.copytree(SOURCES, folder / "source", ignore=OTHERS)
     facts = {"export/bytes": size, "export/error": result.error, "export/form": result.form.kind}
     build = f"cmake -S {out}/source/field -B {out}/build && cmake --build {out}/build"
-    return facts, [result.said, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
+    return facts, [result.summary, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
 
 
 def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:

@@ -102,7 +102,7 @@ class Checker:
         """Whether `array` has one of `shapes`; notes it when not."""
         for shape in shapes:
             if array.ndim == len(shape) and all(
-                want is None or want == got for want, got in zip(shape, array.shape, strict=True)
+                want is None or want == size for want, size in zip(shape, array.shape, strict=True)
             ):
                 return True
         turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)

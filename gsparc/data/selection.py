@@ -270,7 +270,7 @@ def parts_of(number: int, names: Sequence[str]) -> list[int]:
 def known_station(
     wanted: str | int, names: Sequence[str], count: int, option: str, source: str | Path
 ) -> int:
-    """`station_number`; the setting `said` is named in errors.
+    """`station_number`; the setting `option` is named in errors.
 
     Raises:
         DataError: there is none.

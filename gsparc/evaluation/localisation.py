@@ -153,7 +153,7 @@ def by_model(
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = Locator(locator.field, locator.cells, unknown, trust, locator.share)
         if config.store:
-            checkpoint.amend(config.ckpt, locating.kept(trust, unknown, locator.share))
+            checkpoint.amend(config.ckpt, locating.trust_state(trust, unknown, locator.share))
     heard, placed = _heard(config, run)
     answers, trained = {method.name: locator.locate(heard)}, snapshots(data, learned)
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"

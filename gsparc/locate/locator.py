@@ -163,13 +163,13 @@ def trusted(
     return levelled(trust, looks(trust), places, locator.share), len(places)
 
 
-def kept(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
+def trust_state(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
     """For a checkpoint's `extra`."""
     return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
 
 
 def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
-    """The trust that `kept` held.
+    """The trust that `trust_state` held.
 
     Where nothing was, areas are as wide as the model's own variances say, which is logged.
 

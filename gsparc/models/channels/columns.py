@@ -81,10 +81,10 @@ class Group:
     def __len__(self) -> int:
         return len(self.places)
 
-    def take(self, kept: Tensor) -> Group:
+    def take(self, index: Tensor) -> Group:
         """The rows (m,) of these numbers."""
         parts = (self.rows, self.places, self.target, self.run, self.order)
-        return Group(self.slot, *(part[kept] for part in parts))
+        return Group(self.slot, *(part[index] for part in parts))
 
     @cached_property
     def displacements(self) -> bytes:
@@ -250,7 +250,7 @@ def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> 
     for number in chosen:
         group = groups[number]
         if len(group) > rows:
-            kept = np.sort(np.random.default_rng(0).permutation(len(group))[: int(rows)])
-            group = group.take(torch.from_numpy(kept))
+            index = np.sort(np.random.default_rng(0).permutation(len(group))[: int(rows)])
+            group = group.take(torch.from_numpy(index))
         subset.append(group)
     return tuple(subset)

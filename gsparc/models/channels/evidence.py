@@ -168,9 +168,9 @@ def _field(group: Group, values: Values, noise: float) -> tuple[Tensor, Tensor]:
     bound = envelope(distance, values.envelope)
     alike = plain(places, places, wavenumber, values.envelope)
     size, vectors = torch.linalg.eigh(alike)
-    kept = size > FLOOR * noise
-    whole = int(kept.sum()) > WORTH * len(group)
-    basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
+    mask = size > FLOOR * noise
+    whole = int(mask.sum()) > WORTH * len(group)
+    basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, mask]
     room = [alike.to(torch.complex128)]
     for angle in values.angles:
         one = directions(angle[None], values.concentration, wavenumber, places, places, distance)
@@ -186,8 +186,8 @@ def _field(group: Group, values: Values, noise: float) -> tuple[Tensor, Tensor]:
 def _roots(group: Group, length: float) -> Tensor:
     """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
     size, vectors = torch.linalg.eigh(smooth(apart(group.places, group.places), length))
-    kept = size > LOW_RANK * size[-1]
-    return vectors[:, kept] * size[kept].sqrt()
+    mask = size > LOW_RANK * size[-1]
+    return vectors[:, mask] * size[mask].sqrt()
 
 
 def _factors(

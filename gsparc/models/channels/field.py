@@ -383,15 +383,15 @@ class ChannelField(ConditionalField):
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
-    shape, kept = dict(state["shape"]), state["values"]
+    shape, values = dict(state["shape"]), state["values"]
     shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
-    learned = {name: kept[name] for name in ("offset", "towards", "planes") if name in kept}
-    logs = {name: kept[f"log_{name}"].exp() for name in ("power", "envelope", "gain")}
+    learned = {name: values[name] for name in ("offset", "towards", "planes") if name in values}
+    logs = {name: values[f"log_{name}"].exp() for name in ("power", "envelope", "gain")}
     antennas, tones = (int(n) for n in state["channel"])
     field = ChannelField(site, Values(**shape, **learned, **logs), (antennas, tones))
     with torch.no_grad():
         for name, parameter in field.named_parameters():
-            parameter.copy_(kept[name])
+            parameter.copy_(values[name])
     field.rows, runs = state["rows"].numpy(), RunFactors.read(state)
     groups = tuple(Group(**{**each, "slot": _read(each["slot"])}) for each in state["groups"])
     with torch.no_grad():

@@ -207,8 +207,8 @@ def _strongest(values: Values) -> Values:
     strong = beyond > WEAKEST * everywhere
     isotropic_power = everywhere - beyond[strong].sum()
     rest = power[len(numbers) + 1 :]
-    kept = torch.cat([isotropic_power[None], beyond[strong], rest])
-    return replace(values, angles=values.angles[strong], power=kept)
+    powers = torch.cat([isotropic_power[None], beyond[strong], rest])
+    return replace(values, angles=values.angles[strong], power=powers)
 
 
 def _groupings(places: Tensor) -> list[Grouping]:
@@ -253,40 +253,40 @@ class _Search:
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes; what the seconds end is as if it had not been tried."""
         notes: list[str] = []
-        kept = [self._measured(self.start, self._compressed(self.start))]
+        steps = [self._measured(self.start, self._compressed(self.start))]
         longest = max(len(group) for group in self.every)
         reserve = WEIGHTS * len(self.every) * factor_s(longest)  # for the weights in the end
         end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
         try:
             with cancelled_by(partial(budget.over, end)):
-                self._grow(kept, notes, budget)
+                self._grow(steps, notes, budget)
         except Cancelled:
             notes.append("waves: the seconds ended the search for terms")
-        return kept[-1], notes
+        return steps[-1], notes
 
-    def _grow(self, kept: list[Candidate], notes: list[str], budget: TimeBudget) -> None:
-        """Append what each further term makes of the last of `kept`."""
+    def _grow(self, steps: list[Candidate], notes: list[str], budget: TimeBudget) -> None:
+        """Append what each further term makes of the last of `steps`."""
         wanted = self.settings
 
         def step(after: Candidate, name: str) -> None:
-            kept.append(self._step(kept[-1], after, name, notes))
+            steps.append(self._step(steps[-1], after, name, notes))
 
         step(self._fitted(self.start), "powers by likelihood")
         one_end = self.one_end  # where both move, what waves have in common is not known
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
-            step(self._with_fixed(kept[-1], direct, budget), "leakage and direct wave")
-        if wanted.mirrors and kept[-1].values.direct and ends_of(self.every) > 1:
-            mirrored = self._with_mirrors(kept[-1], budget)
+            step(self._with_fixed(steps[-1], direct, budget), "leakage and direct wave")
+        if wanted.mirrors and steps[-1].values.direct and ends_of(self.every) > 1:
+            mirrored = self._with_mirrors(steps[-1], budget)
             if mirrored is not None:
                 step(mirrored, f"mirror planes of all ends ({len(mirrored.values.planes)})")
         if wanted.directions and one_end:
-            step(self._with_directions(kept[-1]), "directions")
+            step(self._with_directions(steps[-1]), "directions")
         if ends_of(self.every) > 1:
-            self._of_all_ends(kept, known, notes)
+            self._of_all_ends(steps, known, notes)
         if wanted.correlated:
-            kept.append(self._with_drift(kept[-1], notes))
+            steps.append(self._with_drift(steps[-1], notes))
 
     def _step(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
         keep = after.beats(before)
@@ -398,14 +398,14 @@ class _Search:
         after = self._fitted(_strongest(values))
         return replace(after, errors=np.maximum(after.errors, errors))
 
-    def _of_all_ends(self, kept: list[Candidate], known: bool, notes: list[str]) -> None:
+    def _of_all_ends(self, steps: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
-        wide, before = replace(self, groups=thinned(self.every, ENDS, self.settings.rows)), kept[-1]
-        kept.append(wide._fitted(before.values))
-        kept.append(wide._moved(kept[-1]))
+        wide, before = replace(self, groups=thinned(self.every, ENDS, self.settings.rows)), steps[-1]
+        steps.append(wide._fitted(before.values))
+        steps.append(wide._moved(steps[-1]))
         if known and self.settings.directions:
-            kept.append(
-                wide._step(kept[-1], wide._with_tied(kept[-1]), "directions by angles to ends", notes)
+            steps.append(
+                wide._step(steps[-1], wide._with_tied(steps[-1]), "directions by angles to ends", notes)
             )
 
     def _with_tied(self, before: Candidate) -> Candidate:

@@ -139,8 +139,8 @@ def find_mirrors(
     while len(search.planes) < most and not late():
         scores = search.gains(search.rough, grid, _single(len(grid)), _about).max(1).values
         if not len(search.planes):
-            kept = scores.topk(min(PROMISING, len(grid))).indices
-            grid, scores = grid[kept], scores[kept]
+            top = scores.topk(min(PROMISING, len(grid))).indices
+            grid, scores = grid[top], scores[top]
         moved = [search.moved(start, turn / 2) for start in search.starts(grid, scores)]
         plane, level, gain = max(moved, key=lambda m: m[2])
         if gain < PARAMETERS * worth:

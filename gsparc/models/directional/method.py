@@ -130,16 +130,16 @@ class DirectionalGP(FramedMethod):
         all_rays = Rays.of(places, rays)
         clusters = triangulate(all_rays, self.seed)
         seen = torch.from_numpy(clusters.seen(all_rays))
-        kept = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
-        if not len(kept):
+        sources = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
+        if not len(sources):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
-        kept = kept[seen[:, kept].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
+        sources = sources[seen[:, sources].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
-        points, covariance = (torch.from_numpy(v)[kept] for v in (clusters.points, clusters.covariance))
+        points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         self.positions = UncertainPositions(points - self.frame.middle, covariance)
-        self.visibility = VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, kept])
+        self.visibility = VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, sources])
         self.rows = self.frame.inside(everything)
         at = {int(row): k for k, row in enumerate(known)}
         self.observer = torch.tensor([at[int(row)] for row in everything.receiver])

@@ -60,9 +60,9 @@ class Rays:
     def __len__(self) -> int:
         return len(self.owner)
 
-    def take(self, kept: np.ndarray) -> Rays:
+    def take(self, mask: np.ndarray) -> Rays:
         """A subset, of the same receivers."""
-        return Rays(self.places, self.direction[kept], self.owner[kept])
+        return Rays(self.places, self.direction[mask], self.owner[mask])
 
     def squared_error(self, points: np.ndarray) -> np.ndarray:
         """Squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
@@ -136,12 +136,12 @@ def expectation_maximisation(rays: Rays, points: np.ndarray, error: float) -> Ra
         points, covariance, responsibility, evidence = (
             v[order] for v in (points, covariance, responsibility, evidence)
         )
-        kept = _distinct(points, covariance)
-        if kept.all():
-            kept = evidence >= MIN_EVIDENCE
-        if kept.all():
+        mask = _distinct(points, covariance)
+        if mask.all():
+            mask = evidence >= MIN_EVIDENCE
+        if mask.all():
             return RayClusters(points, covariance, responsibility, error)
-        points = points[kept]
+        points = points[mask]
 
 
 def _gain(squared_error: np.ndarray, error: float) -> np.ndarray:
@@ -183,12 +183,12 @@ def _steps(
 
 def _distinct(points: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Whether each point (K,) differs from all before it by more than their errors."""
-    kept = np.ones(len(points), bool)
+    mask = np.ones(len(points), bool)
     for k in range(1, len(points)):
         apart = points[:k] - points[k]
         whitened = np.linalg.solve(covariance[:k] + covariance[k], apart[..., None])[..., 0]
-        kept[k] = not bool((((apart * whitened).sum(1) < SAME_SIGMAS**2) & kept[:k]).any())
-    return kept
+        mask[k] = not bool((((apart * whitened).sum(1) < SAME_SIGMAS**2) & mask[:k]).any())
+    return mask
 
 
 def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:

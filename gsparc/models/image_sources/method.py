@@ -402,5 +402,5 @@ class ImageSourceGP(FramedMethod):
 def _loudest(member: Posterior, share: float, contribution: Tensor) -> Posterior:
     """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
     count = max(1, math.ceil(share * len(contribution)))
-    kept = sorted({0, *contribution.topk(count).indices.tolist()})
-    return Posterior(member.rows, member.scene.only(kept))
+    loudest = sorted({0, *contribution.topk(count).indices.tolist()})
+    return Posterior(member.rows, member.scene.only(loudest))

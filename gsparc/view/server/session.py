@@ -120,7 +120,7 @@ class Session:
             names = tuple(str(name) for name in viewed.stations)
             choice = gui.add_dropdown("station", names, initial_value=names[0])
             choice.on_update(lambda event: self._station_changed(event.target.value))
-        self.said = gui.add_markdown("asking ...")
+        self.answer_text = gui.add_markdown("asking ...")
         self.picture: Any = None
         self.curves: dict[str, Any] = {}
         self.vectors = {}
@@ -175,18 +175,18 @@ class Session:
                 self._on(self.height, lambda value: self.want_plane())
 
     def _notes(self) -> list[str]:
-        said = [*self.scene.notes, f"grid: {self.cell:g} m"]
+        notes = [*self.scene.notes, f"grid: {self.cell:g} m"]
         if self.site.static_end is not None:
-            said.append(
+            notes.append(
                 f"the {ENDS[self.site.static_end]} stood still when measured: the model knows it there alone"
             )
         else:
-            said.append(
+            notes.append(
                 "both ends moved: measured points are where the receiver was, wherever its transmitter"
             )
         if len(self.view.viewed.ways) == 1:
-            said.append("`gsparc tradeoff ckpt=FILE` stores faster operating points with the model")
-        return said
+            notes.append("`gsparc tradeoff ckpt=FILE` stores faster operating points with the model")
+        return notes
 
     def _on(self, handle: Any, act: Any) -> None:
         """Do something with a value that the client changed, not with one that we set."""
@@ -309,7 +309,7 @@ class Session:
         try:
             answer = ask(self.view.viewed.predictor_of(self.station, way), places)
         except ValueError as error:
-            self.said.content = f"**{error}**"
+            self.answer_text.content = f"**{error}**"
             return
         self._show(answer)
         self.answers += 1
@@ -325,7 +325,7 @@ class Session:
         one = self.one
         why = reasons(answer, self.view.viewed.moving[-1], one.about)
         with self.client.atomic():
-            self.said.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
+            self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
             for end in self.vectors:
                 self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
             if answer.spectrum is not None:
@@ -390,7 +390,7 @@ class Session:
         )  # fmt: skip
 
     def _after(self) -> float:
-        return float(self.said.order) + 0.1 + 0.1 * len(self.curves)
+        return float(self.answer_text.order) + 0.1 + 0.1 * len(self.curves)
 
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
@@ -428,9 +428,9 @@ class Session:
             self._lay(grid, plane.level_db, legend)
             if first:
                 self._legends()
-            asked = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
+            suffix = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
             self.progress.content = (
-                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{asked}, "
+                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{suffix}, "
                 f"{time.perf_counter() - begin:.1f} s"
             )
             yield

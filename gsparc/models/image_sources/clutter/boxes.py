@@ -40,8 +40,8 @@ def evolve(
         parents = torch.where(better[:, None], heirs, parents)
         best, spread = torch.maximum(best, scores), spread * FALL
         if number in HALVED:
-            kept = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
-            parents, best = parents[kept], best[kept]
+            top = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
+            parents, best = parents[top], best[top]
     first = int(best.argmax())
     return parents[first], float(best[first])
 

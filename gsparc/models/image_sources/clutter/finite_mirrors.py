@@ -168,11 +168,11 @@ def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
 
 
 def _apart(mirrors: list[SmallMirror], least: float) -> list[SmallMirror]:
-    kept: list[SmallMirror] = []
+    apart: list[SmallMirror] = []
     for mirror in sorted(mirrors, key=lambda m: -m.score):
-        if not any(same_mirror(mirror, other, least) for other in kept):
-            kept.append(mirror)
-    return kept
+        if not any(same_mirror(mirror, other, least) for other in apart):
+            apart.append(mirror)
+    return apart
 
 
 def _raster(

@@ -365,10 +365,10 @@ class _ClutterSearcher:
     def _drop_sequences(self) -> None:
         """Remove sources whose constant and varying parts both gain too little."""
         gains = self.residual.nats_per_source(self.visible, self.scene.log_amplitude)
-        kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
-        dropped = len(gains) - len(kept)
+        rest = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
+        dropped = len(gains) - len(rest)
         if dropped:
-            fewer = partial(self._refactor, self.scene.only(kept))
+            fewer = partial(self._refactor, self.scene.only(rest))
             self._changed(fewer, -dropped * self.parameter_cost)
 
 
