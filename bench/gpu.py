@@ -94,17 +94,17 @@ def train(file: Path) -> None:
         started = time.perf_counter()
         try:
             environment = {**os.environ, "HYDRA_FULL_ERROR": "1"}
-            done = subprocess.run(command, capture_output=True, text=True, timeout=130, env=environment)
+            process = subprocess.run(command, capture_output=True, text=True, timeout=130, env=environment)
         except subprocess.TimeoutExpired as late:
-            done = subprocess.CompletedProcess(command, 124, "", str(late))
-        results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": done.returncode}
+            process = subprocess.CompletedProcess(command, 124, "", str(late))
+        results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": process.returncode}
         summary = folder / "summary.json"
-        if done.returncode == 0 and summary.exists():
+        if process.returncode == 0 and summary.exists():
             facts = json.loads(summary.read_text())
             wanted = ("test/", "time/", "model/", "baseline/nearest/test", "baseline/nearest/ssim")
             results[accelerator] |= {k: v for k, v in facts.items() if k.startswith(wanted)}
         else:
-            results[accelerator]["error"] = (done.stderr or done.stdout)[-1500:]
+            results[accelerator]["error"] = (process.stderr or process.stdout)[-1500:]
         update(file, train=results)
     key = "test/ssim_median"
     both = [results[accelerator] for accelerator in ("gpu", "cpu")]

@@ -152,10 +152,10 @@ def rasterize(
     """
     chosen = backends.choose(backend, means.device)
     at_once = getattr(chosen, "rasterize", None)
-    given = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
+    inputs = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
-    if at_once is not None and not followed(*given):
+    if at_once is not None and not followed(*inputs):
         poses = validation.poses(pose, means)
         values = validation.features(features, means, poses)
         return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))

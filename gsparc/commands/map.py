@@ -25,19 +25,19 @@ def settings_of(config: DictConfig) -> RunSettings:
     return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
 
 
-def stations_of(given: Any) -> list[str | int] | None:
+def stations_of(setting: Any) -> list[str | int] | None:
     """Names or numbers; None for `all`.
 
     Raises:
         DataError: neither.
     """
-    if given is None or given == "all":
+    if setting is None or setting == "all":
         return None
-    if isinstance(given, str | int):
-        return [given]
-    if not isinstance(given, list):
-        raise DataError(f"stations={given}: all, a name or a list of names is needed")
-    return given
+    if isinstance(setting, str | int):
+        return [setting]
+    if not isinstance(setting, list):
+        raise DataError(f"stations={setting}: all, a name or a list of names is needed")
+    return setting
 
 
 def task(config: DictConfig) -> dict[str, Any]:

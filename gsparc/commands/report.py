@@ -26,8 +26,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     out = run_directory()
     shown = studies(runs, _fronts(paths))
     origin = provenance()
-    made = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program(origin)}"
-    write(out, config.title, made, shown)
+    note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program(origin)}"
+    write(out, config.title, note, shown)
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(shown), **origin}
     for run in runs:
         stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"
@@ -39,7 +39,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.readme:
         refresh(Path(config.readme), runs)
         console.print(f"table in {config.readme} written anew", highlight=False)
-    console.print(f"{made}; written to {out / 'report.html'}", highlight=False)
+    console.print(f"{note}; written to {out / 'report.html'}", highlight=False)
     return facts
 
 

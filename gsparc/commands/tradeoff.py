@@ -88,8 +88,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     return facts
 
 
-def _threads(given: Sequence[int] | None) -> list[int]:
-    counts = sorted({1, torch.get_num_threads()}) if given is None else sorted({int(n) for n in given})
+def _threads(setting: Sequence[int] | None) -> list[int]:
+    counts = sorted({1, torch.get_num_threads()}) if setting is None else sorted({int(n) for n in setting})
     cores = os.cpu_count() or 1
     if counts and counts[0] >= 1 and counts[-1] <= cores:
         return counts

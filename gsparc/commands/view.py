@@ -61,12 +61,12 @@ def view_of(settings: dict[str, Any]) -> SiteView:
     plan, walls = plan_of(settings), settings["walls"]
     given = Given(plan, None if walls is None else read_walls(walls))
     viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
-    made: tuple[Any, ...] = ()
+    map_layers: tuple[Any, ...] = ()
     if settings["map"] is not None:
         field = FieldMap.read(settings["map"])
-        made = tuple((field.grid, layer) for layer in layers(field, viewed.unit) if not layer.words)
+        map_layers = tuple((field.grid, layer) for layer in layers(field, viewed.unit) if not layer.words)
     at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
-    return SiteView(viewed, given, grid_for(viewed, settings, plan), made, at, other)
+    return SiteView(viewed, given, grid_for(viewed, settings, plan), map_layers, at, other)
 
 
 def serve(view: SiteView, host: str, port: int) -> str:

@@ -136,7 +136,7 @@ def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Results:
     how: dict[str, Any] = {"pre_dispatch": workers, "batch_size": 1, "max_nbytes": None}
     jobs = joblib.Parallel(workers, backend, return_as="generator_unordered", **how)
     warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
-    yield from jobs(joblib.delayed(call)(*given) for call, *given in calls)
+    yield from jobs(joblib.delayed(call)(*arguments) for call, *arguments in calls)
 
 
 def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Results:

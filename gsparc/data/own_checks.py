@@ -180,18 +180,18 @@ class Checker:
 
     def rotation(self, rows: int) -> np.ndarray | None:
         """(S, 3, 3) local to world; the identity when the file says nothing."""
-        given = self.given("rx_orientation", "rx_rotation")
-        if len(given) == 2:
+        present = self.given("rx_orientation", "rx_rotation")
+        if len(present) == 2:
             fault = "rx_orientation and rx_rotation are both given; expected one of them"
             return self.problems.add(self.source, fault)
-        if not given:
+        if not present:
             return np.tile(np.eye(3), (rows, 1, 1))
-        shape = (4,) if given == ["rx_orientation"] else (3, 3)
-        values = self.real(given[0], shape, (rows, *shape))
+        shape = (4,) if present == ["rx_orientation"] else (3, 3)
+        values = self.real(present[0], shape, (rows, *shape))
         if values is None:
             return None
         values = np.broadcast_to(values, (rows, *shape))
-        if given == ["rx_rotation"]:
+        if present == ["rx_rotation"]:
             expected = "not a rotation; expected an orthogonal matrix with determinant +1, receiver to world"
             return None if self.refuse_rows("rx_rotation", ~is_rotation(values), expected) else values.copy()
         good = is_unit(values)
@@ -240,13 +240,13 @@ class Checker:
 
     def release_split(self, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
         """(train, test) rows that the file names, or None."""
-        given = self.given("split_train", "split_test")
-        if len(given) == 1:
-            self.problems.add(self.source, f"{given[0]} is given alone; expected split_train and split_test")
-        if len(given) < 2:
+        names = self.given("split_train", "split_test")
+        if len(names) == 1:
+            self.problems.add(self.source, f"{names[0]} is given alone; expected split_train and split_test")
+        if len(names) < 2:
             return None
         parts = []
-        for name in given:
+        for name in names:
             index = self.array(name, (None,))
             if index is None or index.size == 0:
                 return None if index is None else self.refuse(name, "expected a row number or more")

@@ -107,9 +107,9 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     sheet, notes = sheet_of(path)
     chosen, guessed = choose(sheet, columns, only=GUESSED)
     sheet.problems.raise_if_any()
-    given = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
+    by_end = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
     sheet.problems.raise_if_any()
-    rest = {end: where for end, where in given.items() if where is not None}
+    rest = {end: where for end, where in by_end.items() if where is not None}
     ends: dict[End, Places] = {}
     for end in moving:
         named = f"{end}_" if f"{end}_" in rest else ""
@@ -145,9 +145,9 @@ def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
 
 def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     check = Checker(raw, source)
-    given = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
+    by_end = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
     check.problems.raise_if_any()
-    ends: dict[End, Places] = {end: where for end, where in given.items() if where is not None}
+    ends: dict[End, Places] = {end: where for end, where in by_end.items() if where is not None}
     count = {end: len(where.across) for end, where in ends.items()}
     if len(set(count.values())) > 1:
         raise DataError(f"{source}: {count['tx']} places of the transmitter, {count['rx']} of the receiver")
@@ -180,8 +180,8 @@ def _end(check: Checker, end: End, alone: bool) -> Places | None:
     across = np.column_stack(known) if pair else np.atleast_2d(known[0])
     height = across[:, 2] if across.shape[1] == 3 else None
     for name in check.given(f"{end}_height", *(("height",) if alone else ())):
-        given = None if height is not None else check.real(name, (), (1,), (len(across),))
-        height = height if given is None else np.broadcast_to(given, (len(across),))
+        values = None if height is not None else check.real(name, (), (1,), (len(across),))
+        height = height if values is None else np.broadcast_to(values, (len(across),))
     return Places(across[:, :2], height, bool(pair))
 
 

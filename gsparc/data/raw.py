@@ -284,13 +284,13 @@ def read_error(path: Path, seconds: float = SECONDS) -> str | None:
         return None
     try:
         read, nothing = [sys.executable, "-I", "-c", READ, str(path.absolute())], subprocess.DEVNULL
-        done = subprocess.run(read, stdin=nothing, capture_output=True, timeout=seconds)
+        process = subprocess.run(read, stdin=nothing, capture_output=True, timeout=seconds)
     except subprocess.TimeoutExpired:
         return f"its text cannot be read in {seconds:g} s"
-    if done.returncode < 0:
+    if process.returncode < 0:
         return "its text crashes the HDF5 library"
-    last = done.stderr.decode(errors="replace").strip().splitlines()
-    return None if done.returncode == 0 else last[-1] if last else "its text cannot be read"
+    last = process.stderr.decode(errors="replace").strip().splitlines()
+    return None if process.returncode == 0 else last[-1] if last else "its text cannot be read"
 
 
 def _has_heap(path: Path) -> bool:

@@ -31,19 +31,19 @@ ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", F
 SPLIT = ("split_train", "split_test")
 
 
-def _listed(given: Any) -> Any:
-    return (given,) if isinstance(given, str | int) else given
+def _listed(value: Any) -> Any:
+    return (value,) if isinstance(value, str | int) else value
 
 
-def _are_names(given: Any) -> bool:
-    names = _listed(given)
+def _are_names(value: Any) -> bool:
+    names = _listed(value)
     if not isinstance(names, Sequence) or not names:
         return False
     return all(isinstance(name, str | int) and not isinstance(name, bool) for name in names)
 
 
-def _are_steps(given: Any) -> bool:
-    rows = [_listed(firsts) for firsts in given.values()] if isinstance(given, Mapping) else [()]
+def _are_steps(value: Any) -> bool:
+    rows = [_listed(firsts) for firsts in value.values()] if isinstance(value, Mapping) else [()]
     lists = all(isinstance(firsts, Sequence) and firsts for firsts in rows)
     return lists and all(type(row) is int for firsts in rows for row in firsts)
 
@@ -151,10 +151,10 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     values = raw.arrays[name]
     with np.errstate(divide="ignore", invalid="ignore"):
         low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
-    given = raw.arrays.get("mask")
-    if given is not None and given.shape != low.shape:
-        raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {given.shape}")
-    low &= True if given is None else given.astype(bool)
+    mask = raw.arrays.get("mask")
+    if mask is not None and mask.shape != low.shape:
+        raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {mask.shape}")
+    low &= True if mask is None else mask.astype(bool)
     if low.ndim == 1:
         return _kept(raw, ~low, option, source)
     measured = ~low & measured_links(raw, source)
@@ -296,9 +296,9 @@ def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
     Raises:
         DataError: the file holds no measurement.
     """
-    values, given = raw.arrays[_measurement(raw, source)], raw.arrays.get("mask")
-    if given is not None:
-        return given.astype(bool)
+    values, mask = raw.arrays[_measurement(raw, source)], raw.arrays.get("mask")
+    if mask is not None:
+        return mask.astype(bool)
     return np.ones(values.shape, bool) if "sensitivity_db" in raw.arrays else ~np.isnan(values)
 
 

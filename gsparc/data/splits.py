@@ -67,8 +67,8 @@ class Split:
                 )
 
 
-def _are_rows(given: Any) -> bool:
-    listed = given.tolist() if isinstance(given, np.ndarray) else given
+def _are_rows(value: Any) -> bool:
+    listed = value.tolist() if isinstance(value, np.ndarray) else value
     if isinstance(listed, str) or not isinstance(listed, Sequence):
         return isinstance(listed, str) and listed == "outliers"
     return all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)

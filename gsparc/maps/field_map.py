@@ -202,25 +202,25 @@ def sinr(power_db: np.ndarray, load: np.ndarray, noise_db: float | None) -> np.n
     return np.where((number == REFUSED) | ~(rest > 0), np.nan, ratio)
 
 
-def loads(given: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
+def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
     """Loads (T,) in [0, 1] of one number, one per station, or by name (the others 1).
 
     Raises:
         DataError: another number of them, an unknown name, or no share.
     """
-    if isinstance(given, Mapping):
-        wrong = next((name for name in given if name not in stations), None)
+    if isinstance(load, Mapping):
+        wrong = next((name for name in load if name not in stations), None)
         if wrong is not None:
             raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
-        given = [given.get(name, 1.0) for name in stations]
+        load = [load.get(name, 1.0) for name in stations]
     try:
-        values = np.array(given, dtype=np.float64)
+        values = np.array(load, dtype=np.float64)
     except (TypeError, ValueError):
-        raise DataError(f"load={given}: a number from 0 to 1 is needed, or one per station") from None
+        raise DataError(f"load={load}: a number from 0 to 1 is needed, or one per station") from None
     if values.ndim > 1 or values.size not in (1, len(stations)):
-        raise DataError(f"load={given}: one number is needed, or {len(stations)}, one per station")
+        raise DataError(f"load={load}: one number is needed, or {len(stations)}, one per station")
     if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"load={given}: shares from 0 to 1 are needed")
+        raise DataError(f"load={load}: shares from 0 to 1 are needed")
     return np.broadcast_to(values, (len(stations),))
 
 

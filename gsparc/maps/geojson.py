@@ -111,9 +111,9 @@ def _ring(ring: Any, where: str, origin: Georeference | None) -> np.ndarray:
     return places
 
 
-def _points(given: Any, where: str, origin: Georeference | None, least: int) -> np.ndarray:
+def _points(pairs: Any, where: str, origin: Georeference | None, least: int) -> np.ndarray:
     try:
-        places = np.array([point[:2] for point in given], dtype=np.float64)
+        places = np.array([point[:2] for point in pairs], dtype=np.float64)
     except (TypeError, ValueError, IndexError):
         raise DataError(f"{where}: coordinates are not pairs of numbers") from None
     if len(np.unique(places, axis=0)) < least:

@@ -255,11 +255,11 @@ def ends_of(
     return {"rx": places, "tx": np.broadcast_to(place_of("other_end", other), places.shape)}
 
 
-def place_of(name: str, given: Any) -> np.ndarray:
+def place_of(name: str, value: Any) -> np.ndarray:
     """(3,) [m] of the setting `name`; `DataError` where it is no place."""
-    place = finite(given)
+    place = finite(value)
     if place.shape != (3,):
-        raise DataError(f"{name}={given}: three finite numbers [m] are needed")
+        raise DataError(f"{name}={value}: three finite numbers [m] are needed")
     return place
 
 

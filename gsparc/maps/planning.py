@@ -250,10 +250,10 @@ def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
     return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
 
 
-def _start(given: Sequence[float]) -> np.ndarray:
-    place = finite(given)
+def _start(value: Sequence[float]) -> np.ndarray:
+    place = finite(value)
     if place.shape not in ((2,), (3,)):
-        raise DataError(f"start={given}: [x,y] in metres is needed")
+        raise DataError(f"start={value}: [x,y] in metres is needed")
     return place[:2]
 
 

@@ -43,8 +43,8 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
     known = heard(data, np.sort(np.concatenate([fold.train, fold.val])))
     if len(known) > ONE_FACTOR:
         return "each", f"{len(known)} rows are more than one factor holds ({ONE_FACTOR})"
-    given = math.inf if context.budget_s is None else context.budget_s
-    budget = context.time_budget(min(MOST_S, SHARE * given))
+    limit_s = math.inf if context.budget_s is None else context.budget_s
+    budget = context.time_budget(min(MOST_S, SHARE * limit_s))
     errors = []
     for inner in cut_inside(data, fold, context.split, FOLDS, context.seed).folds:
         learned, queries = (heard(data, part) for part in (np.union1d(inner.train, inner.val), inner.test))

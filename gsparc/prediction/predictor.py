@@ -398,9 +398,9 @@ class Predictor:
 
     def _query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Query:
         """Both ends as they were given, checked."""
-        given = rx.position if isinstance(rx, Pose) else rx
+        receiver = rx.position if isinstance(rx, Pose) else rx
         places = {
-            end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
+            end: _positions(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
         }
         moving, static = self.site.moving_end, self.site.static_end or "tx"
         for needed in (moving,) if self.site.static_end else ("rx", "tx"):
@@ -425,7 +425,7 @@ class Predictor:
             turned = np.broadcast_to(rotation, (count, 3, 3))
             pose = Pose(_float(positions, dtype), _float(turned, dtype))
         sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, given)))
+        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, receiver)))
 
     def _still_pose(self) -> Pose | None:
         """The pose of a receiver that never moved, made once; None for any other site."""
@@ -434,18 +434,18 @@ class Predictor:
             return None
         return Pose(_float(site.static_position), _float(self._rotation(None, 1)))
 
-    def _static(self, given: np.ndarray | None) -> np.ndarray:
+    def _static(self, place: np.ndarray | None) -> np.ndarray:
         """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
         known, end = self.site.static_position, self.site.static_end
         if known is None:
-            if given is not None:
-                return given[0] if len(given) == 1 else given
+            if place is not None:
+                return place[0] if len(place) == 1 else place
             if self.site.stations is not None:
                 raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
             if self.site.kind == "rssi":  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
-        if given is not None and (np.linalg.norm(given - known, axis=-1) > SAME_PLACE_M).any():
+        if place is not None and (np.linalg.norm(place - known, axis=-1) > SAME_PLACE_M).any():
             stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
             raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
         return known

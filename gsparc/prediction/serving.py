@@ -91,8 +91,8 @@ def application(predictor: Predictor, delay_s: float, most: int, token: str | No
 
     @app.post("/predict")
     async def predict(request: Request) -> Response:
-        given = request.headers.get("authorization", "")
-        if token is not None and not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
+        header = request.headers.get("authorization", "")
+        if token is not None and not hmac.compare_digest(header.encode(), f"Bearer {token}".encode()):
             raise HTTPException(401, "Authorization: Bearer TOKEN is needed")
         body = b""
         try:

@@ -125,9 +125,9 @@ def fetch() -> None:
     FETCHED.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=FETCHED.parent) as scratch:
         script = ["sh", "-ec", FETCH, "sh", str(FETCHED)]
-        done = subprocess.run(script, cwd=scratch, capture_output=True, text=True)
-    if done.returncode:
-        words = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
+        process = subprocess.run(script, cwd=scratch, capture_output=True, text=True)
+    if process.returncode:
+        words = (process.stderr.strip().splitlines() or [f"exit {process.returncode}"])[-1]
         raise SimulatorMissing(f"libllvm19: {words}; put LLVM 19 on this machine and name it in {VARIABLE}")
 
 

@@ -100,7 +100,7 @@ def test_file_equals_the_exact_room(tmp_path):
     assert json.loads(about["effects_json"])["depth"] == 3
     assert load_own(tmp_path / "box.h5").site.kind == "spectrum"
     assert check([str(tmp_path / "box.h5")]) == 0
-    assert outcome.convergence is None and outcome.made.facts["paths_per_receiver"] > 5
+    assert outcome.convergence is None and outcome.dataset.facts["paths_per_receiver"] > 5
     assert 0 < about["simulate_s"] <= sum(outcome.seconds.values())
     paths = stored["path_offsets"]
     assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(stored["path_direction"])
@@ -133,7 +133,7 @@ def test_file_is_read_as_powers(tmp_path):
     """Sums of path powers; where no path arrives, a power is below the weakest that was heard."""
     blocked = replace(SCENE, room={**SCENE.room, "boxes_m": [[[2.6, 0, 0], [3.0, 4.0, 3]]]})
     direct = replace(MIRROR, specular=False, depth=0)
-    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").made
+    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").dataset
     data = read(tmp_path / "box.h5", "rssi")
     heard = made.power > 0
     assert data.site.kind == "rssi" and 0 < heard.sum() < 60 and data.site.convergence_error is None

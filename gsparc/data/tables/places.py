@@ -43,17 +43,17 @@ def places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Pla
     """
     for degrees, axes in ((False, ("x", "y")), (True, ("latitude", "longitude"))):
         roles = [f"{end}{axis}" for axis in axes]
-        given = [role for role in roles if role in chosen]
-        if not given:
+        present = [role for role in roles if role in chosen]
+        if not present:
             continue
-        if len(given) == 1:
+        if len(present) == 1:
             missing = next(role for role in roles if role not in chosen)
-            fault = f"{given[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
+            fault = f"{present[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
             return sheet.refuse(fault)
         absent = np.zeros(len(sheet), bool)
         if unknown:
-            given = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
-            absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in given], axis=0)
+            present = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
+            absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in present], axis=0)
         columns = [_complete(sheet, chosen, role, absent) for role in roles]
         height = _complete(sheet, chosen, f"{end}z", absent) if f"{end}z" in chosen else None
         if columns[0] is None or columns[1] is None:

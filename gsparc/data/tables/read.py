@@ -158,8 +158,8 @@ class Builder:
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
-        given = {end: places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
-        ends = {end: where for end, where in given.items() if where is not None}
+        by_end = {end: places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
+        ends = {end: where for end, where in by_end.items() if where is not None}
         if self.sheet.problems:
             return
         if not ends:
@@ -172,7 +172,7 @@ class Builder:
         stations = self._stations(measured, ends)
         if self.sheet.problems:
             return
-        stay = next((end for end, where in given.items() if where is not None and end not in ends), "")
+        stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
         if stations is not None:
             self._add_stations(stations, where.degrees)

@@ -104,17 +104,17 @@ def _png(path: Path) -> str:
     return base64.b64encode(out.getvalue()).decode()
 
 
-def html(title: str, made: str, shown: Sequence[Study]) -> str:
-    """The page; `made` says where it comes from."""
+def html(title: str, note: str, shown: Sequence[Study]) -> str:
+    """The page; `note` says where it comes from."""
     text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
-    return Environment(autoescape=True).from_string(text).render(title=title, made=made, studies=shown)
+    return Environment(autoescape=True).from_string(text).render(title=title, made=note, studies=shown)
 
 
-def write(folder: Path, title: str, made: str, shown: Sequence[Study]) -> None:
+def write(folder: Path, title: str, note: str, shown: Sequence[Study]) -> None:
     """`report.html`, `report.md` and a CSV file per table."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.html").write_text(html(title, made, shown), encoding="utf-8")
-    parts = [f"# {title}\n\n{made}\n"]
+    (folder / "report.html").write_text(html(title, note, shown), encoding="utf-8")
+    parts = [f"# {title}\n\n{note}\n"]
     for study in shown:
         parts.append(f"## {study.title}\n")
         parts += [f"{remark}\n" for remark in study.remarks]

@@ -138,10 +138,10 @@ def image_waves(values: Values, slot: Slot, places: Tensor) -> Tensor:
     if not values.count:
         return places.new_zeros(0, len(places), dtype=torch.complex128)
     end = slot.end + values.offset
-    given = images(end, values.planes, values.sequences)
-    reference = torch.linalg.vector_norm(given - values.middle, dim=-1)
+    sources = images(end, values.planes, values.sequences)
+    reference = torch.linalg.vector_norm(sources - values.middle, dim=-1)
     waves = [
-        steering(places, source, slot.wavenumber, away) for source, away in zip(given, reference, strict=True)
+        steering(places, one, slot.wavenumber, away) for one, away in zip(sources, reference, strict=True)
     ]
     return torch.stack(waves) * mirrored(values.planes, values.sequences, end, values.middle)[:, None]
 

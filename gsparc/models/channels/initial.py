@@ -152,9 +152,9 @@ def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tupl
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     few, began = thinned(looked, 8, FEWEST), budget.spent
     _grid_point(few, [plain(g.places, g.places, g.slot.wavenumber, wavelength) for g in few], 1.0, runs)
-    given = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
+    max_s = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
     most = (
-        int(FEWEST * (given / max(budget.spent - began, 1e-6)) ** (1 / 3)) if given < math.inf else CHOSEN_ON
+        int(FEWEST * (max_s / max(budget.spent - began, 1e-6)) ** (1 / 3)) if max_s < math.inf else CHOSEN_ON
     )
     if most < max(len(group) for group in looked):
         budget.limited = True

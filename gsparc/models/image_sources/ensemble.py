@@ -72,7 +72,7 @@ def search_many(
         ended = at_noise_floor(errors, noise_floor) or (bool(errors) and beaten(min(errors), rival))
         return stopped.is_set() or ended
 
-    def made(number: int) -> Member:
+    def solve(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
         rows, last_round = row_sets[number], partial(budget.over, ROUNDS_END)
         scene = Search(rows, transmitter, settings, seed + number, last_round).run()
@@ -87,14 +87,14 @@ def search_many(
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if done := cache.find(number, noise_floor):
-            errors.append(done.left_out)
-            return done
+        if member := cache.find(number, noise_floor):
+            errors.append(member.left_out)
+            return member
         if unwanted() or (number > 0 and budget.over(LAST_START)):
             return None
         try:
             with cancelled_by(unwanted), late_when(partial(budget.over, SEARCH_END)):
-                member = made(number)
+                member = solve(number)
         except Cancelled:
             return None
         scene = member.scene

@@ -105,8 +105,8 @@ def find_sources(
         seconds: that are left [s]; sources are added for a part of them, and the schedule of the refinement
             ends with them.
     """
-    given = seconds()
-    end = REFINED * given if given < math.inf else 0.0
+    limit_s = seconds()
+    end = REFINED * limit_s if limit_s < math.inf else 0.0
     generator = torch.Generator().manual_seed(seed)
     low, high = receivers.min(0).values, receivers.max(0).values
     far = settings.reach * float((high - low).norm())
@@ -138,10 +138,10 @@ def find_sources(
     optimiser = torch.optim.Adam([free], lr=settings.rate)
     whole = seconds()
     for step in range(settings.steps):
-        done = max(step / settings.steps, 1 - seconds() / whole if 0 < whole < math.inf else 0.0)
-        if done >= 1 or whole <= 0:
+        progress = max(step / settings.steps, 1 - seconds() / whole if 0 < whole < math.inf else 0.0)
+        if progress >= 1 or whole <= 0:
             break
-        optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * done)) / 2
+        optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         some = torch.randperm(len(receivers), generator=generator)[:64]
         residual = left(lags[some], receivers[some], torch.cat([known, free]))
         loss = residual.square().sum() / lags[some].square().sum()

@@ -168,10 +168,10 @@ def _along(
 
 
 def _lines(how: Layout) -> list[np.ndarray]:
-    given: Any = how.points_m
+    points: Any = how.points_m
     try:
-        nested = given is not None and np.ndim(given[0]) == 2
-        lines = [np.array(line, dtype=np.float64) for line in (given if nested else [given])]
+        nested = points is not None and np.ndim(points[0]) == 2
+        lines = [np.array(line, dtype=np.float64) for line in (points if nested else [points])]
     except (TypeError, ValueError, IndexError):
         lines = []
     if not lines or any(x.ndim != 2 or x.shape[1] != 2 or len(x) < 2 for x in lines):

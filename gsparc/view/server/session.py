@@ -70,9 +70,9 @@ class Session:
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
-        self.made: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # layers of a map, as they are chosen
+        self.map_layers: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # as they are chosen
         for grid, one in view.layers:
-            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
+            self.map_layers[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
         self._draw_still()
         first_view(client.camera)
         self._panel()
@@ -161,10 +161,10 @@ class Session:
                 button = gui.add_button("download Gaussians as PLY")
                 button.on_click(lambda _: self._download())
             self.chosen: Any = None
-            if self.view.grid is not None or self.made:
+            if self.view.grid is not None or self.map_layers:
                 known = self.one.about.usual
                 far = (BEYOND,) if known is not None and np.isfinite(known.at_one) else ()
-                names = (*((PREDICTED, *far) if self.view.grid is not None else ()), *self.made)
+                names = (*((PREDICTED, *far) if self.view.grid is not None else ()), *self.map_layers)
                 self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
                 self._on(self.chosen, lambda value: self.want_plane())
                 self.progress = gui.add_markdown("")
@@ -206,8 +206,8 @@ class Session:
 
         return moved
 
-    def _move(self, end: str, given: ArrayLike) -> None:
-        self.places[end] = place = np.asarray(given, np.float64)
+    def _move(self, end: str, position: ArrayLike) -> None:
+        self.places[end] = place = np.asarray(position, np.float64)
         self.gizmos[end].position = self.scene.frame.drawn(place)
         self._moved(end)
 
@@ -395,9 +395,9 @@ class Session:
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
         self.power = None
-        if name in self.made:
-            grid, *_ = self.made[name]
-            self._lay(*self.made[name])
+        if name in self.map_layers:
+            grid, *_ = self.map_layers[name]
+            self._lay(*self.map_layers[name])
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
         elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
             grid = replace(self.view.grid, height=float(self.height.value))
@@ -449,5 +449,5 @@ class Session:
         shown += [PATHS] if RAYS in self.nodes else []
         shown += [self.power] if PLANE in self.nodes and self.power is not None else []
         name = NOTHING if self.chosen is None else self.chosen.value
-        shown += [self.made[name][2]] if name in self.made else []
+        shown += [self.map_layers[name][2]] if name in self.map_layers else []
         self.legend.content = legend_html(shown, self.scene.parts)
