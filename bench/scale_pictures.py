@@ -30,11 +30,11 @@ def slope(lines: pd.DataFrame, figure: str) -> float:
 
 def draw(tables: Path, pictures: Path) -> None:
     """A picture for each source that was measured."""
-    for kind, shown in PANELS.items():
+    for kind, quantities in PANELS.items():
         path = tables / f"{kind}.csv"
         for source, own in pd.read_csv(path).groupby("source", sort=False) if path.exists() else ():
             figure, places = panels(9.0, 6.4, 2, 2)
-            for place, (quantity, title) in zip(places.flat, shown, strict=True):
+            for place, (quantity, title) in zip(places.flat, quantities, strict=True):
                 _curves(place, own, quantity)
                 place.set_title(title)
                 place.set_xlabel("rows")

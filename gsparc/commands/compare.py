@@ -75,8 +75,8 @@ def report(
     blocks = blocks_of(rows)
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
-    drawn = rows[rows.draws]
-    by_set = [here for _, here in drawn.groupby("dataset", sort=False)]
+    by_draw = rows[rows.draws]
+    by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
     page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours, only_timed)])
     write_samples(run_dir / "compare.csv", rows.to_dict("list"))
     write_samples(run_dir / "cells.csv", cells_of(filled)[CELL].to_dict("list"))

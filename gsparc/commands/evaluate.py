@@ -67,5 +67,5 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "per_sample.csv", evaluation.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
-    shown = results_table(facts, facts["model/label"], title, config.eval_on)
-    return finish(run_dir, facts, shown, lines=remarks(facts, config.eval_on))
+    results = results_table(facts, facts["model/label"], title, config.eval_on)
+    return finish(run_dir, facts, results, lines=remarks(facts, config.eval_on))

@@ -43,7 +43,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     title = f"{run.data.site.name}, {study.method.name}"
     levels = settings["mcs"]["snr_db"]
     points = {name: values for name, values in settings["pusch"]["ebno_db"].items() if values}
-    drawn, surest = {}, {}
+    errors, surest = {}, {}
     columns = *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
     with Progress(*columns) as bar:
         adapting = bar.add_task("rate adaptation", total=len(levels), now="")
@@ -57,11 +57,11 @@ def task(config: DictConfig) -> dict[str, Any]:
             def tick(now: str, modulation: str = modulation) -> None:
                 bar.update(sending, advance=1, now=f"{modulation} {now}")
 
-            drawn[modulation], surest[modulation], own = study.send(modulation, ebno_db, tick)
+            errors[modulation], surest[modulation], own = study.send(modulation, ebno_db, tick)
             facts |= own
             write_summary(run_dir / "summary.json", facts)
-    if drawn:
-        draw_errors(drawn, title, run_dir / "bler.png")
+    if errors:
+        draw_errors(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
     return finish(run_dir, facts, *tables(facts, title, list(points), levels))

@@ -37,5 +37,5 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     else:
         plan = plan_of(plain(config))
         localisation = by_model(config, run_dir, None if plan is None else plan.light)
-    facts, shown, lines = report(localisation, config.against, run_dir)
-    return finish(run_dir, facts, *shown, lines=lines)
+    facts, tables, lines = report(localisation, config.against, run_dir)
+    return finish(run_dir, facts, *tables, lines=lines)

@@ -60,16 +60,16 @@ def task(config: DictConfig) -> dict[str, Any]:
     coverage = None if promise is None else promise.coverage(how.share)
     lines = notes_of(field, coverage)
     unit = str(config.unit or predictor.site.level_unit)
-    drawn = list(layers(field, unit))
+    sheets = list(layers(field, unit))
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    for layer in drawn if config.pictures else ():
+    for layer in sheets if config.pictures else ():
         draw_layer(field, layer, run_dir / file_name(layer), title, floor)
     origin = predictor.site.georeference
     if origin is not None and geotiff_wanted(config.geotiff, origin):
         write_geotiff(run_dir / "map.tif", field, origin)
-    write_page(run_dir / "map.html", field, drawn, title, lines, floor)
+    write_page(run_dir / "map.html", field, sheets, title, lines, floor)
     facts = {
         **field.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,

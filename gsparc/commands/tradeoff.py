@@ -54,7 +54,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
     points, other_ms = tradeoff.sweep(candidates, threads, data, fold, **how)
     figure = DECIDING[data.site.kind]
-    shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
+    pareto = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
         operating_point.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
@@ -64,10 +64,10 @@ def task(config: DictConfig) -> dict[str, Any]:
         if value is not None
     }
     copy_ms = float(np.median(other_ms[COPY]))
-    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of(points, shown, chosen, copy_ms))
-    best = [points[i] for i in shown]
+    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of(points, pareto, chosen, copy_ms))
+    best = [points[i] for i in pareto]
     title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
-    save(tradeoff.draw_front(points, shown, beside, figure, method.name, title), run_dir / "tradeoff.png")
+    save(tradeoff.draw_front(points, pareto, beside, figure, method.name, title), run_dir / "tradeoff.png")
     facts = {
         **tradeoff.facts_of(points, best, figure, beside, copy_ms),
         **peak_memory(), **run.facts(),

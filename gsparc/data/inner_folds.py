@@ -215,8 +215,8 @@ def _drawn(
 ) -> tuple[Fold, ...]:
     """`count` distinct draws of a split by seeds of their own, each with the fewest rows again."""
     seeds = rng.integers(2**31, size=DRAWS * count)
-    drawn = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
-    first, *rest = {fold.test.tobytes(): fold for fold in drawn}.values()
+    folds = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
+    first, *rest = {fold.test.tobytes(): fold for fold in folds}.values()
     chosen = [first]
     while rest and len(chosen) < count:
         tested = np.concatenate([fold.test for fold in chosen])

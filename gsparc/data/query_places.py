@@ -174,8 +174,8 @@ def _end(check: Checker, end: End, alone: bool) -> Places | None:
     if len(known) < len(parts):
         return None
     if len({part.shape for part in known}) > 1:
-        shown = " and ".join(str(part.shape) for part in known)
-        fault = f"latitude and longitude have shapes {shown}; expected one shape"
+        both = " and ".join(str(part.shape) for part in known)
+        fault = f"latitude and longitude have shapes {both}; expected one shape"
         return check.problems.add(check.source, fault)
     across = np.column_stack(known) if pair else np.atleast_2d(known[0])
     height = across[:, 2] if across.shape[1] == 3 else None

@@ -235,10 +235,10 @@ def by_fingerprints(config: DictConfig) -> Localisation:
     }  # fmt: skip
     promise = "nothing is promised without calibration, or of another campaign"
     if groups:
-        drawn, share = how in ("random", "places", "blocks", "walks"), float(config.share)
-        inner: Any = how if drawn else "places"
+        random, share = how in ("random", "places", "blocks", "walks"), float(config.share)
+        inner: Any = how if random else "places"
         locator, facts["locate/calibrated_on"] = trusted(locator, known, inner, *cut, groups, share, seed)
-        promise = f"{share:.0%} are promised" if drawn else promise
+        promise = f"{share:.0%} are promised" if random else promise
     answers = {"field": locator.locate(heard)}
     if config.track:
         answers["alone"] = replace(locator, speed=None, point=SHARED).locate(heard)
@@ -273,9 +273,9 @@ def draw_posteriors(
         boxes = [
             Rectangle((x, y), w, h) for (x, y), (w, h) in zip(corners, cells.edge[order, :2], strict=True)
         ]
-        drawn = PatchCollection(boxes, cmap="Blues", linewidth=0)
-        drawn.set_array(np.maximum(density[order], density.max() - 12))
-        axis.add_collection(drawn)
+        patches = PatchCollection(boxes, cmap="Blues", linewidth=0)
+        patches.set_array(np.maximum(density[order], density.max() - 12))
+        axis.add_collection(patches)
         axis.plot(*trained[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
         axis.plot(*one.place[:2], "x", color="#D55E00", label="located")
         if true is not None:

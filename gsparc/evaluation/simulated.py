@@ -78,8 +78,8 @@ def _map(
     axis: Any, places: np.ndarray, values: np.ndarray, label: str, size: float, clipped: float = 0.01
 ) -> None:
     low, high = np.quantile(values, [clipped, 1 - clipped])
-    drawn = axis.scatter(*places[:, :2].T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
-    axis.figure.colorbar(drawn, ax=axis, location="bottom", label=label, shrink=0.8)
+    dots = axis.scatter(*places[:, :2].T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
+    axis.figure.colorbar(dots, ax=axis, location="bottom", label=label, shrink=0.8)
 
 
 def effect_shares(choice: Choice, path: Path) -> None:
@@ -103,12 +103,12 @@ def effect_shares(choice: Choice, path: Path) -> None:
 
 def shipped_scenes() -> tuple[Table, dict[str, np.ndarray]]:
     """Size, triangles and materials of every scene that comes with Sionna, and what `plans` draws of them."""
-    rows, drawn = [], {}
+    rows, meshes = [], {}
     for name in shipped():
         tracer = RayTracer(name, np.zeros(3), CARRIER_HZ)
         size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.box(), axis=0))
-        triangles = drawn[f"{name}, {size} m"] = tracer.triangles()
+        triangles = meshes[f"{name}, {size} m"] = tracer.triangles()
         used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
         rows.append([name, size, f"{len(triangles):,}", used])
     heads = ["scene", "size [m]", "triangles", "materials"]
-    return table("scene=NAME: scenes that come with Sionna", heads, [], rows), drawn
+    return table("scene=NAME: scenes that come with Sionna", heads, [], rows), meshes

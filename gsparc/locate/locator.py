@@ -147,8 +147,8 @@ def trusted(
         rows = np.union1d(inner.train, inner.val)
         without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)
-        drawn = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        groups.append((without, heard.at(drawn)))
+        sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
+        groups.append((without, heard.at(sample)))
     places = np.concatenate([heard.place for _, heard in groups])
 
     def looks(trust: Trust) -> list[Looked]:

@@ -29,7 +29,7 @@ PLAN_PIXELS = 1600  # of a plan's longer side
 def write_page(
     path: Path,
     field: FieldMap,
-    drawn: Sequence[Layer],
+    layers: Sequence[Layer],
     title: str,
     lines: Sequence[str],
     plan: FloorPlan | None,
@@ -46,7 +46,7 @@ def write_page(
     ]
     content = {
         "extent": [left, right, low, high], "step": field.grid.step * every,
-        "layers": [_encoded(layer, every) for layer in drawn],
+        "layers": [_encoded(layer, every) for layer in layers],
         "places": np.round(few, 3).tolist(), "stations": stations,
         "plan": None if plan is None else _plan(plan), "every": every,
         "refused": _bits(field.refused[::every, ::every]),

@@ -138,9 +138,9 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     axis.imshow(nothing, origin="lower", extent=field.grid.extent, cmap=grey, zorder=1, alpha=0.6)
     legend, known = layer.legend, layer.values[np.isfinite(layer.values)]
     limits = {"vmin": legend.low, "vmax": legend.high}
-    drawn = _cells(axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
+    image = _cells(axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
     ends = "both" if ((known < legend.low) | (known > legend.high)).any() else "neither"
-    bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
+    bar = figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.words:
         bar.set_ticks(list(range(len(layer.words))), labels=layer.words)
     if layer.unsure is not None:
@@ -158,8 +158,8 @@ def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
     """Hatch cells (ny, nx) of a map; a map of a single row or column has no area to hatch."""
     if min(cells.shape) > 1:
         how: dict[str, Any] = {"hatches": ["", "////"], "levels": [-0.5, 0.5, 1.5], "colors": "none"}
-        drawn = axis.contourf(field.grid.x, field.grid.y, cells.astype(float), zorder=2.5, **how)
-        drawn.set(edgecolor="black", linewidth=0.0)
+        hatches = axis.contourf(field.grid.x, field.grid.y, cells.astype(float), zorder=2.5, **how)
+        hatches.set(edgecolor="black", linewidth=0.0)
         axis.fill([], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why)
 
 
@@ -207,7 +207,7 @@ def draw_plan_picture(
     for axis, values, title in ((before, batch.error_before, "before"), (after, batch.error_after, "after")):
         image = np.full(batch.grid.shape, np.nan)
         image[batch.grid.inside] = values
-        drawn = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
+        mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
         bounded(axis, (left, low), (right, high), ylabel="", title=title)
         scale_bar(axis)
     if promise is not None and predictor is not None:
@@ -218,7 +218,7 @@ def draw_plan_picture(
     for number, place in enumerate(batch.places[:60], 1):
         after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
                        path_effects=OUTLINE, zorder=4)  # fmt: skip
-    figure.colorbar(drawn, ax=[before, after], label="expected error [dB]", shrink=0.8)
+    figure.colorbar(mesh, ax=[before, after], label="expected error [dB]", shrink=0.8)
     curve.plot(np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)]), ".-")
     curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
     curve.set_ylim(bottom=0)  # what the walk gains is seen beside what is left
@@ -232,8 +232,8 @@ def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = 
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
     label = f"share of the area with {threshold_db:g} {unit} or more"
     label = label if placing.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
-    drawn = axis.scatter(*placing.places[:, :2].T, c=placing.goal, s=60, marker="s", cmap="viridis")
-    figure.colorbar(drawn, ax=axis, label=f"{label}, with a station here", shrink=0.85)
+    dots = axis.scatter(*placing.places[:, :2].T, c=placing.goal, s=60, marker="s", cmap="viridis")
+    figure.colorbar(dots, ax=axis, label=f"{label}, with a station here", shrink=0.85)
     draw_stations(axis, placing.stations)
     draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
     bounded(axis, (left, low), (right, high))

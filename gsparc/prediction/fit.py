@@ -92,6 +92,6 @@ def _learned_from(data: Measurements, share: float, seed: int) -> Fold:
     """All rows; those at a share of the places validate. Nothing is left to test on."""
     rows = np.arange(len(data))
     places, which = np.unique(rows if data.place is None else data.place, return_inverse=True)
-    drawn = np.random.default_rng(seed).permutation(len(places))[: round(share * len(places))]
-    validates = np.isin(which.reshape(-1), drawn)
+    held_out = np.random.default_rng(seed).permutation(len(places))[: round(share * len(places))]
+    validates = np.isin(which.reshape(-1), held_out)
     return Fold(rows[~validates], rows[validates], rows[:0])

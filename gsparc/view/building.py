@@ -61,11 +61,11 @@ class Given:
 
 def build(viewed: Viewed, given: Given, station: str | None, measured: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
-    shown = [viewed.box()]  # where was measured, and the ends that stand
-    shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
+    points = [viewed.box()]  # where was measured, and the ends that stand
+    points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
     if viewed.site.static_end is None:
-        shown.append(viewed.site.box + viewed.site.origin)
-    frame = Frame.around(np.concatenate(shown))
+        points.append(viewed.site.box + viewed.site.origin)
+    frame = Frame.around(np.concatenate(points))
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
@@ -260,8 +260,8 @@ def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     if paths is None or paths.towards is None or receiver is None:
         return None
     length = paths.delay_ns * 1e-9 * LIGHT
-    shown = np.minimum(length, REACH * extent)
-    ends = receiver + paths.towards * shown[:, None]
+    reach = np.minimum(length, REACH * extent)
+    ends = receiver + paths.towards * reach[:, None]
     colours = PATHS.of(paths.gain_db - paths.gain_db.max(initial=-np.inf))
     segments = np.stack([np.broadcast_to(receiver, ends.shape), ends], axis=1)
     return Lines(RAYS, segments, colours), Points(SOURCES, ends, colours, extent / 80)

@@ -81,13 +81,13 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
 def _mark_warnings(marks: list[tuple[float, bool]], values: np.ndarray) -> list[str]:
     warnings = []
     for mark, apart in marks:
-        count, shown = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
-        share = f"{count} of {len(values)} levels are exactly {shown}"
+        count, level = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
+        share = f"{count} of {len(values)} levels are exactly {level}"
         if apart:
             warnings.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
         else:
             warnings.append(
-                f"{share}, the least: not heard? leave them empty and give sensitivity_db={shown}"
+                f"{share}, the least: not heard? leave them empty and give sensitivity_db={level}"
             )
     return warnings
 

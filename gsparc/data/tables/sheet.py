@@ -96,8 +96,8 @@ class Sheet:
                 bad[bad] = self.words(head)[bad] != ""
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
-            shown = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
-            rows = (f"{self.rows[i]}: {cell}" for i, cell in zip(np.flatnonzero(bad), shown, strict=True))
+            texts = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
+            rows = (f"{self.rows[i]}: {cell}" for i, cell in zip(np.flatnonzero(bad), texts, strict=True))
             mark = "commas" if self.decimal == "," else "points, and no marks between thousands"
             hint = f"; this table has decimal {mark}" if any("," in c or "." in c for c in cells) else ""
             what = f"is no finite number{hint}; or leave it empty"

@@ -37,20 +37,20 @@ RATES = {
 LEAST_RATE = 3e-4
 
 
-def draw_errors(drawn: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
+def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
     """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
-    figure, axes = panels(5.6 * len(drawn), 8, 2, len(drawn), grid=False)
-    for column, (modulation, curves) in enumerate(drawn.items()):
+    figure, axes = panels(5.6 * len(rates), 8, 2, len(rates), grid=False)
+    for column, (modulation, curves) in enumerate(rates.items()):
         for name, (label, colour, line) in STYLES.items():
             if name not in curves:
                 continue
             curve, style = curves[name], {"color": colour, "linestyle": line, "marker": "."}
-            shown = curve.bler.clip(LEAST_RATE).to_numpy()
+            bler = curve.bler.clip(LEAST_RATE).to_numpy()
             counts = zip(curve.errors, curve.blocks, strict=True)
             ends = np.array([binomial_interval(int(e), int(n)) for e, n in counts]).clip(LEAST_RATE)
-            reach = np.maximum([[-1], [1]] * (ends.T - shown), 0)
+            reach = np.maximum([[-1], [1]] * (ends.T - bler), 0)
             style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
-            axes[0, column].errorbar(curve.index, shown, reach, **style_above)
+            axes[0, column].errorbar(curve.index, bler, reach, **style_above)
             axes[1, column].plot(curve.index, curve.ber.clip(1e-6), **style)
         axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)

@@ -126,8 +126,8 @@ class LinkStudy:
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
         blocks = transmit(pusch, self.grid.band(), levels, sizes, tick)
-        drawn, surest = curves(blocks, self.accepted), acceptance(blocks, self.score, SHARES)
-        facts = pusch_facts(modulation, drawn)
+        rates, surest = curves(blocks, self.accepted), acceptance(blocks, self.score, SHARES)
+        facts = pusch_facts(modulation, rates)
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()
             facts |= {f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares}
@@ -138,4 +138,4 @@ class LinkStudy:
             "pilots/saved": pusch.pilot_share * float(self.accepted.mean()),
             f"time/pusch_{modulation}_s": time.perf_counter() - begun,
         }  # fmt: skip
-        return drawn, surest, facts
+        return rates, surest, facts

@@ -215,11 +215,11 @@ def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame
     }
 
 
-def pusch_facts(modulation: str, drawn: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
     """`pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %, and how far behind perfect."""
     facts: dict[str, Any] = {}
-    crossings = {name: crossing(curve.bler) for name, curve in drawn.items()}
-    for name, curve in drawn.items():
+    crossings = {name: crossing(curve.bler) for name, curve in rates.items()}
+    for name, curve in rates.items():
         stem, at = f"pusch/{modulation}/{name}", crossings[name]
         reference = crossings["perfect@accepted" if name.endswith("@accepted") else "perfect"]
         facts[f"{stem}/ebno_at_bler_0.1"] = at

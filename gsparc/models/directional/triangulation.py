@@ -247,9 +247,9 @@ def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mos
     if len(owners) < 2:
         return np.zeros((0, 3))
     groups = np.split(order, starts[1:])
-    drawn = rng.integers(len(groups), size=(pairs, 2))
+    couples = rng.integers(len(groups), size=(pairs, 2))
     points = []
-    for a, b in drawn[drawn[:, 0] != drawn[:, 1]]:
+    for a, b in couples[couples[:, 0] != couples[:, 1]]:
         one, two = rays.direction[groups[a]], rays.direction[groups[b]]
         here, there = rays.places[owners[a]], rays.places[owners[b]]
         s, t, gap = closest_approach(here, one, there, two)

@@ -80,12 +80,12 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             nodes |= {part.name: draw(api, scene.frame, part) for part in parts}
             recorder.insert_sleep(PAUSE_S)
             count += 1
-    shown = ""
+    which = ""
     if len(viewed.stations) > 1:
-        shown = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
+        which = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
         some = len(names) < len(viewed.stations)
-        shown += "; station=NAME shows another" if some else ", one after another"
-    notes = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=shown)]
+        which += "; station=NAME shows another" if some else ", one after another"
+    notes = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=which)]
     title = scene.title if len(names) == 1 else scene.title.removesuffix(f": {names[0]}")
     return recorder.as_html(), _side_panel(replace(scene, title=title), notes, legends)
 

@@ -286,10 +286,10 @@ class Session:
     def _show_station(self, name: str) -> Iterator[None]:
         self.station, self.one = name, self.view.station(name)
         choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
-        shown = {name: self.nodes[name].visible for name in choices if name in self.nodes}
+        visibility = {name: self.nodes[name].visible for name in choices if name in self.nodes}
         with self.client.atomic():
             self._draw_still()
-            for name, visible in shown.items():
+            for name, visible in visibility.items():
                 self._seen(name, visible)
         self.title.content = f"**{self.scene.title}**"
         self._legends()
@@ -445,9 +445,9 @@ class Session:
 
     def _legends(self) -> None:
         legends = self.scene.legends
-        shown = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
-        shown += [PATHS] if RAYS in self.nodes else []
-        shown += [self.power] if PLANE in self.nodes and self.power is not None else []
+        entries = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
+        entries += [PATHS] if RAYS in self.nodes else []
+        entries += [self.power] if PLANE in self.nodes and self.power is not None else []
         name = NOTHING if self.chosen is None else self.chosen.value
-        shown += [self.map_layers[name][2]] if name in self.map_layers else []
-        self.legend.content = legend_html(shown, self.scene.parts)
+        entries += [self.map_layers[name][2]] if name in self.map_layers else []
+        self.legend.content = legend_html(entries, self.scene.parts)

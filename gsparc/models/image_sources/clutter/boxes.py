@@ -78,11 +78,11 @@ def find_box(
     def repaired(boxes: Tensor) -> Tensor:
         return inside_out(boxes, room)
 
-    drawn = repaired(_random(draws, room, generator))
-    drawn = drawn[score(drawn).topk(min(parents, draws)).indices]
+    starts = repaired(_random(draws, room, generator))
+    starts = starts[score(starts).topk(min(parents, draws)).indices]
     if seeds is not None:
-        drawn = torch.cat([drawn, repaired(seeds)])
-    return evolve(drawn, score, repaired, generator)
+        starts = torch.cat([starts, repaired(seeds)])
+    return evolve(starts, score, repaired, generator)
 
 
 def inside_out(boxes: Tensor, room: Tensor) -> Tensor:

@@ -78,9 +78,9 @@ def find_patch(
 
     middle = low + (high - low) * torch.rand(DRAWS, 2, generator=generator)
     side = SMALLEST * torch.exp(torch.rand(DRAWS, 2, generator=generator) * math.log(LARGEST / SMALLEST))
-    drawn = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
-    drawn = drawn[score(drawn).topk(8).indices]
-    return evolve(drawn, score, repaired, generator, rounds=10)
+    starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
+    starts = starts[score(starts).topk(8).indices]
+    return evolve(starts, score, repaired, generator, rounds=10)
 
 
 @dataclass(frozen=True)
