@@ -116,7 +116,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     if "station" in part.arrays:
         of_row = raw.arrays["station"]
         rows = np.flatnonzero(np.isin(of_row, chosen))
-        _left(rows, "dataset.stations", source)
+        _check_rows(rows, "dataset.stations", source)
         part = _rows_of(part, rows, source)
         part.arrays["station"] = np.searchsorted(chosen, of_row[rows])
         note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
@@ -136,7 +136,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
     for name in wanted:
         if name not in known:
             raise DataError(f"dataset.runs={name}: no such run in {source}{suggest(name, known)}")
-    return _kept(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
+    return _select(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
 
 
 def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
@@ -156,11 +156,11 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
         raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {mask.shape}")
     low &= True if mask is None else mask.astype(bool)
     if low.ndim == 1:
-        return _kept(raw, ~low, option, source)
+        return _select(raw, ~low, option, source)
     measured = ~low & measured_links(raw, source)
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
-    rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
+    rest = _select(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
     return Noted(rest.raw, (*links, *rest.notes))
 
 
@@ -178,7 +178,7 @@ def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
         first, last = np.ceil(edges[:-1]).astype(int), np.ceil(edges[1:]).astype(int)
         keep = np.zeros(count, bool)
         keep[np.random.default_rng(SEED).integers(first, last)] = True
-    return _kept(raw, keep, f"dataset.max_rows={max_rows}", source)
+    return _select(raw, keep, f"dataset.max_rows={max_rows}", source)
 
 
 def take_rows(
@@ -319,9 +319,9 @@ def _runs(first: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.repeat(first - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
 
 
-def _kept(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
+def _select(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
     rows = np.flatnonzero(keep)
-    _left(rows, option, source)
+    _check_rows(rows, option, source)
     if len(rows) == len(keep):
         return Noted(raw)
     note = f"{option}: {len(keep) - len(rows)} of {len(keep)} rows left out"
@@ -334,7 +334,7 @@ def _rows_of(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
     return replace(raw, arrays=take_rows(named, rows, count, station_count(raw)))
 
 
-def _left(rows: np.ndarray, option: str, source: str | Path) -> None:
+def _check_rows(rows: np.ndarray, option: str, source: str | Path) -> None:
     if len(rows) < FEWEST:
         raise DataError(f"{option}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
 

@@ -154,7 +154,7 @@ def by_model(
         locator = Locator(locator.field, locator.cells, unknown, trust, locator.share)
         if config.store:
             checkpoint.amend(config.ckpt, locating.trust_state(trust, unknown, locator.share))
-    heard, placed = _heard(config, run)
+    heard, placed = _snapshots(config, run)
     answers, trained = {method.name: locator.locate(heard)}, snapshots(data, learned)
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
     if config.track:
@@ -184,7 +184,7 @@ def _trust(
     return result
 
 
-def _heard(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
+def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     """The snapshots, and whether their places are known."""
     site, placed = run.data.site, True
     if config.data is None:
@@ -198,7 +198,7 @@ def _heard(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             raw.arrays[place] = np.linspace(low, high, count)
         other = aligned(interpreted(raw, config.data), site)
         heard = snapshots(other, np.arange(len(other)))
-    return heard.at(_drawn(config, len(heard))), placed
+    return heard.at(_sample(config, len(heard))), placed
 
 
 def by_fingerprints(config: DictConfig) -> Localisation:
@@ -224,7 +224,7 @@ def by_fingerprints(config: DictConfig) -> Localisation:
         known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
     else:
         known, heard = map(rows.at, parted(rows, how, *cut, seed))
-    heard = heard.at(_drawn(config, len(heard.level)))
+    heard = heard.at(_sample(config, len(heard.level)))
     offset = DEVICES_DB if config.offset_db is None else float(config.offset_db)
     started = time.perf_counter()
     locator = FingerprintLocator.of(known, offset, config.prior == "trained", bool(config.track))
@@ -246,7 +246,7 @@ def by_fingerprints(config: DictConfig) -> Localisation:
     return Localisation(answers, *both, np.zeros(3), placed, locator.area.level, promise, facts)
 
 
-def _drawn(config: DictConfig, count: int) -> np.ndarray:
+def _sample(config: DictConfig, count: int) -> np.ndarray:
     """Numbers of at most `rows` of so many rows, drawn evenly."""
     if not count:
         raise ValueError("there is nothing to be located")

@@ -18,7 +18,7 @@ from crashes import small_campaign
 
 from gsparc.commands.check import main as check
 from gsparc.data import blocks
-from gsparc.data.datasets.sionna import _heard
+from gsparc.data.datasets.sionna import _in_decibels
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
@@ -150,10 +150,10 @@ def test_outlier_does_not_set_the_sensitivity():
     weakest = np.sort(power)[1]
     power[power.argmin()] = 10**-21.0
     power[power.argsort()[-2:]] = 0
-    found = _heard(power)
+    found = _in_decibels(power)
     np.testing.assert_allclose(found["sensitivity_db"], 10 * np.log10(weakest))
     assert np.isnan(found["rssi_db"]).sum() == 3
-    assert "sensitivity_db" not in _heard(power[power > 0])  # nothing missing: every power is one
+    assert "sensitivity_db" not in _in_decibels(power[power > 0])  # nothing missing: every power is one
 
 
 def test_noise_has_the_stated_power(tmp_path):

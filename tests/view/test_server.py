@@ -128,7 +128,7 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
     drag(session, "tx", low + 0.2 * (high - low))
     settle(session)
     assert (session.nodes["sphere"].colors != before).any() and (session.picture.image != panel).any()
-    session._shown(CLOUD, "ellipsoids")
+    session._show_only(CLOUD, "ellipsoids")
     assert session.nodes["splats"].visible and not session.nodes["gaussians"].visible
 
 

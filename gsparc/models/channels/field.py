@@ -373,7 +373,7 @@ class ChannelField(ConditionalField):
             "groups": [
                 {
                     **{one.name: getattr(group, one.name) for one in fields(group)},
-                    "slot": _stored(group.slot),
+                    "slot": _slot_state(group.slot),
                     "target": group.target * self.runs.factors[group.run][:, None],
                 }
                 for group in groups
@@ -405,7 +405,7 @@ def _covariances(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
     return [signal + disturbance(values, group) for signal, group in both]
 
 
-def _stored(slot: Slot) -> dict[str, Any]:
+def _slot_state(slot: Slot) -> dict[str, Any]:
     """What `_read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
     unknown = bool(slot.end.isnan().any())
     return {**vars(slot), "end": slot.end[:0] if unknown else slot.end}

@@ -229,10 +229,10 @@ class ImageSourceGP(FramedMethod):
 
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
         """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""
-        parts = [gather(data, self._seen(known, i), self.search_rows, self.seed + i) for i in range(count)]
+        parts = [gather(data, self._rows_of(known, i), self.search_rows, self.seed + i) for i in range(count)]
         return [self.frame.inside(part) for part in parts]
 
-    def _seen(self, known: np.ndarray, number: int) -> np.ndarray:
+    def _rows_of(self, known: np.ndarray, number: int) -> np.ndarray:
         """The rows of a search by its number."""
         groups = self._groups
         return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
@@ -248,7 +248,7 @@ class ImageSourceGP(FramedMethod):
             members = [one for one in all_members if one.number % len(self._groups) == turn]
             if not members:
                 continue
-            apart = self.frame.inside(gather(data, self._seen(known, turn), most, self.seed))
+            apart = self.frame.inside(gather(data, self._rows_of(known, turn), most, self.seed))
             twin = copy.copy(self)
             twin._conditioned(apart, [member.scene for member in members])
             twin.weights = ensemble_weights(members)

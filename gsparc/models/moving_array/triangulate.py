@@ -113,12 +113,12 @@ def find_sources(
     low, high = low - far, high + far
     known = torch.empty(0, 3) if first is None else first.reshape(1, 3).float()
 
-    def left(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
+    def residual_of(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Residual lags (n, Q) of sources of the best powers."""
         atoms = space.atoms(bearings(sources, receivers, rotation))
         return lags - mixture(powers(lags, atoms, settings.ridge), atoms)
 
-    positions, residual = known, left(lags, receivers, known) if len(known) else lags
+    positions, residual = known, residual_of(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())
     while len(positions) < settings.sources:
         candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
@@ -127,7 +127,7 @@ def find_sources(
         if not len(new):
             break
         positions = torch.cat([positions, new[: settings.sources - len(positions)]])
-        residual = left(lags, receivers, positions)
+        residual = residual_of(lags, receivers, positions)
         before, energy = energy, float(residual.square().sum())
         if energy > (1 - settings.least_gain) * before or seconds() <= end:
             break
@@ -143,7 +143,7 @@ def find_sources(
             break
         optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         some = torch.randperm(len(receivers), generator=generator)[:64]
-        residual = left(lags[some], receivers[some], torch.cat([known, free]))
+        residual = residual_of(lags[some], receivers[some], torch.cat([known, free]))
         loss = residual.square().sum() / lags[some].square().sum()
         optimiser.zero_grad()
         loss.backward()

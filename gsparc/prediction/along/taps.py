@@ -198,9 +198,9 @@ def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
     energy = np.convolve(np.concatenate([profile, profile])[: apart + taps - 1], np.ones(taps), "valid")
     middle = int(energy.argmax())
 
-    def left(first: int) -> float:
+    def residual(first: int) -> float:
         columns, solve = _atoms(turns, first, taps)
         return float(np.square(np.abs(rows @ solve.T @ columns.T - rows)).sum())
 
-    best = min(range(middle - 4, middle + 5), key=left)
+    best = min(range(middle - 4, middle + 5), key=residual)
     return best if best < apart / 2 or apart <= taps else best - apart

@@ -77,7 +77,7 @@ class Session:
         first_view(client.camera)
         self._panel()
         self._add_gizmos()
-        self.wanted()
+        self.want_answer()
         self.want_plane()
 
     @property
@@ -155,9 +155,9 @@ class Session:
             if has[VALUES]:
                 points = {"values": VALUES, **({"errors": ERRORS} if has[ERRORS] else {})}
                 chosen = gui.add_dropdown("measured points", (*points, NOTHING), initial_value="values")
-                self._on(chosen, partial(self._shown, points))
+                self._on(chosen, partial(self._show_only, points))
             if has[GAUSSIANS]:
-                self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._shown, CLOUD))
+                self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._show_only, CLOUD))
                 button = gui.add_button("download Gaussians as PLY")
                 button.on_click(lambda _: self._download())
             self.chosen: Any = None
@@ -212,7 +212,7 @@ class Session:
         self._moved(end)
 
     def _moved(self, end: str) -> None:
-        self.wanted()
+        self.want_answer()
         if end == "tx" and self.site.static_end is None:
             self.want_plane()  # which shows the power of this transmitter
 
@@ -229,13 +229,13 @@ class Session:
                 place = weak_place
         self._move(moving, place)
 
-    def _shown(self, parts: Mapping[str, str], choice: str) -> None:
+    def _show_only(self, parts: Mapping[str, str], choice: str) -> None:
         """Of parts, by the words to choose them by, show the one that was chosen alone."""
         for word, name in parts.items():
-            self._seen(name, word == choice)
+            self._set_visible(name, word == choice)
         self._legends()
 
-    def _seen(self, name: str, visible: bool) -> None:
+    def _set_visible(self, name: str, visible: bool) -> None:
         """Show or hide a part; what is hidden at first is sent when it is first shown."""
         if name in self.nodes:
             self.nodes[name].visible = visible
@@ -246,7 +246,7 @@ class Session:
         self.queries.clear()
         self.delays.clear()
         self.front.data = self._front()
-        self.wanted()
+        self.want_answer()
 
     def _front(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first, and
@@ -274,7 +274,7 @@ class Session:
 
     # -- what the worker does ----------------------------------------------------------------------
 
-    def wanted(self) -> None:
+    def want_answer(self) -> None:
         """Have the present places answered."""
         self.asked_s = time.perf_counter()
         self.work.ask((self.client.client_id, "answer"), self._answered, urgent=True)
@@ -290,10 +290,10 @@ class Session:
         with self.client.atomic():
             self._draw_still()
             for name, visible in visibility.items():
-                self._seen(name, visible)
+                self._set_visible(name, visible)
         self.title.content = f"**{self.scene.title}**"
         self._legends()
-        self.wanted()
+        self.want_answer()
         self.want_plane()
         yield
 

@@ -177,7 +177,7 @@ def visible_sequences(
     if hidden and len(best):
         seen = torch.cat(
             [
-                _seen(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
+                _share(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
                 for part in best.split(50)
             ]
         )
@@ -244,7 +244,7 @@ def _reflected(mirrors: Mirrors, paths: Paths) -> Tensor:
     return (inside.all(-1) & paths.valid).float()
 
 
-def _seen(mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor) -> Tensor:
+def _share(mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor) -> Tensor:
     """Mean visible share (W,) of sequences, walls and boxes in the way included."""
     paths = Unfolding.of(transmitter, mirrors.planes, tuple(sequences)).paths(places)
     return visible_share(paths, mirrors.clutter, mirrors.planes).mean(1)
