@@ -62,7 +62,7 @@ def fit(
         DataError: arrays that `gsparc check` would refuse, all problems with array and row.
         ValueError: no such model, or one that cannot learn these measurements.
     """
-    given = {
+    inputs = {
         "rx_position": rx,
         "tx_position": tx,
         "rssi_db": rssi,
@@ -70,7 +70,7 @@ def fit(
         "spectrum": spectrum,
         **arrays,
     }
-    raw = Raw({name: np.asarray(value) for name, value in given.items() if value is not None}, {})
+    raw = Raw({name: np.asarray(value) for name, value in inputs.items() if value is not None}, {})
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:

@@ -218,10 +218,10 @@ class Argos(Release):
     def __init__(
         self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
     ) -> None:
-        given = dict(encoder or {})
-        file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
+        settings = dict(encoder or {})
+        file, room = settings.pop("file", None), Path(settings.pop("folder", "outputs/encoders"))
         super().__init__(root, **rest)
-        self.encoder = (room, EncoderSettings(**given), file)
+        self.encoder = (room, EncoderSettings(**settings), file)
 
     def read(self, folder: Path) -> Measurements:
         """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
