@@ -47,7 +47,7 @@ VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
 
 
 @dataclass(frozen=True)
-class Given:
+class Building:
     """What is known of a site besides its model.
 
     Attributes:
@@ -59,7 +59,7 @@ class Given:
     walls: SceneWalls | None = None
 
 
-def build(viewed: Viewed, given: Given, station: str | None, measured: Measured | None) -> Scene:
+def build(viewed: Viewed, building: Building, station: str | None, measured: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
     points = [viewed.box()]  # where was measured, and the ends that stand
     points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
@@ -69,13 +69,13 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
-    ground = ground_of(viewed, given)
-    if given.plan is not None:
-        corners = np.column_stack([given.plan.corners(), np.full(4, ground - BENEATH * extent)])
+    ground = ground_of(viewed, building)
+    if building.plan is not None:
+        corners = np.column_stack([building.plan.corners(), np.full(4, ground - BENEATH * extent)])
         edges = corners[1] - corners[0], corners[3] - corners[0]
-        parts.append(Sheet("floor plan", corners[0], *edges, given.plan.image))
-    if given.walls is not None:
-        parts += walls_faces(given.walls)
+        parts.append(Sheet("floor plan", corners[0], *edges, building.plan.image))
+    if building.walls is not None:
+        parts += walls_faces(building.walls)
     if measured is not None:
         parts += _measured_parts(measured, legends, extent)
     for name in viewed.stations:
@@ -104,14 +104,14 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
     return Scene(title, frame, tuple(parts), beneath, legends, hidden, viewed.notes)
 
 
-def ground_of(viewed: Viewed, given: Given) -> float:
+def ground_of(viewed: Viewed, building: Building) -> float:
     """Height beneath which nothing is shown [m]: of measured places, planes and known walls."""
     low = [float(viewed.box()[0, 2])]
     if viewed.site.kind in MAPPED:
         low.append(viewed.heights()[0])
-    if given.walls is not None:
-        low += [float(face[:, 2].min()) for face in given.walls.faces]
-        low += [float(box[0, 2]) for box in given.walls.boxes]
+    if building.walls is not None:
+        low += [float(face[:, 2].min()) for face in building.walls.faces]
+        low += [float(box[0, 2]) for box in building.walls.boxes]
     return min(low)
 
 

@@ -284,13 +284,13 @@ def in_metres(check: Checker) -> Georeference | None:
 
 def _stated(check: Checker) -> Georeference | None:
     """The origin of positions in metres, where attributes of the file say where on Earth it lies."""
-    given = [check.raw.attributes.get(f"origin_{name}") for name in ("latitude", "longitude")]
-    if given == [None, None]:
+    degrees = [check.raw.attributes.get(f"origin_{name}") for name in ("latitude", "longitude")]
+    if degrees == [None, None]:
         return None
     try:
-        return Georeference(*(float(value) for value in given))  # type: ignore[arg-type]
+        return Georeference(*(float(value) for value in degrees))  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
-        return check.refuse("origin_latitude", f"with origin_longitude {given}: expected degrees ({error})")
+        return check.refuse("origin_latitude", f"with origin_longitude {degrees}: expected degrees ({error})")
 
 
 def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
