@@ -21,10 +21,10 @@ def machine() -> dict[str, Any]:
     import torch
 
     commit = output_of("git", "describe", "--always", "--dirty")
-    asked = "--query-gpu=name,driver_version,clocks.max.sm,clocks.max.mem"
+    query = "--query-gpu=name,driver_version,clocks.max.sm,clocks.max.mem"
     return {
         "gpu": torch.cuda.get_device_name(),
-        "driver": output_of("nvidia-smi", asked, "--format=csv,noheader"),
+        "driver": output_of("nvidia-smi", query, "--format=csv,noheader"),
         "capability": ".".join(map(str, torch.cuda.get_device_capability())),
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
@@ -94,17 +94,17 @@ def train(file: Path) -> None:
         started = time.perf_counter()
         try:
             environment = {**os.environ, "HYDRA_FULL_ERROR": "1"}
-            done = subprocess.run(command, capture_output=True, text=True, timeout=130, env=environment)
+            process = subprocess.run(command, capture_output=True, text=True, timeout=130, env=environment)
         except subprocess.TimeoutExpired as late:
-            done = subprocess.CompletedProcess(command, 124, "", str(late))
-        results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": done.returncode}
+            process = subprocess.CompletedProcess(command, 124, "", str(late))
+        results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": process.returncode}
         summary = folder / "summary.json"
-        if done.returncode == 0 and summary.exists():
+        if process.returncode == 0 and summary.exists():
             facts = json.loads(summary.read_text())
             wanted = ("test/", "time/", "model/", "baseline/nearest/test", "baseline/nearest/ssim")
             results[accelerator] |= {k: v for k, v in facts.items() if k.startswith(wanted)}
         else:
-            results[accelerator]["error"] = (done.stderr or done.stdout)[-1500:]
+            results[accelerator]["error"] = (process.stderr or process.stdout)[-1500:]
         update(file, train=results)
     key = "test/ssim_median"
     both = [results[accelerator] for accelerator in ("gpu", "cpu")]
@@ -127,11 +127,11 @@ def table(file: Path) -> None:
     sys.stdout.write("\n".join(lines) + "\n")
 
 
-def flat(found: Any, before: str = "") -> list[tuple[str, str]]:
+def flat(value: Any, before: str = "") -> list[tuple[str, str]]:
     """Nested keys joined by dots, numbers to four digits."""
-    if isinstance(found, dict):
-        return [row for key, inner in found.items() for row in flat(inner, f"{before}.{key}".lstrip("."))]
-    return [(before, f"{found:.4g}" if isinstance(found, float) else str(found).replace("\n", " ")[:300])]
+    if isinstance(value, dict):
+        return [row for key, inner in value.items() for row in flat(inner, f"{before}.{key}".lstrip("."))]
+    return [(before, f"{value:.4g}" if isinstance(value, float) else str(value).replace("\n", " ")[:300])]
 
 
 SUMMARY_WORDS = ("passed", "failed", "skipped", "SUMMARY", " error")
@@ -144,8 +144,8 @@ def note(file: Path, name: str, status: str, seconds: str) -> None:
     log = file.parent / f"{name}.log"
     if log.exists() and name in ("tests", "hard", "sanitize"):
         lines = log.read_text(errors="replace").splitlines()
-        kept = [line for line in lines if any(word in line for word in SUMMARY_WORDS)]
-        stages[name]["said"] = kept[-6:]
+        summary = [line for line in lines if any(word in line for word in SUMMARY_WORDS)]
+        stages[name]["said"] = summary[-6:]
     file.write_text(json.dumps(known | {"stages": stages}, indent=1))
 
 

@@ -99,8 +99,8 @@ def graph_of(function: Callable[[], Any], inner: int = 1) -> torch.cuda.CUDAGrap
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph), torch.no_grad():
-        kept = [function() for _ in range(inner)]
-    del kept
+        outputs = [function() for _ in range(inner)]
+    del outputs
     return graph
 
 
@@ -159,7 +159,7 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
     pairs, entries = counted_pairs(model, pose)
     plan = make_plan(*model, pose, GRID)
     pixels = GRID.height * GRID.width
-    found: dict[str, Any] = {"pairs": pairs, "entries": entries, "pairs_per_pixel": pairs / pixels}
+    results: dict[str, Any] = {"pairs": pairs, "entries": entries, "pairs_per_pixel": pairs / pixels}
 
     # Minimal bytes and operations: the model once, the plan's records once, images once.
     image, gaussians, records = 8 * pixels, 4 * count * 12, 4 * count * 21
@@ -180,8 +180,8 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
         "frozen_query": (thaw, thawing),
     }
     for name, (call, cost) in calls.items():
-        found[name] = guarded(lambda call=call, cost=cost: compared(kernel_ms(call), *cost, limits))
-        found[f"{name}_cold"] = guarded(lambda call=call, cost=cost: compared(cold_ms(call), *cost, limits))
+        results[name] = guarded(lambda call=call, cost=cost: compared(kernel_ms(call), *cost, limits))
+        results[f"{name}_cold"] = guarded(lambda call=call, cost=cost: compared(cold_ms(call), *cost, limits))
 
     leaves = [tensor.clone().requires_grad_() for tensor in (*model, features)]
     upstream = torch.randn(1, 1, GRID.height, GRID.width, device="cuda")
@@ -196,9 +196,9 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
             "graph": (graph_of(query).replay, whole),
         }
         for name, (call, cost) in ends.items():
-            found[f"end_to_end_{name}"] = compared(wall_ms(call), *cost, limits)
-    found["end_to_end_forward_backward"] = compared(wall_ms(step), *step_cost, limits)
-    return found
+            results[f"end_to_end_{name}"] = compared(wall_ms(call), *cost, limits)
+    results["end_to_end_forward_backward"] = compared(wall_ms(step), *step_cost, limits)
+    return results
 
 
 def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
@@ -241,8 +241,8 @@ def frozen(count: int, limits: dict[str, Any]) -> dict[str, Any]:
     model, pose = scene(count), origin()
     view = freeze(make_plan(*model, pose, GRID), *model, version=0)
     weights, pixels = int((view.buffers[3] > 0).sum()), GRID.height * GRID.width
-    found: dict[str, Any] = {"gaussians": count, "weights_not_zero": weights}
-    found["share_of_weights_not_zero"] = weights / (count * pixels)
+    results: dict[str, Any] = {"gaussians": count, "weights_not_zero": weights}
+    results["share_of_weights_not_zero"] = weights / (count * pixels)
     for batch in BATCHES:
         features = torch.rand(batch, count, 1, device="cuda")
         query = partial(view.render, features, 0)
@@ -252,8 +252,8 @@ def frozen(count: int, limits: dict[str, Any]) -> dict[str, Any]:
             wall = wall_ms(query, rounds=30)
         rates = {"": wall["p50"], "_captured": kernels.get("p50", math.nan)}
         rates = {f"spectra_per_s{name}": 1e3 * batch / ms for name, ms in rates.items()}
-        found[f"batch{batch}"] = {"end_to_end": wall, "kernels": kernels, **rates}
-    return found
+        results[f"batch{batch}"] = {"end_to_end": wall, "kernels": kernels, **rates}
+    return results
 
 
 def network_weights(count: int, inputs: int, hidden: int, outputs: int) -> list[Tensor]:
@@ -264,18 +264,18 @@ def network_weights(count: int, inputs: int, hidden: int, outputs: int) -> list[
 
 def emission(count: int, batch: int, limits: dict[str, Any]) -> dict[str, Any]:
     """The emission networks alone (33-32-2), forward and backward."""
-    weights, found = network_weights(count, 33, 32, 2), {}
+    weights, results = network_weights(count, 33, 32, 2), {}
     for samples in (1, batch):
         encoded = torch.randn(samples, 33, device="cuda")
         flops = 2 * samples * count * (33 * 32 + 64)
         bytes_ = 4 * sum(w.numel() for w in weights) + 8 * samples * count
         ours = kernel_ms(partial(networks, encoded, *weights), inner=2)
-        found[f"batch{samples}"] = compared(ours, bytes_, flops, limits)
+        results[f"batch{samples}"] = compared(ours, bytes_, flops, limits)
     leaves = [weight.requires_grad_() for weight in weights]
     out = networks(encoded, *leaves)
     slope = torch.randn_like(out)
     grads = partial(torch.autograd.grad, out, leaves, slope, retain_graph=True)
-    return found | {"backward": event_ms(grads, rounds=10)}
+    return results | {"backward": event_ms(grads, rounds=10)}
 
 
 def similarity(batch: int, limits: dict[str, Any]) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def peak_gb() -> float:
 
 def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
     """A line of one method."""
-    held, private, method = peak_gb(), Private(), for_links(lambda: make(name), data)
+    before, private, method = peak_gb(), Private(), for_links(lambda: make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
         cpu, wall = time.process_time(), time.perf_counter()
@@ -95,7 +95,7 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
         method.predict(one.tx, one.rx)
     query = (time.process_time() - began) / SINGLE * 1e3
     spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
-    values = (cpu, wall, query, rmse, spread, held, peak_gb(), private.most, os.getloadavg()[0])
+    values = (cpu, wall, query, rmse, spread, before, peak_gb(), private.most, os.getloadavg()[0])
     count = len(fold.train) + len(fold.val)
     csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))
     sys.stdout.flush()
@@ -122,9 +122,9 @@ def aside(work: Callable[[], Any]) -> None:
     os.waitpid(child, 0)
 
 
-def decibels(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+def decibels(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Squared errors (B,) of powers [dB^2]."""
-    return ((10 * np.log10(found / target)) ** 2)[:, 0]
+    return ((10 * np.log10(predicted / target)) ** 2)[:, 0]
 
 
 def powers(source: str, counts: Sequence[int], methods: Sequence[str] = POWERS) -> None:
@@ -136,10 +136,10 @@ def powers(source: str, counts: Sequence[int], methods: Sequence[str] = POWERS) 
         each(source, methods, data, fold, decibels)
 
 
-def relative(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+def relative(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Squared errors (B,) of channels or spectra, of the mean power of these targets."""
     axes = tuple(range(1, target.ndim))
-    return (np.abs(found - target) ** 2).mean(axes) / (np.abs(target) ** 2).mean()
+    return (np.abs(predicted - target) ** 2).mean(axes) / (np.abs(target) ** 2).mean()
 
 
 def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNELS) -> None:
@@ -158,9 +158,9 @@ def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNEL
         path.unlink()
 
 
-def squares(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+def squares(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Mean squared errors (B,) of spectra."""
-    return ((found - target) ** 2).mean((1, 2))
+    return ((predicted - target) ** 2).mean((1, 2))
 
 
 def spectra(folder: Path, counts: Sequence[int], methods: Sequence[str] = SPECTRA) -> None:

@@ -30,11 +30,11 @@ def slope(lines: pd.DataFrame, figure: str) -> float:
 
 def draw(tables: Path, pictures: Path) -> None:
     """A picture for each source that was measured."""
-    for kind, shown in PANELS.items():
+    for kind, quantities in PANELS.items():
         path = tables / f"{kind}.csv"
         for source, own in pd.read_csv(path).groupby("source", sort=False) if path.exists() else ():
             figure, places = panels(9.0, 6.4, 2, 2)
-            for place, (quantity, title) in zip(places.flat, shown, strict=True):
+            for place, (quantity, title) in zip(places.flat, quantities, strict=True):
                 _curves(place, own, quantity)
                 place.set_title(title)
                 place.set_xlabel("rows")
@@ -48,6 +48,6 @@ def _curves(place: Axes, lines: pd.DataFrame, quantity: str) -> None:
     """A figure of every method against rows; slopes of seconds stand in the legend."""
     for name, own in lines.sort_values("rows", kind="stable").groupby("method", sort=False):
         errors = 2 * own["rmse_error"] if quantity == "rmse" else None
-        found = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
-        label = name if np.isnan(found) else f"{name}, slope {found:.2f}"
+        exponent = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
+        label = name if np.isnan(exponent) else f"{name}, slope {exponent:.2f}"
         place.errorbar(own["rows"], own[quantity], errors, label=label, capsize=2, **look(name).marked)

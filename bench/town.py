@@ -30,8 +30,8 @@ STATION_USED, JITTER_M, CITY_NOISE_DB = 11, 15.0, 3.0  # the station most heard 
 def town(count: int) -> Measurements:
     """Powers of `count` rows to learn from, and, behind them, of `TESTED` places that no number changes."""
     rng = np.random.default_rng([0, count])
-    drawn = [np.random.default_rng(2).uniform(0, SIDE_M, (TESTED, 2)), rng.uniform(0, SIDE_M, (count, 2))]
-    places = np.concatenate(drawn[::-1])
+    parts = [np.random.default_rng(2).uniform(0, SIDE_M, (TESTED, 2)), rng.uniform(0, SIDE_M, (count, 2))]
+    places = np.concatenate(parts[::-1])
     decibels = shadowed(places, np.array(STATION), np.random.default_rng(1))
     decibels += NOISE_DB * rng.standard_normal(len(places))
     arrays = {

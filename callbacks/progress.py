@@ -33,17 +33,17 @@ class StepProgress(L.Callback):
         )
         self._bar.start()
         stage = "refit " if module.run_dir.name == "refit" else ""  # again, on validation rows too
-        done, total = _progress(trainer, module)
-        self._bar.add_task(stage, total=total, completed=done, figures="")
+        step, total = _progress(trainer, module)
+        self._bar.add_task(stage, total=total, completed=step, figures="")
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Advance; metrics are read every 20 steps: reading waits for the device."""
         if self._bar is None:
             return
         task = self._bar.task_ids[0]
-        done, total = _progress(trainer, module)
-        self._bar.update(task, completed=done)
-        if trainer.global_step % 20 == 0 or done == total:
+        step, total = _progress(trainer, module)
+        self._bar.update(task, completed=step)
+        if trainer.global_step % 20 == 0 or step == total:
             result = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
             figures = [form.format(float(value)) for form, value in result.items() if value is not None]
             self._bar.update(task, figures=", ".join([*figures, f"{module.count} Gaussians"]))

@@ -171,10 +171,10 @@ def compile_to(path: Path, command: list[str]) -> None:
             f"no folder for the kernels: {error}; set XDG_CACHE_HOME to one that can be written"
         ) from error
     unfinished = path.with_suffix(f".{os.getpid()}")
-    done = subprocess.run([*command, "-o", str(unfinished)], capture_output=True, text=True, check=False)
-    if done.returncode:
+    process = subprocess.run([*command, "-o", str(unfinished)], capture_output=True, text=True, check=False)
+    if process.returncode:
         unfinished.unlink(missing_ok=True)
-        lines = (done.stderr or done.stdout).strip().splitlines()
+        lines = (process.stderr or process.stdout).strip().splitlines()
         first = next(
             (line for line in lines if "error" in line or "fatal" in line), lines[0] if lines else ""
         )

@@ -47,7 +47,7 @@ class FrozenPlan:
             raise StalePlan(
                 f"this view was frozen at version {self.version}, the field is at {version}: freeze again"
             )
-        return self._drawn(features, picked=False)
+        return self._render(features, picked=False)
 
     @torch.no_grad()
     def compose(self, seen: Tensor) -> Tensor:
@@ -57,9 +57,9 @@ class FrozenPlan:
             raise ValueError(
                 f"features must be ({count}, C) or (B, {count}, C) of those seen, got {tuple(seen.shape)}"
             )
-        return self._drawn(seen, picked=True)
+        return self._render(seen, picked=True)
 
-    def _drawn(self, features: Tensor, *, picked: bool) -> Tensor:
+    def _render(self, features: Tensor, *, picked: bool) -> Tensor:
         if beyond_kernels(features):
             raise RuntimeError(
                 "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"

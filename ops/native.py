@@ -141,10 +141,10 @@ def thaw(
     Raises:
         ValueError: features that are not finite, or not as many as `order` speaks of.
     """
-    samples, given, channels = features.shape
+    samples, count, channels = features.shape
     image = features.new_empty(samples * channels, grid.height, grid.width)
     tensors = contiguous((features, None if picked else order))
-    sizes = (samples, channels, grid.height, grid.width, len(order), given)
+    sizes = (samples, channels, grid.height, grid.width, len(order), count)
     status = calls.run("thaw", features, *buffers, *tensors, image, sizes=sizes)
     if status >= 0:
         validation.seen_features(features, order, picked)  # says what is wrong

@@ -94,15 +94,15 @@ def _check(encoded: Tensor, layers: Layers) -> None:
         wanted = (inputs, (count, hidden), (count, hidden, outputs), (count, outputs))
         fits = (encoded.shape[1], bias1.shape, second.shape, bias2.shape) == wanted
     if not fits or not encoded.device == first.device == bias1.device == second.device == bias2.device:
-        got = ", ".join(f"{tuple(part.shape)} on {part.device}" for part in (encoded, *layers))
+        actual = ", ".join(f"{tuple(part.shape)} on {part.device}" for part in (encoded, *layers))
         raise ValueError(
             "encoded (B, E), weights (N, E, H) and (N, H, C) with biases (N, H) and (N, C) are needed "
-            f"on one device, got {got}"
+            f"on one device, got {actual}"
         )
     alike = first.dtype == bias1.dtype == second.dtype == bias2.dtype
     if not alike or (encoded.dtype != first.dtype and not torch.is_autocast_enabled(encoded.device.type)):
-        got = ", ".join(str(part.dtype) for part in (encoded, *layers))
-        raise TypeError(f"encoded, weights and biases share a dtype, got {got}; convert one of them")
+        actual = ", ".join(str(part.dtype) for part in (encoded, *layers))
+        raise TypeError(f"encoded, weights and biases share a dtype, got {actual}; convert one of them")
 
 
 def _sizes(encoded: Tensor, layers: Layers) -> tuple[int, ...]:

@@ -89,13 +89,13 @@ def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
 
 def _trained(plan: Plan, *tensors: Tensor | None) -> bool:
     """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
-    asked = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
-    if asked and plan.means2d.is_inference():
+    requires_grad = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    if requires_grad and plan.means2d.is_inference():
         raise RuntimeError(
             "this plan was made in torch.inference_mode, so nothing can be trained over it: plan outside, "
             "or under torch.no_grad"
         )
-    return asked
+    return requires_grad
 
 
 def composite(
@@ -152,10 +152,10 @@ def rasterize(
     """
     chosen = backends.choose(backend, means.device)
     at_once = getattr(chosen, "rasterize", None)
-    given = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
+    inputs = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
-    if at_once is not None and not followed(*given):
+    if at_once is not None and not followed(*inputs):
         poses = validation.poses(pose, means)
         values = validation.features(features, means, poses)
         return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))

@@ -42,9 +42,9 @@ def gaussians(
 ) -> Gaussians:
     """Gaussians whose shapes, dtypes and devices agree (ValueError, TypeError)."""
     n = means.shape[0] if means.dim() else 0
-    given = Gaussians(means, quats, scales, opacities, extinctions)
+    result = Gaussians(means, quats, scales, opacities, extinctions)
     expected = ((n, 3), (n, 4), (n, 3), (n,), (n,))
-    for name, tensor, shape in zip(Gaussians._fields, given, expected, strict=True):
+    for name, tensor, shape in zip(Gaussians._fields, result, expected, strict=True):
         if tensor is None:
             continue
         if tuple(tensor.shape) != shape:
@@ -56,7 +56,7 @@ def gaussians(
         tuple(ids.shape) != (n,) or ids.dtype != torch.int64 or ids.device != means.device
     ):
         raise ValueError(f"ids must be ({n},) int64 on {means.device}, got {tuple(ids.shape)} {ids.dtype}")
-    return given
+    return result
 
 
 def transforms(gaussians: Gaussians, pose: Pose, pose_trained: bool) -> None:

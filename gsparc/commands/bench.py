@@ -45,43 +45,43 @@ def task(config: DictConfig) -> dict[str, Any]:
         for projection, threads in product(config.projections, config.threads)
         for claim in claims(projection, list(config.counts), threads, max(config.batches), machine, clock)
     ]
-    found: dict[str, Any] = {**machine_facts(), **peak_memory(), **provenance()}
-    found |= {"machine/instruction_set": instruction_set(), "machine/load_before": before}
+    summary: dict[str, Any] = {**machine_facts(), **peak_memory(), **provenance()}
+    summary |= {"machine/instruction_set": instruction_set(), "machine/load_before": before}
     for row in rows:
-        found |= facts(row)
+        summary |= facts(row)
     for where, claim in promises:
         stem = f"claim/{claim.name}/{where}".replace(",", "").replace(" ", "_")
-        found |= {f"{stem}/ratio": claim.ratio, f"{stem}/promised": claim.bound, f"{stem}/met": claim.met}
+        summary |= {f"{stem}/ratio": claim.ratio, f"{stem}/promised": claim.bound, f"{stem}/met": claim.met}
     run_dir, console = run_directory(), open_console()
-    write_summary(run_dir / "summary.json", found)
+    write_summary(run_dir / "summary.json", summary)
     tables = rows_table(rows), claims_table(promises)
-    (run_dir / "bench.md").write_text(page(found, tables[::-1]), encoding="utf-8")
-    tables[0].title = f"{found['machine/cpu']}, {found['machine/instruction_set']}"
+    (run_dir / "bench.md").write_text(page(summary, tables[::-1]), encoding="utf-8")
+    tables[0].title = f"{summary['machine/cpu']}, {summary['machine/instruction_set']}"
     console.print(*tables, sep="\n")
-    return found
+    return summary
 
 
 def rows_table(rows: Sequence[Row]) -> Table:
     """Every row: time, limit, ratio."""
-    found = table("", ["operation", "projection"], ROWS, [])
-    found.caption = "ms, median; limit: see gsparc/prediction/bench/measure.py"
+    sheet = table("", ["operation", "projection"], ROWS, [])
+    sheet.caption = "ms, median; limit: see gsparc/prediction/bench/measure.py"
     for row in rows:
         case, whole = row.case, None if row.whole is None else float(np.median(row.whole))
         numbers = case.count, case.batch, row.threads, f"{np.median(row.kernel):.3g}", shown(whole, ".3g")
         reference = (case.unaffordable or "-") if row.reference is None else f"{row.reference:.3g}"
         ratio = reference, f"{row.limit:.3g} ({row.bound})", f"{row.over:.1f}"
-        found.add_row(case.name, case.projection, *map(str, numbers), *ratio)
-    return found
+        sheet.add_row(case.name, case.projection, *map(str, numbers), *ratio)
+    return sheet
 
 
 def claims_table(claims: Sequence[tuple[str, Claim]]) -> Table:
     """Every promise and whether it holds here."""
-    found = table("Promises", ["promise", "where"], ["ratio", "promised", "met"], [])
+    sheet = table("Promises", ["promise", "where"], ["ratio", "promised", "met"], [])
     for where, claim in claims:
         bound = f"{'at least' if claim.at_least else 'at most'} {claim.bound:g}"
         cells = claim.name, where, f"{claim.ratio:.2f}", bound, "yes" if claim.met else "no"
-        found.add_row(*cells, style=None if claim.met else "yellow")
-    return found
+        sheet.add_row(*cells, style=None if claim.met else "yellow")
+    return sheet
 
 
 def page(facts: Mapping[str, object], tables: Sequence[Table]) -> str:
@@ -90,7 +90,7 @@ def page(facts: Mapping[str, object], tables: Sequence[Table]) -> str:
     head = f"{facts['machine/cpu']}, {facts['machine/instruction_set']}, {facts['machine/cores']} cores"
     lines = [f"# {head}, {load}, commit {facts['git']}"]
     lines += ["", "Ratios of interleaved rounds (fastest fifth), times in ms (median)."]
-    for columns in (found.columns for found in tables):
+    for columns in (each.columns for each in tables):
         rule = ["---:" if column.justify == "right" else "---" for column in columns]
         cells = zip(*(column.cells for column in columns), strict=True)
         lines += ["", *(f"| {' | '.join(row)} |" for row in ([str(c.header) for c in columns], rule, *cells))]

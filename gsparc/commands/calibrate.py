@@ -38,16 +38,16 @@ def task(config: DictConfig) -> dict[str, Any]:
         raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
-    found = [trials(evidence, promise, "random", *draws)]
+    divisions = [trials(evidence, promise, "random", *draws)]
     try:
-        found.append(trials(evidence, promise, "spatial", *draws))
+        divisions.append(trials(evidence, promise, "spatial", *draws))
     except ValueError:
         log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
-    facts = known | figures(evidence, found, promise) | machine_facts() | provenance()
+    facts = known | figures(evidence, divisions, promise) | machine_facts() | provenance()
     facts["seed"] = config.seed
     write_summary(run_dir / "summary.json", facts)
     title = f"{known['dataset/name']}, {known['model/name']}"
-    draw_calibration(evidence, found, promise, title, run_dir / "confidence.png")
+    draw_calibration(evidence, divisions, promise, title, run_dir / "confidence.png")
     few = too_few(len(evidence), promise)
     stored_lines = [] if few is None else [few]
     if config.store:

@@ -41,8 +41,8 @@ def check(
     levels = link_levels(reading.data)
     steps = [] if levels is None else steps_of(levels)
     warnings = [] if levels is None else plausibility_warnings(levels, steps)
-    found = [*describe(reading.data), *(("note", note) for note in reading.notes)]
-    for topic, sentence in [*found, *(("warning", warning) for warning in warnings)]:
+    topics = [*describe(reading.data), *(("note", note) for note in reading.notes)]
+    for topic, sentence in [*topics, *(("warning", warning) for warning in warnings)]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
@@ -78,23 +78,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--stations-file", help="of a table: a second one that lists the stations")
     add("--draw", metavar="FILE.png", help="where the map goes; else to outputs/check")
     add("--no-draw", action="store_true", help="no map of places, levels and what looks wrong")
-    given = parser.parse_intermixed_args(arguments)
-    columns = dict(text.partition("=")[::2] for text in given.column)
-    for text in [text for text in given.path if text.startswith(SETTINGS)]:  # as refusals and notes say them
+    args = parser.parse_intermixed_args(arguments)
+    columns = dict(text.partition("=")[::2] for text in args.column)
+    for text in [text for text in args.path if text.startswith(SETTINGS)]:  # as refusals and notes say them
         name, _, value = text.removeprefix("dataset.").partition("=")
-        given.path.remove(text)
+        args.path.remove(text)
         if name == "stations_file":
-            given.stations_file = value
+            args.stations_file = value
         else:
             columns[name.removeprefix("columns.")] = value
-    if not given.path:
+    if not args.path:
         parser.error("name a file or a folder, too")
-    if given.draw is not None and (len(given.path) > 1 or not given.draw.lower().endswith(".png")):
+    if args.draw is not None and (len(args.path) > 1 or not args.draw.lower().endswith(".png")):
         parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")
     console = Console()
 
     def picture(path: str) -> str | None:
-        return None if given.no_draw else given.draw or f"outputs/check/{Path(path).resolve().stem}.png"
+        return None if args.no_draw else args.draw or f"outputs/check/{Path(path).resolve().stem}.png"
 
-    good = [check(path, console, columns, given.stations_file, picture(path)) for path in given.path]
+    good = [check(path, console, columns, args.stations_file, picture(path)) for path in args.path]
     return 0 if all(good) else 1

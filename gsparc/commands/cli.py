@@ -146,8 +146,8 @@ def _explained(task: Callable[[DictConfig], object], config: str) -> str:
     texts = [(folder / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
     kind = re.search(r"^  - kind: (\w+)", texts[0], re.MULTILINE)  # settings of the command itself
     if kind is not None:
-        given = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
-        file = folder / "kind" / f"{(given or [kind[1]])[-1]}.yaml"
+        kinds = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
+        file = folder / "kind" / f"{(kinds or [kind[1]])[-1]}.yaml"
         texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
     return "\n\n".join([what, *texts]) + "\n\n"
 

@@ -53,10 +53,10 @@ def task(config: DictConfig) -> pd.DataFrame:
     with locked(cells_dir, "cells"):
         filled = fill_all(prepared, bool(settings["train"]), limit_s)
         if locating:
-            found = compare_places(filled, settings["locate"], cells_dir, locate)
-            write_samples(run_dir / "places.csv", {name: found[name].tolist() for name in found})
-            finish(run_dir, *facts_and_table(found))
-            return found
+            errors = compare_places(filled, settings["locate"], cells_dir, locate)
+            write_samples(run_dir / "places.csv", {name: errors[name].tolist() for name in errors})
+            finish(run_dir, *facts_and_table(errors))
+            return errors
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
@@ -75,8 +75,8 @@ def report(
     blocks = blocks_of(rows)
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
-    drawn = rows[rows.draws]
-    by_set = [here for _, here in drawn.groupby("dataset", sort=False)]
+    by_draw = rows[rows.draws]
+    by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
     page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours, only_timed)])
     write_samples(run_dir / "compare.csv", rows.to_dict("list"))
     write_samples(run_dir / "cells.csv", cells_of(filled)[CELL].to_dict("list"))

@@ -54,9 +54,9 @@ def once(
             log.info("%s: was done before", run_dir)
             return float(record["returned"])
         elif config.ckpt_path is None:
-            config.ckpt_path = _left(run_dir, record["began"])
+            config.ckpt_path = _last_state(run_dir, record["began"])
         if other is not None:
-            config.ckpt_path = _left(other.parent, 0.0)
+            config.ckpt_path = _last_state(other.parent, 0.0)
             text = "going on from %s, where the same run was interrupted; to begin anew, delete it"
             log.info(text, config.ckpt_path)
         (run_dir / FAILURE).unlink(missing_ok=True)  # of an earlier try
@@ -69,15 +69,15 @@ def once(
 def _files(dataset: Any, run_dir: Path) -> dict[str, list[int]]:
     """Number, bytes and last change [ns] of the files that settings of a dataset name, but for runs' own."""
     named = {Path(value) for value in dict(dataset or {}).values() if isinstance(value, str) and value}
-    found = {}
+    stats = {}
     for path in sorted(one.resolve() for one in named if one.exists()):
         runs = {run_dir.resolve(), *(one.parent for one in path.rglob(RECORD))}
         runs = {one for one in runs if path in one.parents}  # as with dataset.root=.
         every = path.rglob("*") if path.is_dir() else [path]
         inside = [one.stat() for one in every if one.is_file() and runs.isdisjoint(one.parents)]
         newest = max((one.st_mtime_ns for one in inside), default=0)
-        found[str(path)] = [len(inside), sum(one.st_size for one in inside), newest]
-    return found
+        stats[str(path)] = [len(inside), sum(one.st_size for one in inside), newest]
+    return stats
 
 
 def _beside(run_dir: Path, record: dict[str, Any]) -> Path | None:
@@ -86,12 +86,12 @@ def _beside(run_dir: Path, record: dict[str, Any]) -> Path | None:
         one = None if path.parent == run_dir else _read(path)
         if one is None or any(one.get(k) != record[k] for k in ("settings", "data", "program", "returned")):
             continue
-        if _left(path.parent, one["began"]) is not None and not in_use(path.parent):
+        if _last_state(path.parent, one["began"]) is not None and not in_use(path.parent):
             return path
     return None
 
 
-def _left(run_dir: Path, began: float) -> str | None:
+def _last_state(run_dir: Path, began: float) -> str | None:
     """The last checkpoint of this job, not of one with other settings before, or the folder of one of many
     parts; None: it begins anew."""
 

@@ -42,11 +42,11 @@ def evaluate_files(
     run = open_files(paths, dataset, split)
     seconds = [one.extra.get("train_s") for one in run.stored]
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
-    found = evaluate(
+    evaluation = evaluate(
         run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines, cache=cache
     )
-    found.facts["split/foreign"] = run.foreign
-    return found, run.data, run.split
+    evaluation.facts["split/foreign"] = run.foreign
+    return evaluation, run.data, run.split
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -54,7 +54,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     RunSettings.of(config)
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    found, data, split = evaluate_files(
+    evaluation, data, split = evaluate_files(
         paths,
         plain(config.dataset),
         plain(config.split),
@@ -63,9 +63,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         cache=platform_cache() if config.cache is None else Path(config.cache),
     )
     seed = checkpoint.read(paths[0]).configuration.get("seed")
-    facts = {**found.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
-    write_samples(run_dir / "per_sample.csv", found.columns)
+    facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
+    write_samples(run_dir / "per_sample.csv", evaluation.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
-    shown = results_table(facts, facts["model/label"], title, config.eval_on)
-    return finish(run_dir, facts, shown, lines=remarks(facts, config.eval_on))
+    results = results_table(facts, facts["model/label"], title, config.eval_on)
+    return finish(run_dir, facts, results, lines=remarks(facts, config.eval_on))

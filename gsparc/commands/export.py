@@ -55,13 +55,13 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
-    found = compiled(predictor, int(config.places))
-    size = write(folder / "field.gsparc", found.form, np.asarray(predictor.site.origin), found.error)
+    result = compiled(predictor, int(config.places))
+    size = write(folder / "field.gsparc", result.form, np.asarray(predictor.site.origin), result.error)
     shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
     shutil.copytree(SOURCES, folder / "source", ignore=OTHERS)
-    facts = {"export/bytes": size, "export/error": found.error, "export/form": found.form.kind}
+    facts = {"export/bytes": size, "export/error": result.error, "export/form": result.form.kind}
     build = f"cmake -S {out}/source/field -B {out}/build && cmake --build {out}/build"
-    return facts, [found.said, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
+    return facts, [result.summary, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
 
 
 def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:

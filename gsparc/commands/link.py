@@ -43,7 +43,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     title = f"{run.data.site.name}, {study.method.name}"
     levels = settings["mcs"]["snr_db"]
     points = {name: values for name, values in settings["pusch"]["ebno_db"].items() if values}
-    drawn, surest = {}, {}
+    errors, surest = {}, {}
     columns = *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
     with Progress(*columns) as bar:
         adapting = bar.add_task("rate adaptation", total=len(levels), now="")
@@ -57,11 +57,11 @@ def task(config: DictConfig) -> dict[str, Any]:
             def tick(now: str, modulation: str = modulation) -> None:
                 bar.update(sending, advance=1, now=f"{modulation} {now}")
 
-            drawn[modulation], surest[modulation], own = study.send(modulation, ebno_db, tick)
+            errors[modulation], surest[modulation], own = study.send(modulation, ebno_db, tick)
             facts |= own
             write_summary(run_dir / "summary.json", facts)
-    if drawn:
-        draw_errors(drawn, title, run_dir / "bler.png")
+    if errors:
+        draw_errors(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
     return finish(run_dir, facts, *tables(facts, title, list(points), levels))
@@ -79,7 +79,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         for level in levels
     ]
     heads = ["median SNR dB", *(head for head, _ in RATES.values())]
-    found = [table(f"{title}: throughput, {accepted}", [], heads, rates)]
+    sections = [table(f"{title}: throughput, {accepted}", [], heads, rates)]
     if modulations:
         keys = ("ebno_at_bler_0.1", "behind_perfect_db")
         errors = [
@@ -89,12 +89,12 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         ]
         heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
         numbers = [column for modulation in modulations for column in (modulation, "behind")]
-        found.append(table(heading, ["receiver"], numbers, errors))
+        sections.append(table(heading, ["receiver"], numbers, errors))
     antennas = sorted(
         int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
     )
     if antennas:
         beams = [[str(n), *(shown(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas]
         heads = ["antennas", *BEAMS.values()]
-        found.append(table("maximum-ratio beams, all test positions", [], heads, beams))
-    return found
+        sections.append(table("maximum-ratio beams, all test positions", [], heads, beams))
+    return sections

@@ -27,12 +27,12 @@ class Command:
     bare: str | None = None
     configured: bool = True
 
-    def arguments(self, given: Sequence[str]) -> list[str]:
+    def arguments(self, words: Sequence[str]) -> list[str]:
         """A command line in Hydra's words: bare paths become `<bare>=[...]`."""
-        paths = [word for word in given if self.bare and "=" not in word and not word.startswith("-")]
+        paths = [word for word in words if self.bare and "=" not in word and not word.startswith("-")]
         quoted = ",".join("'" + path.replace("'", "\\'") + "'" for path in paths)
         return [
-            *(word for word in given if word not in paths),
+            *(word for word in words if word not in paths),
             *([f"{self.bare}=[{quoted}]"] if paths else []),
         ]
 

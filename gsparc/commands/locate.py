@@ -33,9 +33,9 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     for name in config.against:
         choice(*BASELINES).check("against", name)
     if config.dataset.name == "fingerprints":
-        found = by_fingerprints(config)
+        localisation = by_fingerprints(config)
     else:
         plan = plan_of(plain(config))
-        found = by_model(config, run_dir, None if plan is None else plan.light)
-    facts, shown, lines = report(found, config.against, run_dir)
-    return finish(run_dir, facts, *shown, lines=lines)
+        localisation = by_model(config, run_dir, None if plan is None else plan.light)
+    facts, tables, lines = report(localisation, config.against, run_dir)
+    return finish(run_dir, facts, *tables, lines=lines)

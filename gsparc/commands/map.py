@@ -25,19 +25,19 @@ def settings_of(config: DictConfig) -> RunSettings:
     return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
 
 
-def stations_of(given: Any) -> list[str | int] | None:
+def stations_of(setting: Any) -> list[str | int] | None:
     """Names or numbers; None for `all`.
 
     Raises:
         DataError: neither.
     """
-    if given is None or given == "all":
+    if setting is None or setting == "all":
         return None
-    if isinstance(given, str | int):
-        return [given]
-    if not isinstance(given, list):
-        raise DataError(f"stations={given}: all, a name or a list of names is needed")
-    return given
+    if isinstance(setting, str | int):
+        return [setting]
+    if not isinstance(setting, list):
+        raise DataError(f"stations={setting}: all, a name or a list of names is needed")
+    return setting
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -56,22 +56,22 @@ def task(config: DictConfig) -> dict[str, Any]:
     map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
     geotiff_wanted(config.geotiff, predictor.site.georeference)
     promise = promise_of(str(config.ckpt), settings)
-    found = map_of(predictor, promise=promise, **query)
+    field = map_of(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
-    lines = notes_of(found, coverage)
+    lines = notes_of(field, coverage)
     unit = str(config.unit or predictor.site.level_unit)
-    drawn = list(layers(found, unit))
-    size = f"height {found.grid.height:g} m, cells of {found.grid.step:.3g} m"
+    sheets = list(layers(field, unit))
+    size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
-    found.save(run_dir / "map.npz")
-    for layer in drawn if config.pictures else ():
-        draw_layer(found, layer, run_dir / file_name(layer), title, floor)
+    field.save(run_dir / "map.npz")
+    for layer in sheets if config.pictures else ():
+        draw_layer(field, layer, run_dir / file_name(layer), title, floor)
     origin = predictor.site.georeference
     if origin is not None and geotiff_wanted(config.geotiff, origin):
-        write_geotiff(run_dir / "map.tif", found, origin)
-    write_page(run_dir / "map.html", found, drawn, title, lines, floor)
+        write_geotiff(run_dir / "map.tif", field, origin)
+    write_page(run_dir / "map.html", field, sheets, title, lines, floor)
     facts = {
-        **found.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
+        **field.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,
         "promise/calibrated": int(promise is not None), **peak_memory(),
     }  # fmt: skip

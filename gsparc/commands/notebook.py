@@ -30,8 +30,8 @@ def run(line: str, cell: str = "") -> None:
     last = ""
     try:
         for text in command.stdout:
-            found = STAMP.match(text)
-            text = STAMP.sub("" if found and found[1] == "INFO" else r"\1: ", text)
+            stamp = STAMP.match(text)
+            text = STAMP.sub("" if stamp and stamp[1] == "INFO" else r"\1: ", text)
             last = text.strip() or last
             sys.stdout.write(text)
     finally:

@@ -22,23 +22,23 @@ def run_directory() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def show(run_dir: Path, *shown: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
+def show(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
     """What a command says at its end: tables, sentences, and `before` with where everything was written."""
     console = open_console()
-    for one in shown:
+    for one in tables:
         console.print(one)
     for line in (*lines, f"{before}written to {run_dir}"):
         console.print(line, highlight=False)
 
 
-def finish(run_dir: Path, facts: Mapping[str, Any], *shown: RenderableType, **how: Any) -> dict[str, Any]:
+def finish(run_dir: Path, facts: Mapping[str, Any], *tables: RenderableType, **how: Any) -> dict[str, Any]:
     """Write `summary.json` with the program and the machine, then `show`; returns the facts.
 
     Of the machine, what `facts` says of it stands.
     """
     whole = {**machine_facts(), **facts, **provenance()}
     write_summary(run_dir / "summary.json", whole)
-    show(run_dir, *shown, **how)
+    show(run_dir, *tables, **how)
     return whole
 
 

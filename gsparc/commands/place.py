@@ -33,25 +33,25 @@ def task(config: DictConfig) -> dict[str, Any]:
     promise, error = promise_of(path, settings), NewStation()
     if config.left_out:
         error = new_station_error(*trained(path, settings["dataset"]), int(config.left_out))
-    found = place_next(predictor, count=config.count, promise=promise, error=error, **query)
-    columns = coordinates(found.places, predictor)
-    columns |= {found.what: found.goal, "low": found.low, "high": found.high}
+    placing = place_next(predictor, count=config.count, promise=promise, error=error, **query)
+    columns = coordinates(placing.places, predictor)
+    columns |= {placing.what: placing.goal, "low": placing.low, "high": placing.high}
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
-    draw_placing(found, run_dir / "place.png", level, unit)
-    x, y, z = found.places[0]
+    draw_placing(placing, run_dir / "place.png", level, unit)
+    x, y, z = placing.places[0]
     facts = {
-        "place/x": x, "place/y": y, "place/z": z, "place/goal": found.what, "place/before": found.before,
-        "place/after": found.goal[0], "place/low": found.low[0], "place/high": found.high[0],
-        "place/candidates": len(found.places), "place/threshold_db": level,
+        "place/x": x, "place/y": y, "place/z": z, "place/goal": placing.what, "place/before": placing.before,
+        "place/after": placing.goal[0], "place/low": placing.low[0], "place/high": placing.high[0],
+        "place/candidates": len(placing.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
-    low, high = (number(found.what, ends[0], unit) for ends in (found.low, found.high))
+    low, high = (number(placing.what, ends[0], unit) for ends in (placing.low, placing.high))
     lines = [
-        f"now {in_words(found.what, found.before, level, unit)}",
-        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {in_words(found.what, found.goal[0], level, unit)} "
-        f"(90 % interval {low} to {high})",
+        f"now {in_words(placing.what, placing.before, level, unit)}",
+        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): "
+        f"{in_words(placing.what, placing.goal[0], level, unit)} (90 % interval {low} to {high})",
     ]
     if not error.stations:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")
-    return finish(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")
+    return finish(run_dir, facts, lines=lines, before=f"{len(placing.places)} candidates; ")

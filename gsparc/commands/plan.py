@@ -25,24 +25,24 @@ def task(config: DictConfig) -> dict[str, Any]:
     floor = plan_of(settings)
     predictor = None if config.ckpt is None else load(config.ckpt)
     promise = None if predictor is None else promise_of(str(config.ckpt), settings)
-    found = plan_next(
+    plan = plan_next(
         predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
         plan=floor, stations=stations_of(settings["stations"]), other_end=settings["other_end"],
         promise=promise, least_gain_db=float(config.least_gain_db), route=bool(config.route),
         start=settings["start"], route_m=config.route_m, length_m=config.length_m,
     )  # fmt: skip
-    columns = {"order": np.arange(1, len(found.places) + 1), **coordinates(found.places, predictor)}
-    columns |= {"rank": found.chosen + 1, "expected_error_db": found.expected_db.round(4)}
+    columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
+    columns |= {"rank": plan.chosen + 1, "expected_error_db": plan.expected_db.round(4)}
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
-    draw_plan_picture(found, run_dir / "plan.png", promise, predictor, floor)
+    draw_plan_picture(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {
-        "plan/places": len(found.places), "plan/before_db": found.before_db, "plan/after_db": found.after_db,
-        "plan/length_m": found.length_m, "plan/stopped": found.stopped or None,
-        "plan/scatter_db": found.scatter_db, "plan/in_vain": int(bool(found.in_vain)),
+        "plan/places": len(plan.places), "plan/before_db": plan.before_db, "plan/after_db": plan.after_db,
+        "plan/length_m": plan.length_m, "plan/stopped": plan.stopped or None,
+        "plan/scatter_db": plan.scatter_db, "plan/in_vain": int(bool(plan.in_vain)),
         "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
     }  # fmt: skip
-    before = f"{len(found.places)} places: expected error {found.before_db:.2f} -> {found.after_db:.2f} dB"
+    before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
     if config.route or config.route_m is not None:
-        before += f", a walk of {found.length_m:.4g} m"
-    lines = [line for line in (found.stopped, found.in_vain) if line]
+        before += f", a walk of {plan.length_m:.4g} m"
+    lines = [line for line in (plan.stopped, plan.in_vain) if line]
     return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")

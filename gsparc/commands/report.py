@@ -24,11 +24,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.retime:
         runs = retime(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
     out = run_directory()
-    shown = studies(runs, _fronts(paths))
+    sections = studies(runs, _fronts(paths))
     origin = provenance()
-    made = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program(origin)}"
-    write(out, config.title, made, shown)
-    facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(shown), **origin}
+    note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program(origin)}"
+    write(out, config.title, note, sections)
+    facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(sections), **origin}
     for run in runs:
         stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"
         own = {run.figure: run.figure_of(run.figure), "train_s": run.facts["time/train_s"]}
@@ -39,7 +39,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.readme:
         refresh(Path(config.readme), runs)
         console.print(f"table in {config.readme} written anew", highlight=False)
-    console.print(f"{made}; written to {out / 'report.html'}", highlight=False)
+    console.print(f"{note}; written to {out / 'report.html'}", highlight=False)
     return facts
 
 

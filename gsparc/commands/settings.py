@@ -49,11 +49,11 @@ class RunSettings(Checked):
         Raises:
             ValueError: a setting that cannot be, named as it is in the configuration.
         """
-        given = OmegaConf.to_container(config, resolve=True)
-        assert isinstance(given, dict)
-        known: dict[str, Any] = {f.name: given[f.name] for f in fields(cls) if f.name in given}
-        found = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
-        trainer = given.get("trainer") or {}
+        values = OmegaConf.to_container(config, resolve=True)
+        assert isinstance(values, dict)
+        known: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        settings = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
+        trainer = values.get("trainer") or {}
         clip = trainer.get("gradient_clip_val")
         or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
         accelerator = trainer.get("accelerator", "auto")
@@ -66,17 +66,17 @@ class RunSettings(Checked):
             build(config.model)  # its parts check themselves, and so do callbacks
         for node in (config.get("callbacks") or {}).values():
             instantiate(node)
-        for key, value in _leaves(given):
+        for key, value in _leaves(values):
             if isinstance(value, float):
                 Limit("a finite number", math.isfinite).check(key, value)
-        if found.threads is not None:
-            torch.set_num_threads(found.threads)
-        address = (given.get("ray") or {}).get("address")
-        executor.use(Engine(given.get("engine", "process"), given.get("workers"), address))
+        if settings.threads is not None:
+            torch.set_num_threads(settings.threads)
+        address = (values.get("ray") or {}).get("address")
+        executor.use(Engine(values.get("engine", "process"), values.get("workers"), address))
         threadpool_limits(
             1, "blas"
         )  # NumPy's: two threads beside other work took 10 to 400 times as long as one
-        return found
+        return settings
 
 
 def _accelerators() -> list[str]:

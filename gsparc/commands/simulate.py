@@ -58,11 +58,11 @@ def task(config: DictConfig) -> Outcome | None:
     RunSettings.of(config)
     run_dir, console = run_directory(), open_console()
     if config.scene.name == "help":
-        listed, drawn = simulated.shipped_scenes()
+        listed, meshes = simulated.shipped_scenes()
         console.print(listed)
         console.print(OTHERS)
         if not OmegaConf.is_missing(config, "out"):
-            simulated.plans(drawn, Path(to_absolute_path(str(config.out))))
+            simulated.plans(meshes, Path(to_absolute_path(str(config.out))))
             console.print(f"plans in {config.out}")
         return None
     out = Path(to_absolute_path(str(config.out)))

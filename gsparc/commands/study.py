@@ -34,8 +34,8 @@ def variants_of(config: DictConfig) -> dict[str, Callable[[], Method]]:
         return lambda: build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
 
     # Resolved first: an interpolation would take the place of the model's own settings, not join them.
-    found = {str(name): maker(overrides) for name, overrides in plain(config.variants).items()}
-    return found | {name: method_class(name) for name in config.baselines}
+    makers = {str(name): maker(overrides) for name, overrides in plain(config.variants).items()}
+    return makers | {name: method_class(name) for name in config.baselines}
 
 
 def study_of(config: DictConfig) -> Study:

@@ -54,7 +54,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
     points, other_ms = tradeoff.sweep(candidates, threads, data, fold, **how)
     figure = DECIDING[data.site.kind]
-    shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
+    pareto = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
         operating_point.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
@@ -64,10 +64,10 @@ def task(config: DictConfig) -> dict[str, Any]:
         if value is not None
     }
     copy_ms = float(np.median(other_ms[COPY]))
-    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of(points, shown, chosen, copy_ms))
-    best = [points[i] for i in shown]
+    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of(points, pareto, chosen, copy_ms))
+    best = [points[i] for i in pareto]
     title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
-    save(tradeoff.draw_front(points, shown, beside, figure, method.name, title), run_dir / "tradeoff.png")
+    save(tradeoff.draw_front(points, pareto, beside, figure, method.name, title), run_dir / "tradeoff.png")
     facts = {
         **tradeoff.facts_of(points, best, figure, beside, copy_ms),
         **peak_memory(), **run.facts(),
@@ -88,9 +88,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     return facts
 
 
-def _threads(given: Sequence[int] | None) -> list[int]:
-    found = sorted({1, torch.get_num_threads()}) if given is None else sorted({int(n) for n in given})
+def _threads(setting: Sequence[int] | None) -> list[int]:
+    counts = sorted({1, torch.get_num_threads()}) if setting is None else sorted({int(n) for n in setting})
     cores = os.cpu_count() or 1
-    if found and found[0] >= 1 and found[-1] <= cores:
-        return found
-    raise ValueError(f"threads={found}: numbers between 1 and the {cores} cores of this machine are needed")
+    if counts and counts[0] >= 1 and counts[-1] <= cores:
+        return counts
+    raise ValueError(f"threads={counts}: numbers between 1 and the {cores} cores of this machine are needed")

@@ -47,8 +47,8 @@ def _train_and_show(config: DictConfig) -> float:
     facts, objects = train(config, run_dir)
     figure = objective_of(config, objects.data.site.kind)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    shown = results_table(facts, facts["model/label"], title, config.eval_on)
-    show(run_dir, shown, lines=remarks(facts, config.eval_on))
+    results = results_table(facts, facts["model/label"], title, config.eval_on)
+    show(run_dir, results, lines=remarks(facts, config.eval_on))
     value = facts[f"{config.eval_on}/{figure}"]
     if value is not None:
         return score_of(figure, value)

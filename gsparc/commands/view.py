@@ -19,7 +19,7 @@ from gsparc.maps.floor_plan import plan_of
 from gsparc.maps.making import place_of
 from gsparc.maps.pictures import layers
 from gsparc.prediction.timing import peak_memory
-from gsparc.view.building import Given, cloud_colours, cloud_of
+from gsparc.view.building import Building, cloud_colours, cloud_of
 from gsparc.view.ply import write_ply
 from gsparc.view.site_view import SiteView, grid_for
 from gsparc.view.still import draw_still
@@ -59,14 +59,14 @@ def check(save: Path | None, port: int) -> None:
 def view_of(settings: dict[str, Any]) -> SiteView:
     """Everything that is shown, from a configuration; `DataError` for a file or a place that cannot be."""
     plan, walls = plan_of(settings), settings["walls"]
-    given = Given(plan, None if walls is None else read_walls(walls))
+    building = Building(plan, None if walls is None else read_walls(walls))
     viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
-    made: tuple[Any, ...] = ()
+    map_layers: tuple[Any, ...] = ()
     if settings["map"] is not None:
-        found = FieldMap.read(settings["map"])
-        made = tuple((found.grid, layer) for layer in layers(found, viewed.unit) if not layer.words)
+        field = FieldMap.read(settings["map"])
+        map_layers = tuple((field.grid, layer) for layer in layers(field, viewed.unit) if not layer.words)
     at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
-    return SiteView(viewed, given, grid_for(viewed, settings, plan), made, at, other)
+    return SiteView(viewed, building, grid_for(viewed, settings, plan), map_layers, at, other)
 
 
 def serve(view: SiteView, host: str, port: int) -> str:

@@ -98,12 +98,12 @@ def each(
     began = logged = time.monotonic()
     if not elsewhere():
         here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
-        found = _jobs(here, threads, "threading")
+        results = _jobs(here, threads, "threading")
     else:
         blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
-        found = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
-    with closing(found):  # what has begun is cancelled
-        for count, (number, result) in enumerate(found, 1):
+        results = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
+    with closing(results):  # what has begun is cancelled
+        for count, (number, result) in enumerate(results, 1):
             if isinstance(result, Exception):
                 raise result
             ended += cost(pieces[number])
@@ -136,7 +136,7 @@ def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Results:
     how: dict[str, Any] = {"pre_dispatch": workers, "batch_size": 1, "max_nbytes": None}
     jobs = joblib.Parallel(workers, backend, return_as="generator_unordered", **how)
     warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
-    yield from jobs(joblib.delayed(call)(*given) for call, *given in calls)
+    yield from jobs(joblib.delayed(call)(*arguments) for call, *arguments in calls)
 
 
 def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Results:

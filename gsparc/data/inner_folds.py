@@ -168,7 +168,7 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.
         side = settings.side_m or 0.0
         for _ in range(HALVINGS):
             try:
-                folds = _drawn(where, replace(settings, side_m=side), count, rng)
+                folds = _draws(where, replace(settings, side_m=side), count, rng)
             except DataError:
                 side /= 2
                 continue
@@ -206,7 +206,7 @@ def _pieces(
         yield np.sort(turned[size:]), np.sort(turned[:size])
 
 
-def _drawn(
+def _draws(
     where: np.ndarray,
     settings: SplitSettings,
     count: int,
@@ -215,8 +215,8 @@ def _drawn(
 ) -> tuple[Fold, ...]:
     """`count` distinct draws of a split by seeds of their own, each with the fewest rows again."""
     seeds = rng.integers(2**31, size=DRAWS * count)
-    drawn = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
-    first, *rest = {fold.test.tobytes(): fold for fold in drawn}.values()
+    folds = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
+    first, *rest = {fold.test.tobytes(): fold for fold in folds}.values()
     chosen = [first]
     while rest and len(chosen) < count:
         tested = np.concatenate([fold.test for fold in chosen])
@@ -245,5 +245,5 @@ def _stations(
         every = make_split(where, replace(settings, leave_out=0), station=station).folds
         folds = [every[i] for i in rng.permutation(number)[:count]]
     else:
-        folds = list(_drawn(where, settings, count, rng, station))
+        folds = list(_draws(where, settings, count, rng, station))
     return InnerFolds(name, tuple(folds), station)

@@ -94,9 +94,9 @@ def node_of(kind: type, linked: Mapping[str, str] = {}) -> dict[str, Any]:
         kind: a class.
         linked: settings, where the class has them, that follow others: `{"seed": "${seed}"}`.
     """
-    shown = {name: v for name, default in _defaults(kind).items() if (v := _plain(default)) is not _OTHER}
-    links = {name: link for name, link in linked.items() if name in shown}
-    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **shown, **links}
+    defaults = {name: v for name, default in _defaults(kind).items() if (v := _plain(default)) is not _OTHER}
+    links = {name: link for name, link in linked.items() if name in defaults}
+    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **defaults, **links}
 
 
 _OTHER = object()
@@ -115,8 +115,8 @@ def _plain(value: Any) -> Any:
     if value is inspect.Parameter.empty:
         return "???"
     if is_dataclass(value) and not isinstance(value, type):
-        shown = [f.name for f in fields(value) if not f.metadata.get("internal")]
+        names = [f.name for f in fields(value) if not f.metadata.get("internal")]
         path = f"{type(value).__module__}.{type(value).__qualname__}"
-        return {"_target_": path, **{name: _plain(getattr(value, name)) for name in shown}}
+        return {"_target_": path, **{name: _plain(getattr(value, name)) for name in names}}
     value = list(value) if isinstance(value, tuple) else value
     return value if isinstance(value, PLAIN) else _OTHER

@@ -89,10 +89,10 @@ def _real(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def finite(given: Any) -> np.ndarray:
+def finite(numbers: Any) -> np.ndarray:
     """Numbers as float64 in the shape in which they were given; (0,) where one is none, or not finite."""
     try:
-        boxed = np.array(given, dtype=object)
+        boxed = np.array(numbers, dtype=object)
     except ValueError:  # rows of different lengths
         return np.zeros(0)
     return boxed.astype(np.float64) if all(map(_real, boxed.flat)) else np.zeros(0)
@@ -117,7 +117,7 @@ class Checked:
                 field.metadata["limit"].check(field.name, getattr(self, field.name))
 
 
-def check_arguments(given: dict[str, Any], **limits: Limit) -> None:
+def check_arguments(arguments: dict[str, Any], **limits: Limit) -> None:
     """Check arguments of a constructor by name; call it with `locals()`."""
     for name, limit in limits.items():
-        limit.check(name, given[name])
+        limit.check(name, arguments[name])

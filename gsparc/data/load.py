@@ -41,14 +41,14 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     settings = _plain(config)
     choices = _choices()
     if "_target_" not in settings:
-        settings = _plain(OmegaConf.merge(_named(settings.get("name"), choices), settings))
+        settings = _plain(OmegaConf.merge(_choice(settings.get("name"), choices), settings))
     if not trusted:
         for path in targets(settings):
             refuse_foreign(path)
     target, name = settings["_target_"], settings.get("name")
     own = [key for key, node in choices.items() if node["_target_"] == target]
     if own and name is not None and name not in own:
-        _named(name, choices)
+        _choice(name, choices)
         raise DataError(f"dataset.name={name}: this is dataset={own[0]}; say dataset={name}")
     kind = find(str(target))
     if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
@@ -121,7 +121,7 @@ def _choices() -> dict[str, DictConfig]:
     return choices
 
 
-def _named(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
+def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
     if str(name) not in choices:
         hint = nearest(str(name), choices, 0.4)
         raise DataError(f"dataset: {str(name)!r} is none of {', '.join(sorted(choices))}{hint}")

@@ -176,23 +176,23 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
 
 def _attributes(check: Checker, stem: str) -> dict[str, Any]:
     """Arguments of `assemble` that come from the file's attributes."""
-    given = check.raw.attributes
-    normalisation = str(given.get("normalisation", "none"))
+    attributes = check.raw.attributes
+    normalisation = str(attributes.get("normalisation", "none"))
     if normalisation not in NORMALISATIONS:
         check.refuse("normalisation", f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}")
-    error, stand_in = given.get("convergence_error"), given.get("stand_in")
+    error, stand_in = attributes.get("convergence_error"), attributes.get("stand_in")
     number = isinstance(error, int | float) and not isinstance(error, bool)
     if error is not None and not (number and np.isfinite(error) and error >= 0):
         error = check.refuse("convergence_error", f"{error!r}; expected a finite number, at least 0")
     for name in ("name", "stand_in"):
-        if not isinstance(given.get(name), str | None):
-            check.refuse(name, f"a {type(given[name]).__name__}; expected text")
+        if not isinstance(attributes.get(name), str | None):
+            check.refuse(name, f"a {type(attributes[name]).__name__}; expected text")
     return {
-        "name": str(given.get("name") or stem),
+        "name": str(attributes.get("name") or stem),
         "normalisation": normalisation,
         "stand_in": None if stand_in is None else str(stand_in),
         "convergence_error": None if error is None else float(error),
-        "provenance": {str(k): str(v) for k, v in given.items() if k not in OWN_ATTRIBUTES},
+        "provenance": {str(k): str(v) for k, v in attributes.items() if k not in OWN_ATTRIBUTES},
     }
 
 
@@ -228,10 +228,10 @@ def _array(check: Checker, antennas: int | None) -> np.ndarray | None:
 
 def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
     """An array () or (S,) as (S,) float64."""
-    given = check.real(name, (), (rows,))
-    if given is None:
+    array = check.real(name, (), (rows,))
+    if array is None:
         return None
-    values = np.broadcast_to(given, (rows,)).copy()
+    values = np.broadcast_to(array, (rows,)).copy()
     bad = ~(np.isfinite(values) & (values >= 0))
     check.refuse_rows(name, bad, "expected a finite number, at least 0")
     return values
@@ -308,10 +308,10 @@ def _directions(
     check: Checker, offsets: np.ndarray | None, rx: np.ndarray, rotation: np.ndarray
 ) -> list[np.ndarray] | None:
     """Unit vectors (paths, 3) of each sample in the receiver's frame."""
-    given = check.given("path_direction", "path_last_point")
-    if offsets is None or not given:
+    present = check.given("path_direction", "path_last_point")
+    if offsets is None or not present:
         return None
-    name = given[0]
+    name = present[0]
     vectors = check.real(name, (int(offsets[-1]), 3))
     if vectors is None:
         return None

@@ -70,9 +70,9 @@ class Checker:
             return present[0]
         if named in present:
             return str(named)
-        found = " and ".join(present) or "none of them"
+        names = " and ".join(present) or "none of them"
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
-        return self.problems.add(self.source, f"{wanted}; found {found}")
+        return self.problems.add(self.source, f"{wanted}; found {names}")
 
     def name_rows(self, rows: int) -> list[str]:
         """What messages call each row: `row_name`, or its number."""
@@ -102,15 +102,15 @@ class Checker:
         """Whether `array` has one of `shapes`; notes it when not."""
         for shape in shapes:
             if array.ndim == len(shape) and all(
-                want is None or want == got for want, got in zip(shape, array.shape, strict=True)
+                want is None or want == size for want, size in zip(shape, array.shape, strict=True)
             ):
                 return True
         turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
         constrained = any(count is not None for shape in shapes for count in shape)
         here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
-        found = f"{array.shape}{'; transposed?' if turned else ''}"
+        actual = f"{array.shape}{'; transposed?' if turned else ''}"
         known = f" {FIELDS[name].shape}" if name in FIELDS else ""
-        self.refuse(name, f"expected shape{known}{here}, found {found}")
+        self.refuse(name, f"expected shape{known}{here}, found {actual}")
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
@@ -160,10 +160,10 @@ class Checker:
             if values is None:
                 continue
             if values.size == 0 or not np.all((values >= LOWEST_HZ) & (values <= HIGHEST_HZ)):
-                found = (
+                fault = (
                     f"{np.array2string(values, threshold=4)} is outside {LOWEST_HZ:.0e} to {HIGHEST_HZ:.0e}"
                 )
-                self.refuse(name, f"{found}; expected Hz (not MHz or GHz)")
+                self.refuse(name, f"{fault}; expected Hz (not MHz or GHz)")
                 return None, None
             if len(np.unique(values)) != values.size:
                 self.refuse(name, "the same frequency twice; expected distinct ones [Hz]")
@@ -180,18 +180,18 @@ class Checker:
 
     def rotation(self, rows: int) -> np.ndarray | None:
         """(S, 3, 3) local to world; the identity when the file says nothing."""
-        given = self.given("rx_orientation", "rx_rotation")
-        if len(given) == 2:
+        present = self.given("rx_orientation", "rx_rotation")
+        if len(present) == 2:
             fault = "rx_orientation and rx_rotation are both given; expected one of them"
             return self.problems.add(self.source, fault)
-        if not given:
+        if not present:
             return np.tile(np.eye(3), (rows, 1, 1))
-        shape = (4,) if given == ["rx_orientation"] else (3, 3)
-        values = self.real(given[0], shape, (rows, *shape))
+        shape = (4,) if present == ["rx_orientation"] else (3, 3)
+        values = self.real(present[0], shape, (rows, *shape))
         if values is None:
             return None
         values = np.broadcast_to(values, (rows, *shape))
-        if given == ["rx_rotation"]:
+        if present == ["rx_rotation"]:
             expected = "not a rotation; expected an orthogonal matrix with determinant +1, receiver to world"
             return None if self.refuse_rows("rx_rotation", ~is_rotation(values), expected) else values.copy()
         good = is_unit(values)
@@ -233,20 +233,20 @@ class Checker:
         if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any():
             return self.refuse("path_offsets", "expected integers that start at 0 and never decrease")
         for name in per_path:
-            found, count = self.raw.arrays[name].shape[:1], int(offsets[-1])
-            if found != (count,):
-                return self.refuse(name, f"expected {count} paths as path_offsets says, found {found}")
+            shape, count = self.raw.arrays[name].shape[:1], int(offsets[-1])
+            if shape != (count,):
+                return self.refuse(name, f"expected {count} paths as path_offsets says, found {shape}")
         return offsets.astype(np.int64)
 
     def release_split(self, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
         """(train, test) rows that the file names, or None."""
-        given = self.given("split_train", "split_test")
-        if len(given) == 1:
-            self.problems.add(self.source, f"{given[0]} is given alone; expected split_train and split_test")
-        if len(given) < 2:
+        names = self.given("split_train", "split_test")
+        if len(names) == 1:
+            self.problems.add(self.source, f"{names[0]} is given alone; expected split_train and split_test")
+        if len(names) < 2:
             return None
         parts = []
-        for name in given:
+        for name in names:
             index = self.array(name, (None,))
             if index is None or index.size == 0:
                 return None if index is None else self.refuse(name, "expected a row number or more")

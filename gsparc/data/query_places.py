@@ -107,16 +107,16 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     sheet, notes = sheet_of(path)
     chosen, guessed = choose(sheet, columns, only=GUESSED)
     sheet.problems.raise_if_any()
-    given = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
+    by_end = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
     sheet.problems.raise_if_any()
-    found = {end: where for end, where in given.items() if where is not None}
+    rest = {end: where for end, where in by_end.items() if where is not None}
     ends: dict[End, Places] = {}
     for end in moving:
-        named = f"{end}_" if f"{end}_" in found else ""
-        if named not in found or (len(moving) > 1 and not named and "" in ends):
+        named = f"{end}_" if f"{end}_" in rest else ""
+        if named not in rest or (len(moving) > 1 and not named and "" in ends):
             raise DataError(_missing(sheet, end, len(moving) > 1))
-        ends[end] = found.pop(named)
-    other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in found] + ["without a name"] * ("" in found)
+        ends[end] = rest.pop(named)
+    other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * ("" in rest)
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
     station = _words(sheet, chosen, "station")
@@ -145,9 +145,9 @@ def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
 
 def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     check = Checker(raw, source)
-    given = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
+    by_end = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
     check.problems.raise_if_any()
-    ends: dict[End, Places] = {end: where for end, where in given.items() if where is not None}
+    ends: dict[End, Places] = {end: where for end, where in by_end.items() if where is not None}
     count = {end: len(where.across) for end, where in ends.items()}
     if len(set(count.values())) > 1:
         raise DataError(f"{source}: {count['tx']} places of the transmitter, {count['rx']} of the receiver")
@@ -174,14 +174,14 @@ def _end(check: Checker, end: End, alone: bool) -> Places | None:
     if len(known) < len(parts):
         return None
     if len({part.shape for part in known}) > 1:
-        shown = " and ".join(str(part.shape) for part in known)
-        fault = f"latitude and longitude have shapes {shown}; expected one shape"
+        both = " and ".join(str(part.shape) for part in known)
+        fault = f"latitude and longitude have shapes {both}; expected one shape"
         return check.problems.add(check.source, fault)
     across = np.column_stack(known) if pair else np.atleast_2d(known[0])
     height = across[:, 2] if across.shape[1] == 3 else None
     for name in check.given(f"{end}_height", *(("height",) if alone else ())):
-        given = None if height is not None else check.real(name, (), (1,), (len(across),))
-        height = height if given is None else np.broadcast_to(given, (len(across),))
+        values = None if height is not None else check.real(name, (), (1,), (len(across),))
+        height = height if values is None else np.broadcast_to(values, (len(across),))
     return Places(across[:, :2], height, bool(pair))
 
 

@@ -69,8 +69,8 @@ def read_raw(path: str | Path) -> Raw:
         return _read_npz(path)
     if path.suffix.lower() in HDF5_SUFFIXES:
         return _read_hdf5(path)
-    found = path.suffix or "no ending"
-    raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5, found {found}")
+    suffix = path.suffix or "no ending"
+    raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5, found {suffix}")
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:
@@ -87,8 +87,8 @@ def write_raw(path: str | Path, raw: Raw) -> None:
         with whole_file(path) as partial:
             write(partial, raw)
     except (OSError, RuntimeError) as error:  # libhdf5 makes the second of the first when it closes a file
-        found = re.search(r"error message = '([^']+)'", str(error))
-        why = found[1] if found else getattr(error, "strerror", None) or reason(error)
+        match = re.search(r"error message = '([^']+)'", str(error))
+        why = match[1] if match else getattr(error, "strerror", None) or reason(error)
         raise DataError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
@@ -284,13 +284,13 @@ def read_error(path: Path, seconds: float = SECONDS) -> str | None:
         return None
     try:
         read, nothing = [sys.executable, "-I", "-c", READ, str(path.absolute())], subprocess.DEVNULL
-        done = subprocess.run(read, stdin=nothing, capture_output=True, timeout=seconds)
+        process = subprocess.run(read, stdin=nothing, capture_output=True, timeout=seconds)
     except subprocess.TimeoutExpired:
         return f"its text cannot be read in {seconds:g} s"
-    if done.returncode < 0:
+    if process.returncode < 0:
         return "its text crashes the HDF5 library"
-    last = done.stderr.decode(errors="replace").strip().splitlines()
-    return None if done.returncode == 0 else last[-1] if last else "its text cannot be read"
+    last = process.stderr.decode(errors="replace").strip().splitlines()
+    return None if process.returncode == 0 else last[-1] if last else "its text cannot be read"
 
 
 def _has_heap(path: Path) -> bool:

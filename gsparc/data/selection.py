@@ -31,19 +31,19 @@ ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", F
 SPLIT = ("split_train", "split_test")
 
 
-def _listed(given: Any) -> Any:
-    return (given,) if isinstance(given, str | int) else given
+def _listed(value: Any) -> Any:
+    return (value,) if isinstance(value, str | int) else value
 
 
-def _are_names(given: Any) -> bool:
-    names = _listed(given)
+def _are_names(value: Any) -> bool:
+    names = _listed(value)
     if not isinstance(names, Sequence) or not names:
         return False
     return all(isinstance(name, str | int) and not isinstance(name, bool) for name in names)
 
 
-def _are_steps(given: Any) -> bool:
-    rows = [_listed(firsts) for firsts in given.values()] if isinstance(given, Mapping) else [()]
+def _are_steps(value: Any) -> bool:
+    rows = [_listed(firsts) for firsts in value.values()] if isinstance(value, Mapping) else [()]
     lists = all(isinstance(firsts, Sequence) and firsts for firsts in rows)
     return lists and all(type(row) is int for firsts in rows for row in firsts)
 
@@ -116,7 +116,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     if "station" in part.arrays:
         of_row = raw.arrays["station"]
         rows = np.flatnonzero(np.isin(of_row, chosen))
-        _left(rows, "dataset.stations", source)
+        _check_rows(rows, "dataset.stations", source)
         part = _rows_of(part, rows, source)
         part.arrays["station"] = np.searchsorted(chosen, of_row[rows])
         note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
@@ -136,7 +136,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
     for name in wanted:
         if name not in known:
             raise DataError(f"dataset.runs={name}: no such run in {source}{suggest(name, known)}")
-    return _kept(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
+    return _select(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
 
 
 def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
@@ -151,16 +151,16 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     values = raw.arrays[name]
     with np.errstate(divide="ignore", invalid="ignore"):
         low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
-    given = raw.arrays.get("mask")
-    if given is not None and given.shape != low.shape:
-        raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {given.shape}")
-    low &= True if given is None else given.astype(bool)
+    mask = raw.arrays.get("mask")
+    if mask is not None and mask.shape != low.shape:
+        raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {mask.shape}")
+    low &= True if mask is None else mask.astype(bool)
     if low.ndim == 1:
-        return _kept(raw, ~low, option, source)
+        return _select(raw, ~low, option, source)
     measured = ~low & measured_links(raw, source)
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
-    rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
+    rest = _select(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
     return Noted(rest.raw, (*links, *rest.notes))
 
 
@@ -178,7 +178,7 @@ def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
         first, last = np.ceil(edges[:-1]).astype(int), np.ceil(edges[1:]).astype(int)
         keep = np.zeros(count, bool)
         keep[np.random.default_rng(SEED).integers(first, last)] = True
-    return _kept(raw, keep, f"dataset.max_rows={max_rows}", source)
+    return _select(raw, keep, f"dataset.max_rows={max_rows}", source)
 
 
 def take_rows(
@@ -270,7 +270,7 @@ def parts_of(number: int, names: Sequence[str]) -> list[int]:
 def known_station(
     wanted: str | int, names: Sequence[str], count: int, option: str, source: str | Path
 ) -> int:
-    """`station_number`; the setting `said` is named in errors.
+    """`station_number`; the setting `option` is named in errors.
 
     Raises:
         DataError: there is none.
@@ -296,9 +296,9 @@ def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
     Raises:
         DataError: the file holds no measurement.
     """
-    values, given = raw.arrays[_measurement(raw, source)], raw.arrays.get("mask")
-    if given is not None:
-        return given.astype(bool)
+    values, mask = raw.arrays[_measurement(raw, source)], raw.arrays.get("mask")
+    if mask is not None:
+        return mask.astype(bool)
     return np.ones(values.shape, bool) if "sensitivity_db" in raw.arrays else ~np.isnan(values)
 
 
@@ -319,9 +319,9 @@ def _runs(first: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.repeat(first - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
 
 
-def _kept(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
+def _select(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
     rows = np.flatnonzero(keep)
-    _left(rows, option, source)
+    _check_rows(rows, option, source)
     if len(rows) == len(keep):
         return Noted(raw)
     note = f"{option}: {len(keep) - len(rows)} of {len(keep)} rows left out"
@@ -334,7 +334,7 @@ def _rows_of(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
     return replace(raw, arrays=take_rows(named, rows, count, station_count(raw)))
 
 
-def _left(rows: np.ndarray, option: str, source: str | Path) -> None:
+def _check_rows(rows: np.ndarray, option: str, source: str | Path) -> None:
     if len(rows) < FEWEST:
         raise DataError(f"{option}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
 

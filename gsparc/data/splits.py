@@ -67,8 +67,8 @@ class Split:
                 )
 
 
-def _are_rows(given: Any) -> bool:
-    listed = given.tolist() if isinstance(given, np.ndarray) else given
+def _are_rows(value: Any) -> bool:
+    listed = value.tolist() if isinstance(value, np.ndarray) else value
     if isinstance(listed, str) or not isinstance(listed, Sequence):
         return isinstance(listed, str) and listed == "outliers"
     return all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
@@ -172,7 +172,7 @@ def make_split(
     # Of the rows that stand for their places, and the place of each row.
     first = which = np.arange(len(rows_left))
     if settings.name in ("stations", "runs"):
-        found = _whole(None if station is None else station[rows_left], settings)
+        local_folds = _whole(None if station is None else station[rows_left], settings)
     else:
         named = release_split if settings.name == "random" and not settings.redraw else None
         if named is not None:
@@ -182,8 +182,8 @@ def make_split(
             _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
         where = positions[rows_left][first]
         pairs = enumerate(_pairs(where, settings, named))
-        found = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
-    folds = tuple(fold.each(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in found)
+        local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
+    folds = tuple(fold.each(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
     return Split(settings.name, folds, indices_hash(folds))
 
 

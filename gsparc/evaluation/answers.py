@@ -87,7 +87,7 @@ def predict(
     row, number = stations_of(queries, site, station)
     named = station is not None or queries.station is not None
     far, margin = far_outside(world, site)
-    found = answers(predictor, queries, world, row, number, named, partial(check_fits, path, site.kind))
+    predictions = answers(predictor, queries, world, row, number, named, partial(check_fits, path, site.kind))
     speck = in_a_speck(queries, world, site)
     if speck is not None:
         log.warning("%s: %s", places, speck)
@@ -97,15 +97,15 @@ def predict(
             "%s: expect little of the predictions there",
             places, int(far.sum()), len(far), margin, queries.rows[int(np.argmax(far))],
         )  # fmt: skip
-    write(path, queries, found, site.kind)
+    write(path, queries, predictions, site.kind)
     facts = {
-        "predict/places": len(queries), "predict/predictions": len(found),
+        "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
-        "predict/stations": 0 if found.station is None else len(np.unique(found.station)),
+        "predict/stations": 0 if predictions.station is None else len(np.unique(predictions.station)),
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
         "places": str(places), "out": str(path),
     }  # fmt: skip
-    level = decibels(found)[0] if site.kind == "rssi" else np.zeros(0)
+    level = decibels(predictions)[0] if site.kind == "rssi" else np.zeros(0)
     level = level[np.isfinite(level)]
     if len(level):
         facts |= {"predict/lowest_db": float(level.min()), "predict/highest_db": float(level.max())}
@@ -209,20 +209,20 @@ def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
         raise DataError(f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz")
 
 
-def write(path: Path, queries: QueryPlaces, found: Answers, kind: Kind) -> None:
+def write(path: Path, queries: QueryPlaces, predictions: Answers, kind: Kind) -> None:
     """Write all predictions, whole or not at all."""
     archive = path.suffix.lower() == ".npz"
-    columns = _places(queries, found)
+    columns = _places(queries, predictions)
     if kind == "rssi":
-        named = zip(("rssi_db", "rssi_db_std"), decibels(found), strict=True)
+        named = zip(("rssi_db", "rssi_db_std"), decibels(predictions), strict=True)
         columns |= {name: values.astype(np.float32) for name, values in named if values is not None}
-    elif found.variance is not None:
-        columns[f"{kind}_std"] = np.sqrt(found.variance).astype(np.float32)
+    elif predictions.variance is not None:
+        columns[f"{kind}_std"] = np.sqrt(predictions.variance).astype(np.float32)
     if archive and kind != "rssi":
-        columns[kind] = found.mean
+        columns[kind] = predictions.mean
     elif kind == "csi":
-        columns |= _entries(found.mean)
-    columns |= {} if found.confidence is None else {"confidence": found.confidence}
+        columns |= _entries(predictions.mean)
+    columns |= {} if predictions.confidence is None else {"confidence": predictions.confidence}
     if not archive:
         write_samples(path, {name: _cells(values) for name, values in columns.items()})
         return
@@ -230,23 +230,23 @@ def write(path: Path, queries: QueryPlaces, found: Answers, kind: Kind) -> None:
         np.savez_compressed(file, allow_pickle=False, **columns)
 
 
-def decibels(found: Answers) -> tuple[np.ndarray, np.ndarray | None]:
+def decibels(predictions: Answers) -> tuple[np.ndarray, np.ndarray | None]:
     """Level and standard deviation (N,) [dB] of powers, NaN where the power is 0; None without a variance."""
-    power = found.mean[:, 0].astype(np.float64)
-    variance = np.zeros(len(power)) if found.variance is None else found.variance
+    power = predictions.mean[:, 0].astype(np.float64)
+    variance = np.zeros(len(power)) if predictions.variance is None else predictions.variance
     level, spread = in_decibels(np.where(power > 0, power, np.nan), variance)
-    return level, None if found.variance is None else spread
+    return level, None if predictions.variance is None else spread
 
 
-def _places(queries: QueryPlaces, found: Answers) -> dict[str, np.ndarray]:
+def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]:
     """Coordinates as they were given, and the station."""
-    columns = {} if queries.name is None else {"row_name": queries.name[found.place]}
+    columns = {} if queries.name is None else {"row_name": queries.name[predictions.place]}
     for end, where in queries.ends.items():
         before = "" if len(queries.ends) == 1 else f"{end}_"
         axes = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
         for axis, values in zip(axes, where.all().T, strict=True):
-            columns[before + axis] = values[found.place]
-    return columns if found.station is None else {**columns, "station": found.station}
+            columns[before + axis] = values[predictions.place]
+    return columns if predictions.station is None else {**columns, "station": predictions.station}
 
 
 def _entries(channels: np.ndarray) -> dict[str, np.ndarray]:

@@ -73,43 +73,43 @@ class Localisation:
         """Of `locate.csv`, in the world's coordinates [m]."""
         located = next(iter(self.answers.values()))
         place, true = np.array([one.place for one in located]), self.heard.place
-        found: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
+        columns: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
         if self.placed:
-            found |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
-            found |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
-        found |= {"area_m2": [one.area for one in located]}
-        found |= {"inside": [int(one) for one in inside]} if self.placed else {}
-        return {**found, "modes": [one.modes for one in located]}
+            columns |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
+            columns |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
+        columns |= {"area_m2": [one.area for one in located]}
+        columns |= {"inside": [int(one) for one in inside]} if self.placed else {}
+        return {**columns, "modes": [one.modes for one in located]}
 
 
 def report(
-    found: Localisation, against: Sequence[str], run_dir: Path
+    result: Localisation, against: Sequence[str], run_dir: Path
 ) -> tuple[dict[str, Any], list[Table], list[str]]:
     """Write `locate.csv` and pictures; facts, and where places are known, a table and a sentence of errors.
 
     Args:
-        found: what was located.
+        result: what was located.
         against: names of plain methods beside it.
         run_dir: where files go.
     """
-    (ours, located), heard, facts = next(iter(found.answers.items())), found.heard, dict(found.facts)
-    inside = [one.posterior.level(p) <= found.level for one, p in zip(located, heard.place, strict=True)]
-    write_samples(run_dir / "locate.csv", found.columns(inside))
+    (ours, located), heard, facts = next(iter(result.answers.items())), result.heard, dict(result.facts)
+    inside = [one.posterior.level(p) <= result.level for one, p in zip(located, heard.place, strict=True)]
+    write_samples(run_dir / "locate.csv", result.columns(inside))
     facts |= {
-        "locate/snapshots": len(heard), "locate/track": int(len(found.answers) > 1),
+        "locate/snapshots": len(heard), "locate/track": int(len(result.answers) > 1),
         "locate/area_m2": float(np.median([one.area for one in located])),
         "time/locate_ms_p50": float(np.median([one.seconds for one in located]) * 1e3),
     }  # fmt: skip
-    shown_at = [locating.in_world(one, found.origin) for one in located]
-    true = heard.place + found.origin if found.placed else None
-    draw_posteriors(shown_at, true, found.trained.place + found.origin, run_dir / "posteriors.png")
-    if not found.placed:
+    shown_at = [locating.in_world(one, result.origin) for one in located]
+    true = heard.place + result.origin if result.placed else None
+    draw_posteriors(shown_at, true, result.trained.place + result.origin, run_dir / "posteriors.png")
+    if not result.placed:
         return facts, [], []
-    places = {name: np.array([one.place for one in answers]) for name, answers in found.answers.items()}
+    places = {name: np.array([one.place for one in answers]) for name, answers in result.answers.items()}
     stems = {name: "locate" if name == ours else f"locate/{name}" for name in places}
     for name in against:
         stems[name] = stem = f"baseline/{name}"
-        beside = located_by(name, found.trained, heard)
+        beside = located_by(name, result.trained, heard)
         places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
     errors = {name: np.linalg.norm(place - heard.place, axis=1) for name, place in places.items()}
     facts |= {"locate/coverage": float(np.mean(inside))}
@@ -122,7 +122,7 @@ def report(
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
     sentence = (
         f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places, "
-        f"{found.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
+        f"{result.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
     )
     return facts, [table(title, ["method"], ["median [m]", "p90 [m]"], rows)], [sentence]
 
@@ -153,8 +153,8 @@ def by_model(
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = Locator(locator.field, locator.cells, unknown, trust, locator.share)
         if config.store:
-            checkpoint.amend(config.ckpt, locating.kept(trust, unknown, locator.share))
-    heard, placed = _heard(config, run)
+            checkpoint.amend(config.ckpt, locating.trust_state(trust, unknown, locator.share))
+    heard, placed = _snapshots(config, run)
     answers, trained = {method.name: locator.locate(heard)}, snapshots(data, learned)
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
     if config.track:
@@ -179,12 +179,12 @@ def _trust(
     )  # fmt: skip
     make = partial(build, settings.model)
     folds = int(config.calibrate)
-    found = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
-    log.info("trust learned from %d snapshots that were left out: %s", found[1], found[0])
-    return found
+    result = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
+    log.info("trust learned from %d snapshots that were left out: %s", result[1], result[0])
+    return result
 
 
-def _heard(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
+def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     """The snapshots, and whether their places are known."""
     site, placed = run.data.site, True
     if config.data is None:
@@ -198,7 +198,7 @@ def _heard(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             raw.arrays[place] = np.linspace(low, high, count)
         other = aligned(interpreted(raw, config.data), site)
         heard = snapshots(other, np.arange(len(other)))
-    return heard.at(_drawn(config, len(heard))), placed
+    return heard.at(_sample(config, len(heard))), placed
 
 
 def by_fingerprints(config: DictConfig) -> Localisation:
@@ -224,7 +224,7 @@ def by_fingerprints(config: DictConfig) -> Localisation:
         known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
     else:
         known, heard = map(rows.at, parted(rows, how, *cut, seed))
-    heard = heard.at(_drawn(config, len(heard.level)))
+    heard = heard.at(_sample(config, len(heard.level)))
     offset = DEVICES_DB if config.offset_db is None else float(config.offset_db)
     started = time.perf_counter()
     locator = FingerprintLocator.of(known, offset, config.prior == "trained", bool(config.track))
@@ -235,10 +235,10 @@ def by_fingerprints(config: DictConfig) -> Localisation:
     }  # fmt: skip
     promise = "nothing is promised without calibration, or of another campaign"
     if groups:
-        drawn, share = how in ("random", "places", "blocks", "walks"), float(config.share)
-        inner: Any = how if drawn else "places"
+        random, share = how in ("random", "places", "blocks", "walks"), float(config.share)
+        inner: Any = how if random else "places"
         locator, facts["locate/calibrated_on"] = trusted(locator, known, inner, *cut, groups, share, seed)
-        promise = f"{share:.0%} are promised" if drawn else promise
+        promise = f"{share:.0%} are promised" if random else promise
     answers = {"field": locator.locate(heard)}
     if config.track:
         answers["alone"] = replace(locator, speed=None, point=SHARED).locate(heard)
@@ -246,7 +246,7 @@ def by_fingerprints(config: DictConfig) -> Localisation:
     return Localisation(answers, *both, np.zeros(3), placed, locator.area.level, promise, facts)
 
 
-def _drawn(config: DictConfig, count: int) -> np.ndarray:
+def _sample(config: DictConfig, count: int) -> np.ndarray:
     """Numbers of at most `rows` of so many rows, drawn evenly."""
     if not count:
         raise ValueError("there is nothing to be located")
@@ -273,9 +273,9 @@ def draw_posteriors(
         boxes = [
             Rectangle((x, y), w, h) for (x, y), (w, h) in zip(corners, cells.edge[order, :2], strict=True)
         ]
-        drawn = PatchCollection(boxes, cmap="Blues", linewidth=0)
-        drawn.set_array(np.maximum(density[order], density.max() - 12))
-        axis.add_collection(drawn)
+        patches = PatchCollection(boxes, cmap="Blues", linewidth=0)
+        patches.set_array(np.maximum(density[order], density.max() - 12))
+        axis.add_collection(patches)
         axis.plot(*trained[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
         axis.plot(*one.place[:2], "x", color="#D55E00", label="located")
         if true is not None:

@@ -79,14 +79,14 @@ def open_files(
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned)
 
 
-def _settings(group: str, stored: checkpoint.Stored, given: Mapping[str, Any] | None) -> dict[str, Any]:
+def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
     """The checkpoint's settings of a config group under the ones given now (those that are not null).
 
     Another name or a `_target_` given now replaces all that is stored, classes out of the file with it.
     """
     before = stored.configuration.get(group)
     before = before if isinstance(before, dict) else {}
-    now = {key: value for key, value in (given or {}).items() if value is not None}
+    now = {key: value for key, value in (overrides or {}).items() if value is not None}
     if "_target_" in now or ("name" in now and now["name"] != before.get("name")):
         before = {}
     settings = {**before, **now}

@@ -163,8 +163,8 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
             mean = prediction.mean if turn is None else prediction.mean * turn[chunk, None, None]
             metric.update(mean, batch.target, batch.mask)
             for name, values in outputs.items():
-                given, none = getattr(prediction, name), np.full(len(batch), np.nan)
-                values.append(none if given is None else given.detach().cpu().double().numpy())
+                output, none = getattr(prediction, name), np.full(len(batch), np.nan)
+                values.append(none if output is None else output.detach().cpu().double().numpy())
         back = np.argsort(order)
         samples.append({name: values[back] for name, values in metric.compute().items()})
         confidence.append(np.concatenate(outputs["confidence"])[back])

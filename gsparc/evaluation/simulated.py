@@ -27,9 +27,9 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     """
     changed, survey = outcome.changed, outcome.survey
     count = 2 if changed is None else 3
-    places, by_station = survey.places, outcome.made.power.reshape(len(survey.engines), -1)
+    places, by_station = survey.places, outcome.dataset.power.reshape(len(survey.engines), -1)
     best = by_station.argmax(0) * len(places) + np.arange(len(places))
-    heard, spread = outcome.made.power[best], outcome.made.delay_spread[best]
+    heard, spread = outcome.dataset.power[best], outcome.dataset.delay_spread[best]
     extent = np.ptp(places[:, :2], axis=0)
     high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 1.3
     figure, (axes,) = panels(5.4 * count, high, 1, count, grid=False)
@@ -38,7 +38,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     _map(axes[0], places[reached], 10 * np.log10(heard[reached]), "received power [dB]", size)
     _map(axes[1], places[reached], spread[reached] * 1e9, "delay spread [ns]", size)
     if changed is not None:
-        known = outcome.made.power[changed.rows] > 0
+        known = outcome.dataset.power[changed.rows] > 0
         errors, rows = changed.errors[known], changed.rows[known] % len(places)
         label = "error without what is not needed" if np.ptp(errors) > 0 else "all is needed"
         if outcome.choice is not None and not outcome.choice.deliverable.startswith("spectrum"):
@@ -55,7 +55,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
             draw_walls(axis, triangles)
         bounded(axis, (left, south), (right, north), **({} if first else {"ylabel": ""}))
     legend_below(figure)  # beside the title it would cover the last effects
-    figure.suptitle(f"{outcome.made.data.site.name}: {len(places)} receivers\n{outcome.effects}")
+    figure.suptitle(f"{outcome.dataset.data.site.name}: {len(places)} receivers\n{outcome.effects}")
     save(figure, path)
 
 
@@ -78,8 +78,8 @@ def _map(
     axis: Any, places: np.ndarray, values: np.ndarray, label: str, size: float, clipped: float = 0.01
 ) -> None:
     low, high = np.quantile(values, [clipped, 1 - clipped])
-    drawn = axis.scatter(*places[:, :2].T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
-    axis.figure.colorbar(drawn, ax=axis, location="bottom", label=label, shrink=0.8)
+    dots = axis.scatter(*places[:, :2].T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
+    axis.figure.colorbar(dots, ax=axis, location="bottom", label=label, shrink=0.8)
 
 
 def effect_shares(choice: Choice, path: Path) -> None:
@@ -103,12 +103,12 @@ def effect_shares(choice: Choice, path: Path) -> None:
 
 def shipped_scenes() -> tuple[Table, dict[str, np.ndarray]]:
     """Size, triangles and materials of every scene that comes with Sionna, and what `plans` draws of them."""
-    rows, drawn = [], {}
+    rows, meshes = [], {}
     for name in shipped():
         tracer = RayTracer(name, np.zeros(3), CARRIER_HZ)
         size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.box(), axis=0))
-        triangles = drawn[f"{name}, {size} m"] = tracer.triangles()
+        triangles = meshes[f"{name}, {size} m"] = tracer.triangles()
         used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
         rows.append([name, size, f"{len(triangles):,}", used])
     heads = ["scene", "size [m]", "triangles", "materials"]
-    return table("scene=NAME: scenes that come with Sionna", heads, [], rows), drawn
+    return table("scene=NAME: scenes that come with Sionna", heads, [], rows), meshes

@@ -102,10 +102,10 @@ def draw_site(
     `levels` are the `link_levels` of powers, `steps` their `plausibility.steps_of`.
     """
     places = spots(data, levels)
-    shown = [places.place[~places.far], still_ends(data)]  # but those far outside
+    points = [places.place[~places.far], still_ends(data)]  # but those far outside
     if data.site.static_end is None:
-        shown.append(data.tx[:, :2] + data.site.origin[:2])
-    low, high = framed(np.concatenate(shown))
+        points.append(data.tx[:, :2] + data.site.origin[:2])
+    low, high = framed(np.concatenate(points))
     width, height = (high - low) / (high - low).max() * INCHES
     width, height = max(width, 0.45 * INCHES) + 1.9, max(height, 0.35 * INCHES) + 1.6
     jumping = sorted({t for t, _ in steps}, key=lambda t: -max(abs(s.change_db) for u, s in steps if u == t))
@@ -170,11 +170,11 @@ def _draw_map(
             silent = places.place[inside & ~known]
             axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
         limits = dict(zip(("vmin", "vmax"), np.percentile(places.level_db[known], [1, 99]), strict=True))
-        drawn = axis.scatter(
+        dots = axis.scatter(
             *places.place[known].T, c=places.level_db[known], s=size, linewidths=0, label=name, **limits
         )
         assert axis.figure is not None
-        axis.figure.colorbar(drawn, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
+        axis.figure.colorbar(dots, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
     side = side_of_squares(data)
     test = np.zeros(0, np.int64) if side is None else held_out(data, side)
     if len(test):

@@ -205,10 +205,10 @@ def _git() -> str | None:
     def ask(*arguments: str) -> str | None:
         command = ["git", "-C", str(here.parent), *arguments]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=10)
+            process = subprocess.run(command, capture_output=True, text=True, timeout=10)
         except (OSError, subprocess.TimeoutExpired):
             return None
-        return done.stdout.strip() if done.returncode == 0 else None
+        return process.stdout.strip() if process.returncode == 0 else None
 
     if ask("ls-files", "--error-unmatch", here.name) is None:  # an installed copy inside someone else's tree
         return None

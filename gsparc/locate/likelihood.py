@@ -96,7 +96,7 @@ def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: boo
     Without a known phase each snapshot is turned to where it fits best.
     """
     heard, seen = _where(values)
-    mean, precision, log_variance = _known(mean, variance)
+    mean, precision, log_variance = _moments(mean, variance)
     power = heard.abs().square() @ precision.T + seen @ (mean.abs().square() * precision).T
     overlap = heard @ (mean.conj() * precision).T
     gain = overlap.real if phase_known else overlap.abs()
@@ -117,7 +117,7 @@ def of_levels(
         floor: (n, P) levels [dB] below which a silent power lies, NaN of those that were heard.
     """
     heard, seen = _where(values)
-    known, precision, log_variance = _known(mean, variance)
+    known, precision, log_variance = _moments(mean, variance)
     weighed = known * precision
     square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (known * weighed).T
     slope = heard @ precision.T - seen @ weighed.T
@@ -143,7 +143,7 @@ def _where(values: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(there, values, torch.zeros_like(values)), seen
 
 
-def _known(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _moments(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Means, inverse variances and logarithms of variances (G, P), all 0 where nothing is predicted."""
     known = ~torch.isnan(mean.real)
     safe = torch.where(known, variance.clamp_min(TINY), torch.ones_like(variance))

@@ -147,8 +147,8 @@ def trusted(
         rows = np.union1d(inner.train, inner.val)
         without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)
-        drawn = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        groups.append((without, heard.at(drawn)))
+        sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
+        groups.append((without, heard.at(sample)))
     places = np.concatenate([heard.place for _, heard in groups])
 
     def looks(trust: Trust) -> list[Looked]:
@@ -163,13 +163,13 @@ def trusted(
     return levelled(trust, looks(trust), places, locator.share), len(places)
 
 
-def kept(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
+def trust_state(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
     """For a checkpoint's `extra`."""
     return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
 
 
 def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
-    """The trust that `kept` held.
+    """The trust that `trust_state` held.
 
     Where nothing was, areas are as wide as the model's own variances say, which is logged.
 

@@ -152,11 +152,11 @@ def _as_text(area: Any) -> str:
     return str(list(area)) if isinstance(area, Sequence) and not isinstance(area, str) else str(area)
 
 
-def _height(site: Site | None, given: float | None) -> float:
-    if given is not None:
-        if not (np.isfinite(given) and abs(given) < FARTHEST):
-            raise DataError(f"height_m={given}: a finite number of metres is needed")
-        return float(given)
+def _height(site: Site | None, height_m: float | None) -> float:
+    if height_m is not None:
+        if not (np.isfinite(height_m) and abs(height_m) < FARTHEST):
+            raise DataError(f"height_m={height_m}: a finite number of metres is needed")
+        return float(height_m)
     if site is None:
         return HEIGHT
     known = usual_heights(site).get(site.moving_end)

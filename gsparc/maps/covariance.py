@@ -68,7 +68,7 @@ def unknown_of(
     Raises:
         DataError: the model has neither a process nor known places.
     """
-    found = []
+    covariances = []
     for name in stations:
         asking = predictor if predictor.site.stations is None else predictor.at(name)
         number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
@@ -88,8 +88,8 @@ def unknown_of(
             error = calibration.expected_error(spread, inside, np.full(len(far), number))
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
-        found.append(ErrorCovariance(covariance, noise, weight))
-    return found
+        covariances.append(ErrorCovariance(covariance, noise, weight))
+    return covariances
 
 
 def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:

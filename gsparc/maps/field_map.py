@@ -129,7 +129,7 @@ class FieldMap:
             return float(reduced(values)) if len(values) else None
 
         power = self.layer("power_db")
-        found = {
+        figures = {
             "cells": int(self.grid.inside.sum()), "refused": int(self.refused.sum()),
             "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
             "lowest_db": of(power, np.min), "highest_db": of(power, np.max),
@@ -137,7 +137,7 @@ class FieldMap:
             "expected_error_db": of(self.layer("expected_error_db")), "threshold_db": self.threshold_db,
             "outage": of(self.outage), "sinr_db": of(self.sinr_db), "server_unsure": of(1.0 * self.unsure),
         }  # fmt: skip
-        return {f"map/{name}": value for name, value in found.items()}
+        return {f"map/{name}": value for name, value in figures.items()}
 
 
 def empty(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:
@@ -202,25 +202,25 @@ def sinr(power_db: np.ndarray, load: np.ndarray, noise_db: float | None) -> np.n
     return np.where((number == REFUSED) | ~(rest > 0), np.nan, ratio)
 
 
-def loads(given: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
+def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
     """Loads (T,) in [0, 1] of one number, one per station, or by name (the others 1).
 
     Raises:
         DataError: another number of them, an unknown name, or no share.
     """
-    if isinstance(given, Mapping):
-        wrong = next((name for name in given if name not in stations), None)
+    if isinstance(load, Mapping):
+        wrong = next((name for name in load if name not in stations), None)
         if wrong is not None:
             raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
-        given = [given.get(name, 1.0) for name in stations]
+        load = [load.get(name, 1.0) for name in stations]
     try:
-        values = np.array(given, dtype=np.float64)
+        values = np.array(load, dtype=np.float64)
     except (TypeError, ValueError):
-        raise DataError(f"load={given}: a number from 0 to 1 is needed, or one per station") from None
+        raise DataError(f"load={load}: a number from 0 to 1 is needed, or one per station") from None
     if values.ndim > 1 or values.size not in (1, len(stations)):
-        raise DataError(f"load={given}: one number is needed, or {len(stations)}, one per station")
+        raise DataError(f"load={load}: one number is needed, or {len(stations)}, one per station")
     if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"load={given}: shares from 0 to 1 are needed")
+        raise DataError(f"load={load}: shares from 0 to 1 are needed")
     return np.broadcast_to(values, (len(stations),))
 
 
@@ -238,7 +238,7 @@ def geotiff_wanted(wanted: bool | None, origin: Georeference | None) -> bool:
     return there and origin is not None and wanted is not False
 
 
-def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> None:
+def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference) -> None:
     """Write float32 bands, north up; named, NaN where nothing is said.
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
@@ -248,19 +248,19 @@ def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> No
     import rasterio
     from rasterio.transform import from_origin
 
-    bands = {**{name: found.layer(name) for name in ARRAYS}, **found.extra}
-    if len(found.stations) > 1:
+    bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
+    if len(raster.stations) > 1:
         bands |= {
-            f"power_db {name}": power for name, power in zip(found.stations, found.power_db, strict=True)
+            f"power_db {name}": power for name, power in zip(raster.stations, raster.power_db, strict=True)
         }
-    left, _, _, high = found.grid.extent
+    left, _, _, high = raster.grid.extent
     place = (
         f"+proj=aeqd +lat_0={origin.latitude!r} +lon_0={origin.longitude!r} +datum=WGS84 +units=m +no_defs"
     )
     profile = {
-        "driver": "GTiff", "width": len(found.grid.x), "height": len(found.grid.y), "count": len(bands),
+        "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "count": len(bands),
         "dtype": "float32", "crs": place, "nodata": float("nan"), "compress": "deflate", "tiled": True,
-        "transform": from_origin(left, high, found.grid.step, found.grid.step),
+        "transform": from_origin(left, high, raster.grid.step, raster.grid.step),
     }  # fmt: skip
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         for number, (name, values) in enumerate(bands.items(), 1):

@@ -82,14 +82,14 @@ def read_shapes(
                 lines.append(_points(line, where, origin, 2))
     if not polygons and not (lines and lines_too):
         raise DataError(f"{key}={path}: holds no polygon; draw the area as a Polygon or MultiPolygon")
-    found = Shapes(tuple(polygons), tuple(lines))
-    low, high = found.bounds()
+    shapes = Shapes(tuple(polygons), tuple(lines))
+    low, high = shapes.bounds()
     if origin is None and (high - low).max() < SPECK * site_m:
         raise DataError(
             f"{key}={path}: all of it is {(high - low).max():.2g} m wide, the site {site_m:.3g} m; the model "
             "was trained in metres about an unknown origin, which degrees mean nothing to"
         )
-    return found
+    return shapes
 
 
 def _geometries(content: Any) -> Iterator[dict[str, Any]]:
@@ -111,9 +111,9 @@ def _ring(ring: Any, where: str, origin: Georeference | None) -> np.ndarray:
     return places
 
 
-def _points(given: Any, where: str, origin: Georeference | None, least: int) -> np.ndarray:
+def _points(pairs: Any, where: str, origin: Georeference | None, least: int) -> np.ndarray:
     try:
-        places = np.array([point[:2] for point in given], dtype=np.float64)
+        places = np.array([point[:2] for point in pairs], dtype=np.float64)
     except (TypeError, ValueError, IndexError):
         raise DataError(f"{where}: coordinates are not pairs of numbers") from None
     if len(np.unique(places, axis=0)) < least:

@@ -35,8 +35,8 @@ def predicted(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[n
     if kind == "rssi":
         power = mean[:, 0].astype(np.float64) * scale
         good = np.isfinite(power) & (power > 0)
-        given = np.zeros(len(power)) if variance is None else variance
-        level[good], spread[good] = in_decibels(power[good], given[good])
+        variances = np.zeros(len(power)) if variance is None else variance
+        level[good], spread[good] = in_decibels(power[good], variances[good])
     else:
         power = (np.abs(mean.astype(np.complex128)) ** 2).mean(axis=1) * scale**2
         error = np.zeros(len(power)) if variance is None else variance

@@ -52,8 +52,8 @@ def map_of(
 ) -> FieldMap:
     """Predict every cell of an area.
 
-    >>> found = map_of(gsparc.load("model.ckpt"), step_m=0.5)
-    >>> len(found.power_db), bool(0 <= found.outage.mean() <= 1)
+    >>> field = map_of(gsparc.load("model.ckpt"), step_m=0.5)
+    >>> len(field.power_db), bool(0 <= field.outage.mean() <= 1)
     (1, True)
 
     Args:
@@ -121,8 +121,8 @@ def map_of(
             "sinr_db": sinr(power, load_of, noise_db),
             "outage": calibration.below(threshold_db, power[strongest], error[strongest]),
         }  # fmt: skip
-        for name, found in part.items():
-            flat[name][..., cells] = found
+        for name, layer in part.items():
+            flat[name][..., cells] = layer
     if promise is not None and not np.isfinite(values["power_db"]).any():
         raise DataError(
             f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
@@ -211,10 +211,10 @@ def _asker(
         return np.column_stack(levels_at(predictor, grid.places(cells), other))
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        found, parts = np.zeros((len(cells), 2)), _chunks(cells, CHUNK)
+        levels, parts = np.zeros((len(cells), 2)), _chunks(cells, CHUNK)
         for number, values in each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
-            found[number * CHUNK : number * CHUNK + len(values)] = values
-        return found
+            levels[number * CHUNK : number * CHUNK + len(values)] = values
+        return levels
 
     return ask
 
@@ -255,11 +255,11 @@ def ends_of(
     return {"rx": places, "tx": np.broadcast_to(place_of("other_end", other), places.shape)}
 
 
-def place_of(name: str, given: Any) -> np.ndarray:
+def place_of(name: str, value: Any) -> np.ndarray:
     """(3,) [m] of the setting `name`; `DataError` where it is no place."""
-    place = finite(given)
+    place = finite(value)
     if place.shape != (3,):
-        raise DataError(f"{name}={given}: three finite numbers [m] are needed")
+        raise DataError(f"{name}={value}: three finite numbers [m] are needed")
     return place
 
 
@@ -306,17 +306,17 @@ def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str
     layers = {name: np.full(grid.shape, np.nan, np.float32) for name in ("delay_spread_ns", "direction_deg")}
     for cells in _chunks(np.flatnonzero(best >= 0), CHUNK):
         try:
-            found = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
+            paths = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
         except ValueError:  # what was fitted has none
             return {}
-        power = np.abs(found.gain).astype(np.float64) ** 2
-        power, delay = power.mean(axis=1), np.asarray(found.delay_s, np.float64).mean(axis=1)
+        power = np.abs(paths.gain).astype(np.float64) ** 2
+        power, delay = power.mean(axis=1), np.asarray(paths.delay_s, np.float64).mean(axis=1)
         share = power / np.maximum(power.sum(axis=1, keepdims=True), np.finfo(float).tiny)
         middle = (share * delay).sum(axis=1, keepdims=True)
         spread = np.sqrt((share * (delay - middle) ** 2).sum(axis=1))
         layers["delay_spread_ns"].reshape(-1)[cells] = spread * 1e9
-        if found.direction is not None:
-            towards = found.direction[np.arange(len(cells)), power.argmax(axis=1)]
+        if paths.direction is not None:
+            towards = paths.direction[np.arange(len(cells)), power.argmax(axis=1)]
             azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
             layers["direction_deg"].reshape(-1)[cells] = azimuth
     return {name: layer for name, layer in layers.items() if np.isfinite(layer).any()}

@@ -28,28 +28,28 @@ PLAN_PIXELS = 1600  # of a plan's longer side
 
 def write_page(
     path: Path,
-    found: FieldMap,
-    drawn: Sequence[Layer],
+    field: FieldMap,
+    layers: Sequence[Layer],
     title: str,
     lines: Sequence[str],
     plan: FloorPlan | None,
 ) -> None:
     """Write an HTML page of layers that needs nothing but itself; `lines` are what a reader must know."""
-    every = max(1, -(-max(found.grid.shape) // MOST_CELLS))
+    every = max(1, -(-max(field.grid.shape) // MOST_CELLS))
     text = files("gsparc.maps").joinpath("page.html.j2").read_text(encoding="utf-8")
-    left, right, low, high = found.grid.extent
-    few = found.places[evenly(len(found.places), MOST_POINTS)]
+    left, right, low, high = field.grid.extent
+    few = field.places[evenly(len(field.places), MOST_POINTS)]
     stations = [
         {"name": name, "x": float(x), "y": float(y)}
-        for name, (x, y) in zip(found.stations, found.station_place, strict=True)
+        for name, (x, y) in zip(field.stations, field.station_place, strict=True)
         if np.isfinite([x, y]).all()
     ]
     content = {
-        "extent": [left, right, low, high], "step": found.grid.step * every,
-        "layers": [_encoded(layer, every) for layer in drawn],
+        "extent": [left, right, low, high], "step": field.grid.step * every,
+        "layers": [_encoded(layer, every) for layer in layers],
         "places": np.round(few, 3).tolist(), "stations": stations,
         "plan": None if plan is None else _plan(plan), "every": every,
-        "refused": _bits(found.refused[::every, ::every]),
+        "refused": _bits(field.refused[::every, ::every]),
     }  # fmt: skip
     page = Environment(autoescape=True).from_string(text)
     html = page.render(title=title, lines=lines, content=content)

@@ -50,9 +50,9 @@ class Legend:
         with np.errstate(invalid="ignore"):
             share = np.clip((values - self.low) / max(self.high - self.low, 1e-30), 0, 1)
         known = np.isfinite(values)
-        found = np.round(255 * colormaps[self.colours](np.where(known, share, 0.0))[..., :3]).astype(np.uint8)
-        found[~known] = GREY
-        return found
+        rgb = np.round(255 * colormaps[self.colours](np.where(known, share, 0.0))[..., :3]).astype(np.uint8)
+        rgb[~known] = GREY
+        return rgb
 
     @classmethod
     def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:
@@ -92,32 +92,32 @@ class Layer:
         return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
 
 
-def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
+def layers(field: FieldMap, unit: str = "dB") -> Iterator[Layer]:
     """Every layer of a map that says something; of several stations, also the power of each, in `unit`."""
-    several = len(found.stations) > 1
+    several = len(field.stations) > 1
     of = " of the strongest station" if several else ""
-    layer = found.layer("power_db")
+    layer = field.layer("power_db")
     yield Layer("power", layer, Legend.over(f"received power{of} [{unit}]", layer))
     if several:
-        doubt = (found.unsure, UNSURE) if found.unsure.any() else None
-        legend = Legend("strongest station", -0.5, len(found.stations) - 0.5)
-        yield Layer("best_server", found.layer("best_server"), legend, found.stations, doubt)
-    if np.isfinite(found.sinr_db).any():
+        doubt = (field.unsure, UNSURE) if field.unsure.any() else None
+        legend = Legend("strongest station", -0.5, len(field.stations) - 0.5)
+        yield Layer("best_server", field.layer("best_server"), legend, field.stations, doubt)
+    if np.isfinite(field.sinr_db).any():
         label = "signal over interference and noise [dB]"
-        yield Layer("sinr", found.sinr_db, Legend.over(label, found.sinr_db))
-    label = f"probability of less than {found.threshold_db:g} {unit}"
-    yield Layer("outage", found.outage, Legend(label, 0.0, 1.0, "magma_r"))
-    error, width = found.layer("expected_error_db"), found.strongest(found.upper_db - found.lower_db)
+        yield Layer("sinr", field.sinr_db, Legend.over(label, field.sinr_db))
+    label = f"probability of less than {field.threshold_db:g} {unit}"
+    yield Layer("outage", field.outage, Legend(label, 0.0, 1.0, "magma_r"))
+    error, width = field.layer("expected_error_db"), field.strongest(field.upper_db - field.lower_db)
     yield Layer("expected_error", error, Legend.over("expected error [dB]", error, "cividis"))
-    label = f"width of the {found.share:.0%} interval [dB]"
+    label = f"width of the {field.share:.0%} interval [dB]"
     yield Layer("width", width, Legend.over(label, width, "cividis"))
-    if "delay_spread_ns" in found.extra:
-        layer = found.extra["delay_spread_ns"]
+    if "delay_spread_ns" in field.extra:
+        layer = field.extra["delay_spread_ns"]
         yield Layer("delay_spread_ns", layer, Legend.over("delay spread [ns]", layer, "plasma"))
-    if "direction_deg" in found.extra:
+    if "direction_deg" in field.extra:
         legend = Legend("azimuth of the strongest path [degrees]", -180.0, 180.0, "twilight")
-        yield Layer("direction_deg", found.extra["direction_deg"], legend)
-    for name, layer in zip(found.stations, found.power_db, strict=True) if several else ():
+        yield Layer("direction_deg", field.extra["direction_deg"], legend)
+    for name, layer in zip(field.stations, field.power_db, strict=True) if several else ():
         if np.isfinite(layer).any():
             yield Layer(f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer))
 
@@ -127,39 +127,39 @@ def file_name(layer: Layer) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
 
 
-def draw_layer(found: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
+def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
     """Save one layer as PNG, over a floor plan."""
-    left, right, low, high = found.grid.extent
+    left, right, low, high = field.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
     axis = axes[0, 0]
-    nothing = np.where(found.refused, 1.0, np.nan)
+    nothing = np.where(field.refused, 1.0, np.nan)
     grey = ListedColormap(["0.82"])
-    axis.imshow(nothing, origin="lower", extent=found.grid.extent, cmap=grey, zorder=1, alpha=0.6)
+    axis.imshow(nothing, origin="lower", extent=field.grid.extent, cmap=grey, zorder=1, alpha=0.6)
     legend, known = layer.legend, layer.values[np.isfinite(layer.values)]
     limits = {"vmin": legend.low, "vmax": legend.high}
-    drawn = _cells(axis, found.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
+    image = _cells(axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
     ends = "both" if ((known < legend.low) | (known > legend.high)).any() else "neither"
-    bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
+    bar = figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.words:
         bar.set_ticks(list(range(len(layer.words))), labels=layer.words)
     if layer.unsure is not None:
-        _hatch(axis, found, *layer.unsure)
+        _hatch(axis, field, *layer.unsure)
     bounded(axis, (left, low), (right, high), title=title)
-    draw_places(axis, found)
+    draw_places(axis, field)
     scale_bar(axis)
-    if found.refused.any():
+    if field.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
     legend_below(figure)
     save(figure, path, 110)
 
 
-def _hatch(axis: Any, found: FieldMap, cells: np.ndarray, why: str) -> None:
+def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
     """Hatch cells (ny, nx) of a map; a map of a single row or column has no area to hatch."""
     if min(cells.shape) > 1:
         how: dict[str, Any] = {"hatches": ["", "////"], "levels": [-0.5, 0.5, 1.5], "colors": "none"}
-        drawn = axis.contourf(found.grid.x, found.grid.y, cells.astype(float), zorder=2.5, **how)
-        drawn.set(edgecolor="black", linewidth=0.0)
+        hatches = axis.contourf(field.grid.x, field.grid.y, cells.astype(float), zorder=2.5, **how)
+        hatches.set(edgecolor="black", linewidth=0.0)
         axis.fill([], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why)
 
 
@@ -179,63 +179,63 @@ def draw_plan(axis: Any, plan: FloorPlan) -> None:
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 
-def draw_places(axis: Any, found: FieldMap) -> None:
+def draw_places(axis: Any, field: FieldMap) -> None:
     """Measured points and stations; those outside the map are left out."""
-    left, right, low, high = found.grid.extent
-    draw_measured(axis, found.places)
-    known = found.station_place
+    left, right, low, high = field.grid.extent
+    draw_measured(axis, field.places)
+    known = field.station_place
     inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
     if inside.any():
         draw_stations(axis, known[inside])
     if 1 < len(known) <= NAMED:
-        for where, name in zip(known[inside], np.array(found.stations)[inside], strict=True):
+        for where, name in zip(known[inside], np.array(field.stations)[inside], strict=True):
             annotate(axis, name, where)
 
 
 def draw_plan_picture(
-    found: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
+    batch: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
 ) -> None:
     """Expected error before and after, the chosen places, and how it falls."""
-    left, right, low, high = found.grid.extent
+    left, right, low, high = batch.grid.extent
     wide = (right - left) / max(right - left, high - low)
     tall = (high - low) / max(right - left, high - low)
     figure, ((before, after, curve),) = panels(
         11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
     )
-    errors = np.concatenate([found.error_before, found.error_after])
+    errors = np.concatenate([batch.error_before, batch.error_after])
     limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
-    for axis, values, title in ((before, found.error_before, "before"), (after, found.error_after, "after")):
-        image = np.full(found.grid.shape, np.nan)
-        image[found.grid.inside] = values
-        drawn = _cells(axis, found.grid, image, plan, cmap="cividis", **limits)
+    for axis, values, title in ((before, batch.error_before, "before"), (after, batch.error_after, "after")):
+        image = np.full(batch.grid.shape, np.nan)
+        image[batch.grid.inside] = values
+        mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
         bounded(axis, (left, low), (right, high), ylabel="", title=title)
         scale_bar(axis)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
         draw_measured(before, places)
     how: dict[str, Any] = {"marker": "o", "color": "red", "markeredgecolor": "white", "markersize": 6}
-    after.plot(*found.places[:, :2].T, linestyle="-" if found.walk else "", linewidth=1, zorder=3, **how)
-    for number, place in enumerate(found.places[:60], 1):
+    after.plot(*batch.places[:, :2].T, linestyle="-" if batch.walk else "", linewidth=1, zorder=3, **how)
+    for number, place in enumerate(batch.places[:60], 1):
         after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
                        path_effects=OUTLINE, zorder=4)  # fmt: skip
-    figure.colorbar(drawn, ax=[before, after], label="expected error [dB]", shrink=0.8)
-    curve.plot(np.append(found.before_db, found.expected_db[np.argsort(found.chosen)]), ".-")
+    figure.colorbar(mesh, ax=[before, after], label="expected error [dB]", shrink=0.8)
+    curve.plot(np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)]), ".-")
     curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
     curve.set_ylim(bottom=0)  # what the walk gains is seen beside what is left
     curve.grid(alpha=0.3)
     save(figure, path, 100)
 
 
-def draw_placing(found: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
+def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
     """The goal at every candidate, the stations that stand, and the best place."""
-    left, right, low, high = found.grid.extent
+    left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
     label = f"share of the area with {threshold_db:g} {unit} or more"
-    label = label if found.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
-    drawn = axis.scatter(*found.places[:, :2].T, c=found.goal, s=60, marker="s", cmap="viridis")
-    figure.colorbar(drawn, ax=axis, label=f"{label}, with a station here", shrink=0.85)
-    draw_stations(axis, found.stations)
-    draw_stations(axis, found.places[0, :2], "best", marker="*", color="r", markersize=18)
+    label = label if placing.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
+    dots = axis.scatter(*placing.places[:, :2].T, c=placing.goal, s=60, marker="s", cmap="viridis")
+    figure.colorbar(dots, ax=axis, label=f"{label}, with a station here", shrink=0.85)
+    draw_stations(axis, placing.stations)
+    draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
     bounded(axis, (left, low), (right, high))
     scale_bar(axis)
     legend_below(figure)

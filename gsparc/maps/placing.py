@@ -145,12 +145,12 @@ def place_next(
             goals[k] = np.mean(1 - np.minimum(old_outage, outage))
         return goals
 
-    found = np.empty((len(candidates), 3))
+    scores = np.empty((len(candidates), 3))
     for row, goals in each(tried, list(candidates), "candidates"):
-        found[row] = goals
+        scores[row] = goals
     before = float(np.quantile(old_power, DECILE) if goal == "worst" else np.mean(1 - old_outage))
-    order = np.argsort(-found[:, 0], kind="stable")
-    value, low, high = found[order].T
+    order = np.argsort(-scores[:, 0], kind="stable")
+    value, low, high = scores[order].T
     return Placing(candidates[order], value, low, high, before, goal, grid, still[:, :2], error)
 
 

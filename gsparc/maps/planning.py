@@ -98,8 +98,8 @@ def plan_next(
 ) -> Plan:
     """Choose places to measure next, as a batch.
 
-    >>> found = gsparc.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
-    >>> found.places.shape, found.after_db < found.before_db
+    >>> plan = gsparc.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
+    >>> plan.places.shape, plan.after_db < plan.before_db
     ((20, 3), True)
 
     Args:
@@ -182,18 +182,18 @@ def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str
     """Places (n, 3) in polygons or along lines of a file."""
     left, right, south, north = grid.extent
     shapes: Shapes = read_shapes(path, key, origin, True, max(right - left, north - south))
-    found = [np.zeros((0, 2))]
+    points = [np.zeros((0, 2))]
     if shapes.polygons:
         low, high = (np.array(v) for v in Shapes(shapes.polygons, ()).bounds())
         step = max(grid.step / 2, float(np.sqrt((high - low).prod() / (4 * CANDIDATES))))
         x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
         every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        found.append(every[shapes.contains(every)])
+        points.append(every[shapes.contains(every)])
     for line in shapes.lines:
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
         at = np.linspace(0, along[-1], max(2, int(np.ceil(2 * along[-1] / grid.step)) + 1))
-        found.append(np.column_stack([np.interp(at, along, line[:, k]) for k in range(2)]))
-    places = np.unique(np.concatenate(found), axis=0)
+        points.append(np.column_stack([np.interp(at, along, line[:, k]) for k in range(2)]))
+    places = np.unique(np.concatenate(points), axis=0)
     if not len(places):
         raise DataError(f"{key}={path}: its polygons are too small for any place")
     if len(places) > CANDIDATES:
@@ -250,10 +250,10 @@ def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
     return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
 
 
-def _start(given: Sequence[float]) -> np.ndarray:
-    place = finite(given)
+def _start(value: Sequence[float]) -> np.ndarray:
+    place = finite(value)
     if place.shape not in ((2,), (3,)):
-        raise DataError(f"start={given}: [x,y] in metres is needed")
+        raise DataError(f"start={value}: [x,y] in metres is needed")
     return place[:2]
 
 

@@ -36,19 +36,19 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
     if not settings["promised"]:
         return None
     stored = checkpoint.read(path)
-    found = None if settings.get("renew") else stored_promise(stored.extra)
-    if found is not None and how.block_m in (None, found.block_m):
-        return found
+    promise = None if settings.get("renew") else stored_promise(stored.extra)
+    if promise is not None and how.block_m in (None, promise.block_m):
+        return promise
     if "model" not in stored.configuration:
         raise DataError(
             f"{path}: does not say how it was trained; say promised=false for a map without promise"
         )
     method, make, data, fold, context = trained(path, settings["dataset"])
     log.info("a promise for this map: %d fits without blocks of places", how.folds)
-    found = gather(method, make, data, fold, how, context)
-    found.coverage(how.share)  # too little evidence is said before anything is stored
-    found.keep(path)
-    return found
+    promise = gather(method, make, data, fold, how, context)
+    promise.coverage(how.share)  # too little evidence is said before anything is stored
+    promise.keep(path)
+    return promise
 
 
 def trained(
@@ -76,12 +76,12 @@ def trained(
     return run.methods[0], make, run.data, run.split.folds[0], context
 
 
-def notes_of(found: FieldMap, coverage: Coverage | None) -> list[str]:
+def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
     """What a reader of the map must know."""
-    notes = [*found.notes]
-    figures = found.figures()
+    notes = [*field.notes]
+    figures = field.figures()
     share = figures["map/server_unsure"]
-    if share and len(found.stations) > 1:
+    if share and len(field.stations) > 1:
         notes.append(
             f"best_server: in {share:.1%} of the cells (hatched) the station named is less likely than not "
             "the strongest and above its floor; noise_db=... says where noise lies"
@@ -92,10 +92,10 @@ def notes_of(found: FieldMap, coverage: Coverage | None) -> list[str]:
     ours = f"{coverage.share:.1%} did (mean width {coverage.width_db:.1f} dB"
     own = f"the model's own deviations: {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB)"
     notes.append(
-        f"in {found.share:.0%} of the cells a measurement is promised to lie in its interval: of "
+        f"in {field.share:.0%} of the cells a measurement is promised to lie in its interval: of "
         f"{coverage.rows} rows in {coverage.blocks} held-out blocks {ours}; {own}"
     )
     if figures["map/refused"]:
-        cells = f"{figures['map/refused']} of {int(found.grid.inside.sum())} cells"
+        cells = f"{figures['map/refused']} of {int(field.grid.inside.sum())} cells"
         notes.append(f"{cells} are refused: too far from what was measured")
     return notes

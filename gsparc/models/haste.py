@@ -46,7 +46,7 @@ def haste(budget: TimeBudget | None, share: float, count: int) -> Haste:
     if budget is None or not math.isfinite(budget.seconds):
         return UNHURRIED
     began = budget.spent
-    given = share * max(budget.seconds - began, 0.0)
+    share_s = share * max(budget.seconds - began, 0.0)
     values, at = torch.arange(TIMED_ON, dtype=torch.float64)[:, None], torch.from_numpy(ONE.parameters())
     tried = []
     for _ in range(TRIES):
@@ -54,10 +54,10 @@ def haste(budget: TimeBudget | None, share: float, count: int) -> Haste:
         gram = gram_of(at.requires_grad_(), torch.cdist(values, values))
         LeftOutDensity.apply(gram, values, 1, True)[0].backward()  # type: ignore[no-untyped-call]
         tried.append(watch.spent)
-    affordable = given / (LOOKS * max(min(tried), 1e-6))
+    affordable = share_s / (LOOKS * max(min(tried), 1e-6))
     rows = min(int(TIMED_ON * affordable ** (1 / 3)), CHOSEN_ON)
     budget.limited |= rows < min(count, CHOSEN_ON)
-    return Haste(max(rows, FEWEST), lambda: budget.over((began + given) / max(budget.seconds, 1e-9)))
+    return Haste(max(rows, FEWEST), lambda: budget.over((began + share_s) / max(budget.seconds, 1e-9)))
 
 
 def factor_s(rows: int) -> float:

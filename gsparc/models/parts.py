@@ -56,7 +56,7 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
     left = context.resume
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
-            return _taken(method, data, fold, context, left / checkpoint.MODEL)
+            return _restore(method, data, fold, context, left / checkpoint.MODEL)
         if not method.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
@@ -78,7 +78,7 @@ def folder_of(path: Path, parts: str) -> Path:
     return next((one.parent for one in (inside, *inside.parents) if re.fullmatch(parts, one.name)), inside)
 
 
-def _taken(method: Method, data: Measurements, fold: Fold, context: FitContext, file: Path) -> FitReport:
+def _restore(method: Method, data: Measurements, fold: Fold, context: FitContext, file: Path) -> FitReport:
     stored = checkpoint.read(file)
     Origin.of(data, fold, context).refuse_other(stored)
     method.restore(data.site, stored.state)

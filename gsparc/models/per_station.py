@@ -154,8 +154,8 @@ class PerStation(Method):
             except KeyboardInterrupt:
                 if not resumable or len(numbers) == 1:
                     raise
-                said = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
-                raise KeyboardInterrupt(f"{said}; go on with ckpt_path={context.run_dir}") from None
+                progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
+                raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
                 extra = parts.marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)

@@ -43,8 +43,8 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
     known = heard(data, np.sort(np.concatenate([fold.train, fold.val])))
     if len(known) > ONE_FACTOR:
         return "each", f"{len(known)} rows are more than one factor holds ({ONE_FACTOR})"
-    given = math.inf if context.budget_s is None else context.budget_s
-    budget = context.time_budget(min(MOST_S, SHARE * given))
+    limit_s = math.inf if context.budget_s is None else context.budget_s
+    budget = context.time_budget(min(MOST_S, SHARE * limit_s))
     errors = []
     for inner in cut_inside(data, fold, context.split, FOLDS, context.seed).folds:
         learned, queries = (heard(data, part) for part in (np.union1d(inner.train, inner.val), inner.test))
@@ -58,7 +58,7 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
         rows = np.concatenate([part for part, _ in parts])
         separate = torch.cat([powers for _, powers in parts])
         target = _decibels(data.batch(rows).target)
-        errors.append([(_said(joint, data, rows) - target).square(), (separate - target).square()])
+        errors.append([(_levels(joint, data, rows) - target).square(), (separate - target).square()])
         if budget.over():
             break
     if not errors:
@@ -79,11 +79,11 @@ def _by_station(
         if len(known) >= LEAST_ROWS:
             part = data.subset(rows, of_station(data.site, number))
             field, _ = INITIALISERS["powers"](part, known, PLAIN, False, context)
-            yield rows[left], _said(field, part, left)
+            yield rows[left], _levels(field, part, left)
 
 
 @torch.no_grad()
-def _said(field: ConditionalField, data: Measurements, rows: np.ndarray) -> Tensor:
+def _levels(field: ConditionalField, data: Measurements, rows: np.ndarray) -> Tensor:
     return _decibels(field.answer(data.batch(rows)).mean)
 
 

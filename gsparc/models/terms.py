@@ -87,13 +87,13 @@ def called_for(
     site = data.site
     networks = f"emission.hidden={hidden}" if hidden else None
     placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
-    drawn = networks or placed  # asks for Gaussians that are rendered
+    request = networks or placed  # asks for Gaussians that are rendered
     obstacles = {
         "array": _no_array(site, "rx", "the receiver moves")
         or (networks and f"{networks} asks for networks"),
         "moving_array": _no_array(site, "tx", "the receiver stands still")
-        or (drawn and f"{drawn} asks for rendered Gaussians"),
-        "phase": _no_phase(data) or (drawn and f"{drawn} asks for rendered Gaussians"),
+        or (request and f"{request} asks for rendered Gaussians"),
+        "phase": _no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
     on, reasons = {}, []
@@ -107,7 +107,7 @@ def called_for(
             reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{suffix}")
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
-    rendered = drawn is not None or switches.image is True
+    rendered = request is not None or switches.image is True
     return Terms(**on, rendered=rendered, obstacle=obstacles["phase"], reasons=tuple(reasons))
 
 

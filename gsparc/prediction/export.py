@@ -129,11 +129,11 @@ def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any =
 
 def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     """The sources of uplinks (B, U, L), physical units; see `heard`."""
-    found = _separator(method).sources(_snapshots(method, site, uplink))
+    sources = _separator(method).sources(_snapshots(method, site, uplink))
     assert site.uplink_hz is not None
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
-    gain, delay = (found.gain * site.target_scale).numpy(), (found.delay.double() / spacing).numpy()
-    return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=found.direction.numpy())
+    gain, delay = (sources.gain * site.target_scale).numpy(), (sources.delay.double() / spacing).numpy()
+    return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=sources.direction.numpy())
 
 
 def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
@@ -190,10 +190,10 @@ def _snapshots(method: Method, site: Site, uplink: Any) -> Tensor:
     if site.uplink_array is None or site.uplink_hz is None:
         raise ValueError(f"uplink=: {site.name} has no uplink")
     shape = (len(site.uplink_array), len(site.uplink_hz))
-    given = torch.as_tensor(uplink).to(torch.complex64)
-    given = given[None] if given.ndim == 2 else given
-    if given.ndim != 3 or given.shape[1:] != shape:
-        raise ValueError(f"uplink=: expected (B, {shape[0]}, {shape[1]}) complex, got {tuple(given.shape)}")
-    if not torch.isfinite(torch.view_as_real(given)).all():
+    values = torch.as_tensor(uplink).to(torch.complex64)
+    values = values[None] if values.ndim == 2 else values
+    if values.ndim != 3 or values.shape[1:] != shape:
+        raise ValueError(f"uplink=: expected (B, {shape[0]}, {shape[1]}) complex, got {tuple(values.shape)}")
+    if not torch.isfinite(torch.view_as_real(values)).all():
         raise ValueError("uplink=: holds NaN or Inf")
-    return given / site.target_scale
+    return values / site.target_scale

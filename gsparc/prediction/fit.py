@@ -62,7 +62,7 @@ def fit(
         DataError: arrays that `gsparc check` would refuse, all problems with array and row.
         ValueError: no such model, or one that cannot learn these measurements.
     """
-    given = {
+    inputs = {
         "rx_position": rx,
         "tx_position": tx,
         "rssi_db": rssi,
@@ -70,7 +70,7 @@ def fit(
         "spectrum": spectrum,
         **arrays,
     }
-    raw = Raw({name: np.asarray(value) for name, value in given.items() if value is not None}, {})
+    raw = Raw({name: np.asarray(value) for name, value in inputs.items() if value is not None}, {})
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
@@ -92,6 +92,6 @@ def _learned_from(data: Measurements, share: float, seed: int) -> Fold:
     """All rows; those at a share of the places validate. Nothing is left to test on."""
     rows = np.arange(len(data))
     places, which = np.unique(rows if data.place is None else data.place, return_inverse=True)
-    drawn = np.random.default_rng(seed).permutation(len(places))[: round(share * len(places))]
-    validates = np.isin(which.reshape(-1), drawn)
+    held_out = np.random.default_rng(seed).permutation(len(places))[: round(share * len(places))]
+    validates = np.isin(which.reshape(-1), held_out)
     return Fold(rows[~validates], rows[validates], rows[:0])

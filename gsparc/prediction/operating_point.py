@@ -57,9 +57,9 @@ def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -
 
 def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
     """The points in a checkpoint's `extra`, none when it was never swept."""
-    found = extra.get(KEY) or {"points": [], "measured": {}}
-    points = [Operating(**{**point, "figure": tuple(point["figure"])}) for point in found["points"]]
-    return points, dict(found["measured"])
+    sweep = extra.get(KEY) or {"points": [], "measured": {}}
+    points = [Operating(**{**point, "figure": tuple(point["figure"])}) for point in sweep["points"]]
+    return points, dict(sweep["measured"])
 
 
 log = logging.getLogger(__name__)

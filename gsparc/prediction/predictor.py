@@ -230,12 +230,12 @@ class Predictor:
 
         if uplink is not None:
             channel = export.uplink_channels(self.method, self.site, uplink, frequency_hz)
-            found = export.on_grid(channel, self.site, None, symbols)
-            return found if isinstance(uplink, Tensor) else found.numpy()
+            answer = export.on_grid(channel, self.site, None, symbols)
+            return answer if isinstance(uplink, Tensor) else answer.numpy()
         channel = torch.as_tensor(self._ask("csi", tx, rx))
         channel = channel[None] if channel.ndim == 2 else channel
-        found = export.on_grid(channel, self.site, frequency_hz, symbols)
-        return found if any(isinstance(end, Tensor) for end in (tx, rx)) else found.numpy()
+        answer = export.on_grid(channel, self.site, frequency_hz, symbols)
+        return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
         """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
@@ -352,8 +352,8 @@ class Predictor:
                 f"call .{self.site.kind}(...)"
             )
         if grad:
-            found, single = self._followed(self.method, tx, rx)
-            return found.mean[0] if single else found.mean
+            moments, single = self._followed(self.method, tx, rx)
+            return moments.mean[0] if single else moments.mean
         query = self._query(tx, rx)
         mean = _predicted(self.method, query).mean
         scale = self.site.target_scale
@@ -385,22 +385,22 @@ class Predictor:
                 self._prepared.append(method)
                 with torch._C._DisableFuncTorch(), torch.no_grad():
                     method.predict(query.tx, query.rx)
-            found = method.predict(local.get("tx", query.tx), at)
+            moments = method.predict(local.get("tx", query.tx), at)
         dtype = torch.float32
         for value in ends.values():
             dtype = torch.promote_types(dtype, value.dtype)
         scale, own = self.site.target_scale, (self.kind or self.trusted.kind) in (None, "learned")
-        mean = (found.mean * scale).to(dtype.to_complex() if found.mean.is_complex() else dtype)
-        sure = None if found.confidence is None or not own else found.confidence.to(dtype)
+        mean = (moments.mean * scale).to(dtype.to_complex() if moments.mean.is_complex() else dtype)
+        sure = None if moments.confidence is None or not own else moments.confidence.to(dtype)
         return Prediction(
-            mean, sure, None if found.variance is None else found.variance * scale**2
+            mean, sure, None if moments.variance is None else moments.variance * scale**2
         ), query.single
 
     def _query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Query:
         """Both ends as they were given, checked."""
-        given = rx.position if isinstance(rx, Pose) else rx
+        receiver = rx.position if isinstance(rx, Pose) else rx
         places = {
-            end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
+            end: _positions(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
         }
         moving, static = self.site.moving_end, self.site.static_end or "tx"
         for needed in (moving,) if self.site.static_end else ("rx", "tx"):
@@ -425,7 +425,7 @@ class Predictor:
             turned = np.broadcast_to(rotation, (count, 3, 3))
             pose = Pose(_float(positions, dtype), _float(turned, dtype))
         sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, given)))
+        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, receiver)))
 
     def _still_pose(self) -> Pose | None:
         """The pose of a receiver that never moved, made once; None for any other site."""
@@ -434,18 +434,18 @@ class Predictor:
             return None
         return Pose(_float(site.static_position), _float(self._rotation(None, 1)))
 
-    def _static(self, given: np.ndarray | None) -> np.ndarray:
+    def _static(self, place: np.ndarray | None) -> np.ndarray:
         """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
         known, end = self.site.static_position, self.site.static_end
         if known is None:
-            if given is not None:
-                return given[0] if len(given) == 1 else given
+            if place is not None:
+                return place[0] if len(place) == 1 else place
             if self.site.stations is not None:
                 raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
             if self.site.kind == "rssi":  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
-        if given is not None and (np.linalg.norm(given - known, axis=-1) > SAME_PLACE_M).any():
+        if place is not None and (np.linalg.norm(place - known, axis=-1) > SAME_PLACE_M).any():
             stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
             raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
         return known

@@ -35,9 +35,9 @@ class Batcher:
 
     async def ask(self, place: np.ndarray) -> np.ndarray:
         """Answers (n, ...) at world places (n, 3) [m]; raises what the model does."""
-        found: asyncio.Future = asyncio.get_running_loop().create_future()
-        self.waiting.put_nowait((place, found))
-        return await found
+        future: asyncio.Future = asyncio.get_running_loop().create_future()
+        self.waiting.put_nowait((place, future))
+        return await future
 
     async def run(self) -> None:
         """Until cancelled; a request whose client left is dropped."""
@@ -55,9 +55,9 @@ class Batcher:
     async def _serve(self, batch: list[tuple[np.ndarray, asyncio.Future]]) -> None:
         try:
             site, place = self.predictor.site, np.concatenate([place for place, _ in batch])
-            found = await asyncio.to_thread(getattr(self.predictor, site.kind), **{site.moving_end: place})
+            answers = await asyncio.to_thread(getattr(self.predictor, site.kind), **{site.moving_end: place})
             ends = np.cumsum([len(place) for place, _ in batch])[:-1]
-            for (_, future), own in zip(batch, np.split(found, ends), strict=True):
+            for (_, future), own in zip(batch, np.split(answers, ends), strict=True):
                 if not future.done():
                     future.set_result(own)
         except Exception as error:
@@ -91,8 +91,8 @@ def application(predictor: Predictor, delay_s: float, most: int, token: str | No
 
     @app.post("/predict")
     async def predict(request: Request) -> Response:
-        given = request.headers.get("authorization", "")
-        if token is not None and not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
+        header = request.headers.get("authorization", "")
+        if token is not None and not hmac.compare_digest(header.encode(), f"Bearer {token}".encode()):
             raise HTTPException(401, "Authorization: Bearer TOKEN is needed")
         body = b""
         try:
@@ -114,13 +114,13 @@ def application(predictor: Predictor, delay_s: float, most: int, token: str | No
         if len(place) > most:
             raise HTTPException(413, f"at most {most} places")
         try:
-            found = await batcher.ask(place)
+            values = await batcher.ask(place)
         except Exception as error:
             raise HTTPException(422 if isinstance(error, ValueError) else 500, str(error)) from error
-        found = np.stack([found.real, found.imag], -1) if np.iscomplexobj(found) else found
-        shape = {"x-shape": ",".join(map(str, found.shape))}
+        values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
+        shape = {"x-shape": ",".join(map(str, values.shape))}
         if raw:
-            return Response(found.astype("<f4").tobytes(), media_type=RAW, headers=shape)
-        return JSONResponse({"shape": found.shape, "values": found.tolist()})
+            return Response(values.astype("<f4").tobytes(), media_type=RAW, headers=shape)
+        return JSONResponse({"shape": values.shape, "values": values.tolist()})
 
     return app

@@ -120,7 +120,7 @@ class ConditionalGaussian:
         return level - self.mean < CERTAIN * self.covariance.diagonal().sqrt()
 
     def at(self, rows: Tensor) -> ConditionalGaussian:
-        """The entries `kept` alone."""
+        """The entries `rows` alone."""
         return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
 
 

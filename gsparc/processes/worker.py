@@ -15,7 +15,7 @@ class Cancelled(BaseException):
 
 @contextmanager
 def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
-    """Within, this thread is asked `said` as `name`, beside what surrounds it."""
+    """Within, this thread is asked `condition` as `name`, beside what surrounds it."""
     before = getattr(_asked, name, None)
     setattr(_asked, name, condition if before is None else lambda: before() or condition())
     try:

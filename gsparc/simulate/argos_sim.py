@@ -104,9 +104,9 @@ def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
         ValueError: fewer than `count` users are decoded.
     """
     streets, rng = scene(seed, scatterers), np.random.default_rng([seed, 2])
-    drawn = rng.uniform(LOWER, UPPER, (8 * count, 2))
-    drawn = drawn[streets.open(drawn)][: 2 * count]
-    users = np.column_stack([drawn, rng.uniform(*HEIGHT_M, len(drawn))])
+    across = rng.uniform(LOWER, UPPER, (8 * count, 2))
+    across = across[streets.open(across)][: 2 * count]
+    users = np.column_stack([across, rng.uniform(*HEIGHT_M, len(across))])
     rays = trace(streets, users, LIGHT / CARRIER_HZ)
     power = (np.abs(rays.gain) ** 2).sum(axis=1)
     noise = float(np.median(power)) / 10 ** (MEDIAN_SNR_DB / 10)

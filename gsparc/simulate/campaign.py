@@ -34,13 +34,13 @@ class Outcome:
     """A finished dataset and what it cost.
 
     Attributes:
-        made, survey, effects: the file, its rows, and what was simulated.
+        dataset, survey, effects: the file, its rows, and what was simulated.
         choice, changed: of `auto`; else None.
         convergence: between two seeds; None where there are no rays.
         seconds: by stage [s].
     """
 
-    made: Assembled
+    dataset: Assembled
     survey: Survey
     effects: PropagationEffects
     choice: Choice | None
@@ -81,10 +81,10 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     error = convergence(campaign, survey, effects, shards, left_out)
     laps.append(time.perf_counter())
     other_s = laps[1] - laps[0] + (0.0 if choice is None else choice.seconds) + laps[4] - laps[3]
-    made = assemble(campaign, survey, effects, choice, error, other_s, shards)
+    dataset = assemble(campaign, survey, effects, choice, error, other_s, shards)
     laps.append(time.perf_counter())
     seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
-    return Outcome(made, survey, effects, choice, changed, error, seconds)
+    return Outcome(dataset, survey, effects, choice, changed, error, seconds)
 
 
 def _decided(decider: deciding.Decider, shards: Shards) -> Decision:
@@ -96,8 +96,8 @@ def _decided(decider: deciding.Decider, shards: Shards) -> Decision:
     shards.path(0).unlink(missing_ok=True)
     decision = decider.decide()
     if decision.rows is not None and decision.paths is not None:
-        made = shard_arrays(decision.paths, decider.campaign, decider.survey.engine.wavelength)
-        shards.put(0, {**made, ROWS: decision.rows, SECONDS: np.array(0.0)})  # they are in the decision's
+        arrays = shard_arrays(decision.paths, decider.campaign, decider.survey.engine.wavelength)
+        shards.put(0, {**arrays, ROWS: decision.rows, SECONDS: np.array(0.0)})  # they are in the decision's
     shards.write_note(decision.note())
     return decision
 
@@ -124,8 +124,8 @@ class _Tracing:
             self.survey = build(self.campaign.scene, self.campaign.sampling)
         paths = self.survey.trace(rows, self.effects)
         spent = (deciding.busy_s() - busy) / len(rows)
-        made = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
-        self.shards.put(number, {**made, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
+        arrays = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
+        self.shards.put(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
         first, self.compiled = not self.compiled, True
         return math.nan if first else spent
 

@@ -112,8 +112,8 @@ def prepare(fetch_missing: bool = False) -> Path:
     if fetch_missing and not os.environ.get(VARIABLE):
         fetch()
         return prepare()
-    found = "; ".join(faults) or "no LLVM library was found"
-    raise SimulatorMissing(f"Sionna needs LLVM 19 (15 and 16 abort): {found}; {REMEDY}")
+    causes = "; ".join(faults) or "no LLVM library was found"
+    raise SimulatorMissing(f"Sionna needs LLVM 19 (15 and 16 abort): {causes}; {REMEDY}")
 
 
 def fetch() -> None:
@@ -125,9 +125,9 @@ def fetch() -> None:
     FETCHED.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=FETCHED.parent) as scratch:
         script = ["sh", "-ec", FETCH, "sh", str(FETCHED)]
-        done = subprocess.run(script, cwd=scratch, capture_output=True, text=True)
-    if done.returncode:
-        words = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
+        process = subprocess.run(script, cwd=scratch, capture_output=True, text=True)
+    if process.returncode:
+        words = (process.stderr.strip().splitlines() or [f"exit {process.returncode}"])[-1]
         raise SimulatorMissing(f"libllvm19: {words}; put LLVM 19 on this machine and name it in {VARIABLE}")
 
 

@@ -264,9 +264,9 @@ class RayTracer(Engine):
 
         def point(coordinates: np.ndarray) -> Any:
             # Plain numbers are constants of kernels: every other place would compile one anew.
-            made = mi.Point3f(*map(float, coordinates))
-            dr.make_opaque(made)
-            return made
+            opaque = mi.Point3f(*map(float, coordinates))
+            dr.make_opaque(opaque)
+            return opaque
 
         tx = scene.get("tx")
         tx.position, ahead = point(self.transmitter), point(np.zeros(3))

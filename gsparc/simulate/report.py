@@ -58,14 +58,14 @@ def verdict(choice: Choice) -> str:
 
 def figures(outcome: Outcome) -> dict[str, Any]:
     """Flat facts."""
-    made = outcome.made
+    dataset = outcome.dataset
     facts: dict[str, Any] = {
-        "dataset/name": made.data.site.name,
-        "dataset/sha256": made.data.site.sha256,
+        "dataset/name": dataset.data.site.name,
+        "dataset/sha256": dataset.data.site.sha256,
         "dataset/receivers": len(outcome.survey.places),
         "dataset/rows": len(outcome.survey),
         "effects": str(outcome.effects),
-        **{f"scene/{name}": value for name, value in made.facts.items()},
+        **{f"scene/{name}": value for name, value in dataset.facts.items()},
         **{f"time/{name}_s": value for name, value in outcome.seconds.items()},
         "time/receivers_per_s": len(outcome.survey) / max(outcome.seconds["trace"], 1e-9),
     }
@@ -90,7 +90,7 @@ def closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
     lines = [
         f"{count} receivers with {outcome.effects} in {seconds:.0f} s (load {load:.1f} per core): "
         + ", ".join(f"{name} {value:.0f} s" for name, value in outcome.seconds.items()),
-        f"{outcome.made.facts['below_horizon']:.1%} of the power comes from below the horizon, unseen",
+        f"{outcome.dataset.facts['below_horizon']:.1%} of the power comes from below the horizon, unseen",
     ]
     if outcome.convergence is not None:
         error = outcome.convergence

@@ -83,9 +83,9 @@ class SpectrumSettings(ArraySettings):
 
     def attributes(self) -> dict[str, str | float | int]:
         """The definition as attributes of a file."""
-        given = {f"spectrum_{key}": value for key, value in asdict(self).items()}
+        attributes = {f"spectrum_{key}": value for key, value in asdict(self).items()}
         drop = ("beam_deg",) if self.kind == "bartlett" else ("rows", "columns", "spacing")
-        return {key: value for key, value in given.items() if key.removeprefix("spectrum_") not in drop}
+        return {key: value for key, value in attributes.items() if key.removeprefix("spectrum_") not in drop}
 
 
 def spectra(

@@ -103,12 +103,12 @@ def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
     if predictor.site.kind != "csi" or not isinstance(predictor.method, HasPaths):
         return None
     try:
-        found: Paths = predictor.paths(**ends)
+        paths: Paths = predictor.paths(**ends)
     except ValueError:  # what was fitted has none
         return None
-    delay = np.asarray(found.delay_s[0], np.float64).mean(axis=0) * 1e9
-    towards = None if found.direction is None else np.asarray(found.direction[0], np.float64)
-    return rays(found.gain[0], delay, towards)
+    delay = np.asarray(paths.delay_s[0], np.float64).mean(axis=0) * 1e9
+    towards = None if paths.direction is None else np.asarray(paths.direction[0], np.float64)
+    return rays(paths.gain[0], delay, towards)
 
 
 def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:

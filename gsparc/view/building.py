@@ -47,7 +47,7 @@ VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
 
 
 @dataclass(frozen=True)
-class Given:
+class Building:
     """What is known of a site besides its model.
 
     Attributes:
@@ -59,23 +59,23 @@ class Given:
     walls: SceneWalls | None = None
 
 
-def build(viewed: Viewed, given: Given, station: str | None, measured: Measured | None) -> Scene:
+def build(viewed: Viewed, building: Building, station: str | None, measured: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
-    shown = [viewed.box()]  # where was measured, and the ends that stand
-    shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
+    points = [viewed.box()]  # where was measured, and the ends that stand
+    points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
     if viewed.site.static_end is None:
-        shown.append(viewed.site.box + viewed.site.origin)
-    frame = Frame.around(np.concatenate(shown))
+        points.append(viewed.site.box + viewed.site.origin)
+    frame = Frame.around(np.concatenate(points))
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
-    ground = ground_of(viewed, given)
-    if given.plan is not None:
-        corners = np.column_stack([given.plan.corners(), np.full(4, ground - BENEATH * extent)])
+    ground = ground_of(viewed, building)
+    if building.plan is not None:
+        corners = np.column_stack([building.plan.corners(), np.full(4, ground - BENEATH * extent)])
         edges = corners[1] - corners[0], corners[3] - corners[0]
-        parts.append(Sheet("floor plan", corners[0], *edges, given.plan.image))
-    if given.walls is not None:
-        parts += walls_faces(given.walls)
+        parts.append(Sheet("floor plan", corners[0], *edges, building.plan.image))
+    if building.walls is not None:
+        parts += walls_faces(building.walls)
     if measured is not None:
         parts += _measured_parts(measured, legends, extent)
     for name in viewed.stations:
@@ -104,14 +104,14 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
     return Scene(title, frame, tuple(parts), beneath, legends, hidden, viewed.notes)
 
 
-def ground_of(viewed: Viewed, given: Given) -> float:
+def ground_of(viewed: Viewed, building: Building) -> float:
     """Height beneath which nothing is shown [m]: of measured places, planes and known walls."""
     low = [float(viewed.box()[0, 2])]
     if viewed.site.kind in MAPPED:
         low.append(viewed.heights()[0])
-    if given.walls is not None:
-        low += [float(face[:, 2].min()) for face in given.walls.faces]
-        low += [float(box[0, 2]) for box in given.walls.boxes]
+    if building.walls is not None:
+        low += [float(face[:, 2].min()) for face in building.walls.faces]
+        low += [float(box[0, 2]) for box in building.walls.boxes]
     return min(low)
 
 
@@ -164,8 +164,8 @@ def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> 
     method, site = predictor.method, predictor.site
     if isinstance(method, HasGaussians):
         try:
-            found = method.gaussians(*_queries(site, measured))
-            return replace(found, means=found.means + site.origin)
+            cloud = method.gaussians(*_queries(site, measured))
+            return replace(cloud, means=cloud.means + site.origin)
         except ValueError:
             pass  # of this kind are only some of those that it fits
     return None
@@ -260,8 +260,8 @@ def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     if paths is None or paths.towards is None or receiver is None:
         return None
     length = paths.delay_ns * 1e-9 * LIGHT
-    shown = np.minimum(length, REACH * extent)
-    ends = receiver + paths.towards * shown[:, None]
+    reach = np.minimum(length, REACH * extent)
+    ends = receiver + paths.towards * reach[:, None]
     colours = PATHS.of(paths.gain_db - paths.gain_db.max(initial=-np.inf))
     segments = np.stack([np.broadcast_to(receiver, ends.shape), ends], axis=1)
     return Lines(RAYS, segments, colours), Points(SOURCES, ends, colours, extent / 80)

@@ -76,8 +76,8 @@ def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
     """Every cell with the level of the asked one whose block it is in."""
     ny, nx = grid.shape
     coarse = level[::stride, ::stride]
-    found = np.repeat(np.repeat(coarse, stride, axis=0), stride, axis=1)[:ny, :nx]
-    return np.where(grid.inside, np.where(np.isfinite(level), level, found), np.nan)
+    repeated = np.repeat(np.repeat(coarse, stride, axis=0), stride, axis=1)[:ny, :nx]
+    return np.where(grid.inside, np.where(np.isfinite(level), level, repeated), np.nan)
 
 
 def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:

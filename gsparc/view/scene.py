@@ -33,9 +33,9 @@ class Frame:
         """World places (..., 3) [m] as float32 in drawn units; float64 until the middle is taken away."""
         return np.asarray((places - self.middle) * self.scale, np.float32)
 
-    def world(self, drawn: np.ndarray) -> np.ndarray:
-        """The inverse of `drawn`, float64."""
-        return np.asarray(drawn, np.float64) / self.scale + self.middle
+    def world(self, points: np.ndarray) -> np.ndarray:
+        """The inverse of `points`, float64."""
+        return np.asarray(points, np.float64) / self.scale + self.middle
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from gsparc.data.walls import SceneWalls
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.levels import MAPPED
 from gsparc.maps.pictures import Layer, Legend
-from gsparc.view.building import VALUES, Given, Sphere, build, start_place
+from gsparc.view.building import VALUES, Building, Sphere, build, start_place
 from gsparc.view.crossed import Obstacles
 from gsparc.view.plane import Plane, refining
 from gsparc.view.reasons import Surroundings, usual
@@ -51,7 +51,7 @@ class SiteView:
 
     Attributes:
         viewed: the model.
-        given: floor plan and walls.
+        building: floor plan and walls.
         grid: cells of planes; None where no power is predicted.
         layers: of a map that was made before, with its cells.
         at: world place where the moving end first stands; None: chosen.
@@ -59,7 +59,7 @@ class SiteView:
     """
 
     viewed: Viewed
-    given: Given = field(default_factory=Given)
+    building: Building = field(default_factory=Building)
     grid: Grid | None = None
     layers: tuple[tuple[Grid, Layer], ...] = ()
     at: np.ndarray | None = None
@@ -87,17 +87,17 @@ class SiteView:
     def _make(self, name: str | None) -> StationView:
         viewed = self.viewed
         measured = viewed.measured(name)
-        scene = build(viewed, self.given, name, measured)
+        scene = build(viewed, self.building, name, measured)
         known, values = None, np.zeros(0)
         if measured is not None:
             values = measured.values
             levels = values if viewed.site.kind in MAPPED else np.full(len(values), np.nan)
             known = usual(measured.places, levels, viewed.others(name))
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        faces = () if self.given.walls is None else self.given.walls.faces
+        faces = () if self.building.walls is None else self.building.walls.faces
         boxes = viewed.predictor_of(name).method.objects().boxes + viewed.site.origin
-        if self.given.walls is not None:
-            boxes = np.concatenate([boxes, self.given.walls.boxes])
+        if self.building.walls is not None:
+            boxes = np.concatenate([boxes, self.building.walls.boxes])
         walls = Obstacles.of(SceneWalls(faces, boxes)) if len(faces) or len(boxes) else None
         about = Surroundings(known, values, walls, self.unit)
         return StationView(scene, measured, about, power)
@@ -115,13 +115,13 @@ class SiteView:
         """World places (3,) where the ends that move first stand."""
         viewed, first = self.viewed, self.viewed.moving[-1]
         at = start_place(viewed, self.station(name).measured) if self.at is None else self.at
-        found: dict[str, np.ndarray] = {first: at}
+        places: dict[str, np.ndarray] = {first: at}
         if len(viewed.moving) > 1:
             other = (viewed.site.box + viewed.site.origin).mean(axis=0)
             if viewed.data is not None:
                 other = viewed.data.tx[len(viewed.data) // 2] + viewed.site.origin
-            found["tx"] = other if self.other is None else self.other
-        return found
+            places["tx"] = other if self.other is None else self.other
+        return places
 
     def plane(self, name: str | None, grid: Grid) -> Plane:
         """Power over all of some cells, the transmitter where it first stands if both ends move."""

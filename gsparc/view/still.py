@@ -60,9 +60,9 @@ def draw_still(view: SiteView, path: Path) -> None:
     for end in viewed.moving:
         _mark(axis, answer.ends[end], ENDS[end], "o", "top", color=RED)
     _look(axis, low, high)
-    shown = [legend for key, legend in one.scene.legends.items() if key in (VALUES, GAUSSIANS)]
-    shown += [PATHS] if rays else []
-    for legend in shown:
+    legends = [legend for key, legend in one.scene.legends.items() if key in (VALUES, GAUSSIANS)]
+    legends += [PATHS] if rays else []
+    for legend in legends:
         scale = ScalarMappable(Normalize(legend.low, legend.high), legend.colours)
         bar = figure.colorbar(scale, ax=axis, shrink=0.7, pad=0.01, location="bottom", aspect=40)
         bar.set_label(legend.label, fontsize="small")

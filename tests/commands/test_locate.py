@@ -14,7 +14,7 @@ from PIL import Image
 from gsparc.commands.locate import locate
 from gsparc.commands.train import train
 from gsparc.locate.likelihood import Trust
-from gsparc.locate.locator import kept
+from gsparc.locate.locator import trust_state
 from gsparc.locate.search import Unknown
 from gsparc.models import checkpoint
 
@@ -74,7 +74,7 @@ def test_a_file_without_places_is_located_too(trained, tmp_path):
 
 def test_trust_of_other_settings_is_not_taken_in_silence(trained, tmp_path):
     """`calibrate=0 share=0.5` used the level that was learned for 90 % of places."""
-    checkpoint.amend(trained, kept(Trust(level=0.95), Unknown(), 0.9))
+    checkpoint.amend(trained, trust_state(Trust(level=0.95), Unknown(), 0.9))
     with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
         located(tmp_path, f"ckpt={trained}", "calibrate=0", "share=0.5")
 

@@ -108,7 +108,7 @@ def example():
 def test_a_form_says_what_it_is_and_its_file_is_checked(tmp_path):
     predictor = of_powers(60)
     found = make.compiled(predictor)
-    assert (found.form.kind, found.error) == (4, 0) and found.said == "a process of powers, exactly"
+    assert (found.form.kind, found.error) == (4, 0) and found.summary == "a process of powers, exactly"
     blob = packed(found.form, predictor.site.origin, found.error)
     magic, version, checksum, size, _ = HEAD.unpack(blob[: HEAD.size])
     assert (magic, version, size) == (b"GSPARC\r\n", 1, len(blob))
@@ -165,7 +165,7 @@ def test_the_library_answers_as_the_model(name, library, example, tmp_path, monk
     real = None if MODELS[name] else request.getfixturevalue("real_rfid")
     predictor = MODELS[name]() if MODELS[name] else of_a_real_array(real, tmp_path)
     site, found = predictor.site, make.compiled(predictor)
-    assert (found.error > 0) == ("distilled" in name), found.said
+    assert (found.error > 0) == ("distilled" in name), found.summary
     path = tmp_path / "field.gsparc"
     path.write_bytes(packed(found.form, np.asarray(site.origin), found.error))
     field, places = example.Field(path, library), make.random_places(site, PLACES, 3)

@@ -11,7 +11,7 @@ from campaigns import powers, spectra
 
 import gsparc
 from gsparc.locate.likelihood import Trust
-from gsparc.locate.locator import kept
+from gsparc.locate.locator import trust_state
 from gsparc.locate.search import Unknown
 from gsparc.models import checkpoint
 
@@ -39,7 +39,7 @@ def test_areas_are_those_that_were_calibrated(trained, caplog):
     with caplog.at_level(logging.WARNING):
         before = predictor.locate(spectrum)[0]
     assert "never calibrated" in caplog.text
-    checkpoint.amend(trained, kept(Trust(spread=0.2), Unknown(), 0.9))
+    checkpoint.amend(trained, trust_state(Trust(spread=0.2), Unknown(), 0.9))
     after = gsparc.load(trained).locate(spectrum)[0]
     assert after.area > 2 * before.area
     with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):

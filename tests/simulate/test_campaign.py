@@ -18,7 +18,7 @@ from crashes import small_campaign
 
 from gsparc.commands.check import main as check
 from gsparc.data import blocks
-from gsparc.data.datasets.sionna import _heard
+from gsparc.data.datasets.sionna import _in_decibels
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
@@ -100,7 +100,7 @@ def test_file_equals_the_exact_room(tmp_path):
     assert json.loads(about["effects_json"])["depth"] == 3
     assert load_own(tmp_path / "box.h5").site.kind == "spectrum"
     assert check([str(tmp_path / "box.h5")]) == 0
-    assert outcome.convergence is None and outcome.made.facts["paths_per_receiver"] > 5
+    assert outcome.convergence is None and outcome.dataset.facts["paths_per_receiver"] > 5
     assert 0 < about["simulate_s"] <= sum(outcome.seconds.values())
     paths = stored["path_offsets"]
     assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(stored["path_direction"])
@@ -133,7 +133,7 @@ def test_file_is_read_as_powers(tmp_path):
     """Sums of path powers; where no path arrives, a power is below the weakest that was heard."""
     blocked = replace(SCENE, room={**SCENE.room, "boxes_m": [[[2.6, 0, 0], [3.0, 4.0, 3]]]})
     direct = replace(MIRROR, specular=False, depth=0)
-    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").made
+    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").dataset
     data = read(tmp_path / "box.h5", "rssi")
     heard = made.power > 0
     assert data.site.kind == "rssi" and 0 < heard.sum() < 60 and data.site.convergence_error is None
@@ -150,10 +150,10 @@ def test_outlier_does_not_set_the_sensitivity():
     weakest = np.sort(power)[1]
     power[power.argmin()] = 10**-21.0
     power[power.argsort()[-2:]] = 0
-    found = _heard(power)
+    found = _in_decibels(power)
     np.testing.assert_allclose(found["sensitivity_db"], 10 * np.log10(weakest))
     assert np.isnan(found["rssi_db"]).sum() == 3
-    assert "sensitivity_db" not in _heard(power[power > 0])  # nothing missing: every power is one
+    assert "sensitivity_db" not in _in_decibels(power[power > 0])  # nothing missing: every power is one
 
 
 def test_noise_has_the_stated_power(tmp_path):

@@ -13,7 +13,7 @@ from towns import town_model
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
 from gsparc.models import checkpoint
-from gsparc.view.building import SPLATS, Given, build
+from gsparc.view.building import SPLATS, Building, build
 from gsparc.view.viewed import open_viewed
 
 
@@ -65,7 +65,7 @@ def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, 
 def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
     viewed = open_viewed(town_model(), {"file": str(tmp_path / "gone.npz")})
     assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
-    scene = build(viewed, Given(), "west", viewed.measured("west"))
+    scene = build(viewed, Building(), "west", viewed.measured("west"))
     assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.pictures import GREY, Legend
-from gsparc.view.building import Given, build
+from gsparc.view.building import Building, build
 from gsparc.view.scene import EXTENT, Frame
 
 
@@ -35,10 +35,10 @@ def test_a_floor_plan_and_the_grid_lie_beneath_the_plane_and_the_walls(power_vie
     """The plan lay at the height of the plane: of each other half was hidden."""
     viewed, plan = power_view.viewed, FloorPlan(np.zeros((60, 80, 3), np.uint8), 1 + 0j, 60j)
     low = viewed.heights()[0]
-    scene = build(viewed, Given(plan), "west", None)
+    scene = build(viewed, Building(plan), "west", None)
     assert scene.ground < scene.part("floor plan").corner[2] < low <= power_view.grid.height
     wall = np.array([[0.0, 0, -9], [9, 0, -9], [9, 0, 3]])
-    deep = build(viewed, Given(plan, SceneWalls((wall,), np.zeros((0, 2, 3)))), "west", None)
+    deep = build(viewed, Building(plan, SceneWalls((wall,), np.zeros((0, 2, 3)))), "west", None)
     assert deep.part("floor plan").corner[2] < -9 < low
 
 

@@ -113,7 +113,7 @@ def test_a_drag_is_answered_with_what_the_model_says_there(visit, power_view):
     session = visit(power_view)
     drag(session, "rx", [20.0, 30.0, 1.5])
     settle(session)
-    said = float(re.match(r"\*\*(-?[\d.]+)", session.said.content)[1])
+    said = float(re.match(r"\*\*(-?[\d.]+)", session.answer_text.content)[1])
     asked = power_view.viewed.predictor_of("west")
     assert said == pytest.approx(10 * np.log10(asked.rssi(rx=[20.0, 30.0, 1.5])[0]), abs=0.06)
     assert session.vectors["rx"].value == pytest.approx((20.0, 30.0, 1.5), abs=1e-3)
@@ -128,7 +128,7 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
     drag(session, "tx", low + 0.2 * (high - low))
     settle(session)
     assert (session.nodes["sphere"].colors != before).any() and (session.picture.image != panel).any()
-    session._shown(CLOUD, "ellipsoids")
+    session._show_only(CLOUD, "ellipsoids")
     assert session.nodes["splats"].visible and not session.nodes["gaussians"].visible
 
 
@@ -195,7 +195,7 @@ def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
     drag(session, "tx", [9.0, 9.0, 9.0])
     settle(session)
     assert np.abs(session.plane.level_db - before).max() > 1
-    assert "distance alone" in session.said.content
+    assert "distance alone" in session.answer_text.content
 
 
 def test_a_station_that_is_being_made_keeps_nobody_waiting(visit, power_view, monkeypatch):
@@ -208,7 +208,7 @@ def test_a_station_that_is_being_made_keeps_nobody_waiting(visit, power_view, mo
     choosing.start()
     drag(session, "rx", [20.0, 30.0, 1.5])
     settle(session)
-    assert session.station == "west" and "receiver at 20.00, 30.00" in session.said.content
+    assert session.station == "west" and "receiver at 20.00, 30.00" in session.answer_text.content
     assert "being prepared" in session.title.content and not go.is_set()
     go.set()
     choosing.join()
@@ -219,14 +219,14 @@ def test_a_station_that_is_being_made_keeps_nobody_waiting(visit, power_view, mo
 def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(visit, power_view):
     session = visit(power_view)
     settle(session)
-    first = session.said.content
+    first = session.answer_text.content
     session._station_changed("east")
     settle(session)
-    assert session.said.content != first and "east" in session.title.content
+    assert session.answer_text.content != first and "east" in session.title.content
     session._go("next weak place")
     settle(session)
     level = session.plane.level_db
-    said = float(re.match(r"\*\*(-?[\d.]+)", session.said.content)[1])
+    said = float(re.match(r"\*\*(-?[\d.]+)", session.answer_text.content)[1])
     assert said == pytest.approx(np.nanmin(level), abs=0.1)
     here = session.places["rx"]
     session._go("next weak place")
@@ -264,12 +264,12 @@ def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
         one, two = Visitor(server), Visitor(server)
         assert wait(lambda: one.session.answers and two.session.answers)
         two.drag([20.0, 30.0, 1.5])
-        assert wait(lambda: "receiver at 20.00, 30.00" in two.session.said.content)
-        assert "receiver at 20.00, 30.00" not in one.session.said.content
+        assert wait(lambda: "receiver at 20.00, 30.00" in two.session.answer_text.content)
+        assert "receiver at 20.00, 30.00" not in one.session.answer_text.content
         two.socket.socket.shutdown(socket.SHUT_RDWR)  # without a word
         assert wait(lambda: set(server.sessions) == {one.number})
         one.drag([40.0, 10.0, 1.5])
-        assert wait(lambda: "receiver at 40.00, 10.00" in one.session.said.content)
+        assert wait(lambda: "receiver at 40.00, 10.00" in one.session.answer_text.content)
         assert wait(lambda: not len(server.work)) and server.address.startswith("http://127.0.0.1:")
     finally:
         server.stop()

@@ -34,8 +34,8 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
         levels: of powers.
         steps: `steps_of` them.
     """
-    found = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
-    return [*found, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
+    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
+    return [*warnings, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
@@ -81,13 +81,13 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
 def _mark_warnings(marks: list[tuple[float, bool]], values: np.ndarray) -> list[str]:
     warnings = []
     for mark, apart in marks:
-        count, shown = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
-        share = f"{count} of {len(values)} levels are exactly {shown}"
+        count, level = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
+        share = f"{count} of {len(values)} levels are exactly {level}"
         if apart:
             warnings.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
         else:
             warnings.append(
-                f"{share}, the least: not heard? leave them empty and give sensitivity_db={shown}"
+                f"{share}, the least: not heard? leave them empty and give sensitivity_db={level}"
             )
     return warnings
 
@@ -162,7 +162,7 @@ def wild_rows(levels: LinkLevels) -> list[str]:
 
 def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
     """(station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
-    found = []
+    outliers = []
     for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
             continue
@@ -174,8 +174,8 @@ def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
         # A single row: where the neighbour differs as much it is a place, not a fault.
         bad = np.flatnonzero(wild & ~np.roll(wild, 1) & ~np.roll(wild, -1))
         if 0 < len(bad) <= max(NAMED, len(used) // 100):
-            found.append((t, used[bad], float(difference[bad].max())))
-    return found
+            outliers.append((t, used[bad], float(difference[bad].max())))
+    return outliers
 
 
 def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:

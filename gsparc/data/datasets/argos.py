@@ -58,7 +58,7 @@ def load_argos(
     description = read_yaml(root / "base-station.yml", "the antennas' positions", expected)
     csi = _channels(root)
     places = _antennas(root, description, csi.shape[1])
-    chosen = _chosen(antenna, csi.shape[1])
+    chosen = _antenna_numbers(antenna, csi.shape[1])
     tones = np.array(description.get("tones", TONES), dtype=np.float64)
     spacing = float(description.get("spacing_hz", SPACING_HZ))
     carrier = float(description.get("carrier_hz", CARRIER_HZ))
@@ -167,7 +167,7 @@ def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndar
     return places
 
 
-def _chosen(antenna: int | str, count: int) -> np.ndarray:
+def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
     if antenna == "all":
         return np.arange(count)
     if not isinstance(antenna, int) or isinstance(antenna, bool) or not 0 <= antenna < count:
@@ -218,10 +218,10 @@ class Argos(Release):
     def __init__(
         self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
     ) -> None:
-        given = dict(encoder or {})
-        file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
+        settings = dict(encoder or {})
+        file, room = settings.pop("file", None), Path(settings.pop("folder", "outputs/encoders"))
         super().__init__(root, **rest)
-        self.encoder = (room, EncoderSettings(**given), file)
+        self.encoder = (room, EncoderSettings(**settings), file)
 
     def read(self, folder: Path) -> Measurements:
         """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""

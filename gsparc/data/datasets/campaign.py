@@ -248,20 +248,18 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
     return {of.field or name: raw.arrays[name] for name, of in layout.items() if name in raw.arrays}
 
 
-def _fits(found: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> bool:
-    if len(found) != len(shape):
+def _fits(dims: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> bool:
+    if len(dims) != len(shape):
         return False
     wanted = (sizes.get(axis, (None,))[0] if isinstance(axis, str) else axis for axis in shape)
-    return all(want is None or want == got for want, got in zip(wanted, found, strict=True))
+    return all(want is None or want == size for want, size in zip(wanted, dims, strict=True))
 
 
-def _misfit(
-    found: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]
-) -> str:
+def _misfit(dims: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> str:
     known = [f"{a} = {sizes[a][0]} as in {sizes[a][1]}" for a in shape if isinstance(a, str) and a in sizes]
     here = f" with {', '.join(known)}" if known else ""
-    turned = len(found) > 1 and found != found[::-1] and _fits(found[::-1], shape, sizes)
-    return f"expected shape {_text(shape)}{here}, found {found}{'; transposed?' if turned else ''}"
+    turned = len(dims) > 1 and dims != dims[::-1] and _fits(dims[::-1], shape, sizes)
+    return f"expected shape {_text(shape)}{here}, found {dims}{'; transposed?' if turned else ''}"
 
 
 def _text(shape: tuple[str | int, ...]) -> str:

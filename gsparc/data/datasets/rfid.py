@@ -73,8 +73,8 @@ def load_rfid(
     problems.raise_if_any()
     assert info is not None and positions is not None and spectra is not None and count is not None
     simulated = info.dataset == STAND_IN
-    given = {} if array is None else array
-    places = planar_array(**given) if isinstance(given, Mapping) else np.asarray(given, np.float64)
+    layout = {} if array is None else array
+    places = planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
     return assemble(
         name=STAND_IN if simulated else "rfid", stand_in="rfid" if simulated else None,
         kind="spectrum", static_end="rx", tx=positions, rx=np.repeat(info.position[None], count, axis=0),
@@ -106,15 +106,15 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
     name = next(iter(gateways)) if wanted is None else wanted
     if name not in gateways:
         return problems.add(path, f"no gateway named {name!r}; there are {', '.join(gateways)}")
-    given = [gateways[name].get(key) for key in ("position", "orientation")]
-    position, orientation = map(finite, given)
+    pose = [gateways[name].get(key) for key in ("position", "orientation")]
+    position, orientation = map(finite, pose)
     if position.shape != (3,):
-        problems.add(path, f"{name}: position is {given[0]}; expected three finite numbers [m]")
+        problems.add(path, f"{name}: position is {pose[0]}; expected three finite numbers [m]")
     else:
         check_positions(problems, str(path), position[None], [f"{name}: position"])
     if orientation.shape != (4,):
         expected = "expected a quaternion of four finite numbers (x, y, z, w)"
-        return problems.add(path, f"{name}: orientation is {given[1]}; {expected}")
+        return problems.add(path, f"{name}: orientation is {pose[1]}; {expected}")
     try:
         rotation = quaternion_to_matrix(orientation, scalar_first=False)
     except ValueError as error:
@@ -132,8 +132,8 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     while rows and not any(cell.strip() for cell in rows[-1]):
         rows.pop()
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
-        found = ",".join(rows[0]) if rows else "an empty file"
-        return problems.add(f"{path}, line 1", f"expected the header x,y,z, found {found}")
+        header = ",".join(rows[0]) if rows else "an empty file"
+        return problems.add(f"{path}, line 1", f"expected the header x,y,z, found {header}")
     if len(rows) == 1:
         return problems.add(path, "no rows; expected one position per spectrum")
     positions = np.full((len(rows) - 1, 3), np.nan)

@@ -88,7 +88,7 @@ def read_as(raw: Raw, target: str) -> Raw:
     names = {f"{target}_array_position": "array_position", f"{target}_noise_variance": "noise_variance"}
     attributes = {**raw.attributes, "measurement": target}
     if target == "rssi":
-        arrays |= _heard(np.asarray(arrays.pop("received_power"), dtype=np.float64))
+        arrays |= _in_decibels(np.asarray(arrays.pop("received_power"), dtype=np.float64))
         attributes["measurement"] = "rssi_db"
         attributes.pop("convergence_error", None)  # it is of channels
     if target == "spectrum" and "convergence_spectrum_nmse" in attributes:
@@ -98,7 +98,7 @@ def read_as(raw: Raw, target: str) -> Raw:
     return renamed(Raw(arrays, attributes, raw.units), names)
 
 
-def _heard(power: np.ndarray) -> dict[str, np.ndarray]:
+def _in_decibels(power: np.ndarray) -> dict[str, np.ndarray]:
     """Powers (S,) in decibels; where no path arrives, they lie below the weakest that is no outlier.
 
     One path through five walls may be 70 dB below the next power: no receiver hears it, and a place without

@@ -72,14 +72,14 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     """A file with a table of stations, wide or long, as one row per link."""
     before = len(check.problems)
     stations = station_table(check, measured in POWERS)
-    given = check.given("rx_position", "tx_position")
-    if len(given) != 1:
-        found = " and ".join(given) or "neither"
+    ends = check.given("rx_position", "tx_position")
+    if len(ends) != 1:
+        names = " and ".join(ends) or "neither"
         wanted = "expected rx_position or tx_position, of the end that moves"
-        return check.refuse("station_position", f"{wanted}; found {found}")
+        return check.refuse("station_position", f"{wanted}; found {names}")
     if stations is None:
         return None
-    moving: End = "rx" if given == ["rx_position"] else "tx"
+    moving: End = "rx" if ends == ["rx_position"] else "tx"
     values = check.raw.arrays[measured]
     long = "station" in check.raw.arrays
     count = len(stations)
@@ -239,11 +239,11 @@ def _heights(check: Checker) -> bool:
 
 def _run(check: Checker, rows: int) -> np.ndarray | None:
     """(S,) int64, the number of each row's run; runs may have names."""
-    given = check.array("run", (rows,))
-    if given is None:
+    runs = check.array("run", (rows,))
+    if runs is None:
         return None
     check.raw.arrays.pop("run")
-    return np.unique(given, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return np.unique(runs, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def in_metres(check: Checker) -> Georeference | None:
@@ -284,13 +284,13 @@ def in_metres(check: Checker) -> Georeference | None:
 
 def _stated(check: Checker) -> Georeference | None:
     """The origin of positions in metres, where attributes of the file say where on Earth it lies."""
-    given = [check.raw.attributes.get(f"origin_{name}") for name in ("latitude", "longitude")]
-    if given == [None, None]:
+    degrees = [check.raw.attributes.get(f"origin_{name}") for name in ("latitude", "longitude")]
+    if degrees == [None, None]:
         return None
     try:
-        return Georeference(*(float(value) for value in given))  # type: ignore[arg-type]
+        return Georeference(*(float(value) for value in degrees))  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
-        return check.refuse("origin_latitude", f"with origin_longitude {given}: expected degrees ({error})")
+        return check.refuse("origin_latitude", f"with origin_longitude {degrees}: expected degrees ({error})")
 
 
 def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:

@@ -63,11 +63,11 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
     Places may be missing, NaN throughout, where powers alone are told by the stations.
     """
     arrays = check.raw.arrays
-    given = arrays["station_position"]
-    lost = np.zeros(len(given) if given.ndim else 0, bool)
-    if may_miss and given.ndim == 2 and given.dtype.kind == "f":
-        lost = np.isnan(given[:, :2]).all(axis=1)
-        arrays["station_position"] = np.where(lost[:, None], 0, given)
+    positions = arrays["station_position"]
+    lost = np.zeros(len(positions) if positions.ndim else 0, bool)
+    if may_miss and positions.ndim == 2 and positions.dtype.kind == "f":
+        lost = np.isnan(positions[:, :2]).all(axis=1)
+        arrays["station_position"] = np.where(lost[:, None], 0, positions)
     places = check.position("station_position", None)
     if places is None or places.ndim != 2:
         return None if places is None else check.refuse("station_position", "expected shape (T, 3)")

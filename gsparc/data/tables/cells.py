@@ -40,25 +40,25 @@ def merged(first: Sheet, chosen: Chosen, cell_m: float) -> Sheet:
         from pyarrow import acero, compute
 
         wanted = {c.head: c for columns in chosen.values() for c in columns if c.head is not None}
-        keys, made, sums = [], {}, []
+        keys, values, sums = [], {}, []
         for number, (head, column) in enumerate(wanted.items()):
             value, key = compute.field(head), f"key {number}"
             if column.role == "rssi_db" or column.role in {end + axis for end in ENDS for axis in AXES}:
                 value = value.cast("float64")
-                made[head] = value
+                values[head] = value
                 sums += [(head, f"hash_{how}", None, f"{how} {number}") for how in ("mean", "min", "max")]
                 absent = compute.is_null(value, nan_is_null=True)
                 cell = compute.floor(value * (_metres(column, chosen, first) / cell_m))
                 value = absent if column.role == "rssi_db" else cell + 0.0  # of -0.0 and 0.0 one
-            made[key] = value
+            values[key] = value
             keys.append(key)
         scan = acero.ScanNodeOptions(files, columns=list(wanted), require_sequenced_output=True, **CHUNK)
-        project = acero.ProjectNodeOptions(list(made.values()), list(made))
+        project = acero.ProjectNodeOptions(list(values.values()), list(values))
         steps = {"scan": scan, "project": project, "aggregate": acero.AggregateNodeOptions(sums, keys)}
         plan = acero.Declaration.from_sequence([acero.Declaration(*step) for step in steps.items()])
         frame = plan.to_table(use_threads=False).to_pandas()  # one thread adds in one order
     for number, head in enumerate(wanted):
-        if head in made:  # a mean of equal numbers is that number, but for rounding
+        if head in values:  # a mean of equal numbers is that number, but for rounding
             least, most = frame[f"min {number}"], frame[f"max {number}"]
             frame[f"key {number}"] = frame[f"mean {number}"].clip(least, most)
     columns, rows = tuple(frame[key] for key in keys), tuple(f"cell {i}" for i in range(len(frame)))

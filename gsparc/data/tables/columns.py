@@ -215,12 +215,12 @@ def _settled(role: str, chosen: Chosen) -> bool:
 def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
     """Refuse several measurements (levels, powers, channels), and an end that has both metres and degrees."""
     for ways in ONE_OF:
-        found = [[column for role in way for column in guesses.get(role, ())] for way in ways]
-        found = [columns for columns in found if columns]
-        if len(found) < 2:
+        by_way = [[column for role in way for column in guesses.get(role, ())] for way in ways]
+        by_way = [columns for columns in by_way if columns]
+        if len(by_way) < 2:
             continue
-        first = [columns[0] for columns in found]
-        fault = f"{' and '.join(map(_names, found))} both say where"
+        first = [columns[0] for columns in by_way]
+        fault = f"{' and '.join(map(_names, by_way))} both say where"
         if ways is MEASURED:
             fault = f"{_names(first)} are different measurements"
         sheet.refuse(f"{fault}; say {' or '.join(map(_choice, first))}")

@@ -123,11 +123,11 @@ def understand(text: str) -> Head:
         # A last word may be a unit or a name (`tx_m`): it is a unit where it suits the rest.
         last = UNITS[words[-1]]
         cut = re.sub(rf"[\W_]*{re.escape(words[-1])}\W*$", "", plain, flags=re.IGNORECASE)
-        found = _role(words[:-1], last, cut)
-        if found.role and suits(found.role, last):
-            return found
-    found = _role(words, unit, plain)
-    return replace(found, unit=unit, strange=strange)
+        head = _role(words[:-1], last, cut)
+        if head.role and suits(head.role, last):
+            return head
+    head = _role(words, unit, plain)
+    return replace(head, unit=unit, strange=strange)
 
 
 def suits(role: str, unit: Unit) -> bool:

@@ -43,22 +43,22 @@ def places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Pla
     """
     for degrees, axes in ((False, ("x", "y")), (True, ("latitude", "longitude"))):
         roles = [f"{end}{axis}" for axis in axes]
-        given = [role for role in roles if role in chosen]
-        if not given:
+        present = [role for role in roles if role in chosen]
+        if not present:
             continue
-        if len(given) == 1:
+        if len(present) == 1:
             missing = next(role for role in roles if role not in chosen)
-            fault = f"{given[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
+            fault = f"{present[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
             return sheet.refuse(fault)
         absent = np.zeros(len(sheet), bool)
         if unknown:
-            given = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
-            absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in given], axis=0)
-        found = [_complete(sheet, chosen, role, absent) for role in roles]
+            present = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
+            absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in present], axis=0)
+        columns = [_complete(sheet, chosen, role, absent) for role in roles]
         height = _complete(sheet, chosen, f"{end}z", absent) if f"{end}z" in chosen else None
-        if found[0] is None or found[1] is None:
+        if columns[0] is None or columns[1] is None:
             return None
-        across = np.stack([found[0], found[1]], axis=1)
+        across = np.stack([columns[0], columns[1]], axis=1)
         if degrees:
             _on_earth(sheet, chosen, roles, across)
         return Places(across, height, degrees)
@@ -86,22 +86,22 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
 
 
 def one_each(
-    sheet: Sheet, found: Places, station: np.ndarray, names: Sequence[str], ask: bool = False
+    sheet: Sheet, row_places: Places, station: np.ndarray, names: Sequence[str], ask: bool = False
 ) -> Places | None:
     """The place of each station, which must be the same in all its rows; None, and noted, when it is not.
 
     Args:
         sheet: for the names of rows.
-        found: (S,) places, one for each row.
+        row_places: (S,) places, one for each row.
         station: (S,) which station each row is of.
         names: of the stations.
         ask: say whether it is so, and note nothing.
     """
-    values = found.all()
+    values = row_places.all()
     first = np.array([int(np.argmax(station == t)) for t in range(len(names))])
     moved = np.flatnonzero((values != values[first[station]]).any(axis=1))
     if len(moved) == 0:
-        return found.take(first)
+        return row_places.take(first)
     if not ask:
         row = moved[0]
         here, there = first[station[row]], row
@@ -139,8 +139,8 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     notes = [f"{sheet.source}: {note}" for note in notes if not note.startswith("not used")]
     if "station" not in chosen:
         return sheet.refuse("no column of names; expected one called name or station"), notes
-    found = places(sheet, chosen, "station_", unknown=True)
-    if found is None:
+    coordinates = places(sheet, chosen, "station_", unknown=True)
+    if coordinates is None:
         if not sheet.problems:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
         return None, notes
@@ -156,4 +156,4 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         array = chosen[role][0].numbers(sheet) if role in chosen else None
         if array is not None:
             extra[role] = array
-    return StationList(tuple(map(str, names)), found, extra), notes
+    return StationList(tuple(map(str, names)), coordinates, extra), notes

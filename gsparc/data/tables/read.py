@@ -158,8 +158,8 @@ class Builder:
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
-        given = {end: places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
-        ends = {end: where for end, where in given.items() if where is not None}
+        by_end = {end: places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
+        ends = {end: where for end, where in by_end.items() if where is not None}
         if self.sheet.problems:
             return
         if not ends:
@@ -172,7 +172,7 @@ class Builder:
         stations = self._stations(measured, ends)
         if self.sheet.problems:
             return
-        stay = next((end for end, where in given.items() if where is not None and end not in ends), "")
+        stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
         if stations is not None:
             self._add_stations(stations, where.degrees)
@@ -181,7 +181,7 @@ class Builder:
             self._add_other("tx" if moving == "rx" else "rx", other, where)
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
-        """Which end the rows are places of, where `stay` are stations; it is taken out of `found`."""
+        """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
         named: list[str] = [end for end in ("rx_", "tx_") if end in ends]
         if "" in ends:
             named = named or [stay] * bool(stay)
@@ -199,8 +199,8 @@ class Builder:
             named = ["tx_"]
         return named[0][:2], ends.pop(named[0])
 
-    def _stations(self, measured: str | None, found: dict[str, Places]) -> StationList | None:
-        """The stations, where there are; an end that is their place is taken out of `found`."""
+    def _stations(self, measured: str | None, end_places: dict[str, Places]) -> StationList | None:
+        """The stations, where there are; an end that is their place is taken out of `end_places`."""
         where = places(self.sheet, self.chosen, "station_")
         labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
         for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
@@ -216,7 +216,7 @@ class Builder:
                     "no column says which station a row is of; say dataset.columns.station=COLUMN"
                 )
             if where is None:
-                where = self._second_in_degrees(found)
+                where = self._second_in_degrees(end_places)
             return None if where is None else self._unnamed(where)
         words = self.sheet.words(column.head or "")
         self.sheet.refuse_rows(column.head, np.flatnonzero(words == ""), "no station; expected its name")
@@ -230,18 +230,18 @@ class Builder:
             return None if each is None else StationList(names, each, index=index)
         if self.sheet.problems:
             return None
-        ends = [end for end in ("tx_", "rx_") if end in found] if len(found) > 1 else []
+        ends = [end for end in ("tx_", "rx_") if end in end_places] if len(end_places) > 1 else []
         for end in ends:
-            each = one_each(self.sheet, found[end], index, names, ask=True)
+            each = one_each(self.sheet, end_places[end], index, names, ask=True)
             if each is not None:
-                found.pop(end)
+                end_places.pop(end)
                 return StationList(names, each, index=index)
         if ends:
-            one_each(self.sheet, found[ends[0]], index, names)
+            one_each(self.sheet, end_places[ends[0]], index, names)
             return None
         if measured in LEVELS:
             nowhere = np.full((len(names), 3), np.nan)
-            degrees = next(iter(found.values())).degrees
+            degrees = next(iter(end_places.values())).degrees
             self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
             return StationList(names, Places(nowhere[:, :2], nowhere[:, 2], degrees), index=index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "

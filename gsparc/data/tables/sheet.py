@@ -96,8 +96,8 @@ class Sheet:
                 bad[bad] = self.words(head)[bad] != ""
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
-            shown = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
-            rows = (f"{self.rows[i]}: {cell}" for i, cell in zip(np.flatnonzero(bad), shown, strict=True))
+            texts = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
+            rows = (f"{self.rows[i]}: {cell}" for i, cell in zip(np.flatnonzero(bad), texts, strict=True))
             mark = "commas" if self.decimal == "," else "points, and no marks between thousands"
             hint = f"; this table has decimal {mark}" if any("," in c or "." in c for c in cells) else ""
             what = f"is no finite number{hint}; or leave it empty"
@@ -330,7 +330,7 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
         fault = f"{count} heads, but every line below has {counts[0]} cells{hint}"
         raise DataError(f"{source}, line {min(lines)}: {fault}")
     problems, below = Problems(source), list(lines)[1:]
-    names = (f"line {n} ({found} cells)" for n, found in zip(below, counts, strict=True) if found != count)
+    names = (f"line {n} ({width} cells)" for n, width in zip(below, counts, strict=True) if width != count)
     mark = DELIMITERS.get(delimiter, delimiter)
     problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")
     problems.raise_if_any()

@@ -95,12 +95,12 @@ class Prepared:
         folds = self.problem.folds
         return 0.0 if folds is None else len(folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
 
-    def found(self) -> Filled | None:
+    def result(self) -> Filled | None:
         """The kept result, if there is a whole one."""
         facts = facts_of(self.folder / RESULT)
         return None if facts is None else Filled(self.cell, self.folder, facts)
 
-    def found_earlier(self) -> Filled | None:
+    def old_result(self) -> Filled | None:
         """The latest result of other program text or settings for this cell, the same data and split.
 
         Published results outlive the code they were measured with; a table must say so, not lose them.
@@ -120,7 +120,7 @@ class Prepared:
 
 
 def prepare(
-    cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, kept: Path
+    cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, cells_dir: Path
 ) -> Prepared:
     """Compose a cell's configuration and name the folder of its result."""
     chosen = problem.chosen or (f"dataset={settings.get('dataset', cell.dataset)}",)
@@ -135,7 +135,7 @@ def prepare(
     if problem.draw is None and cell.seed and "seed" not in whole["model"]:
         trainer["seed"] = cell.seed  # of a draw, the split's own hash tells
     name = key(whole["model"], trainer, *problem.hashes)
-    folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
+    folder = cells_dir / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, problem, config, folder, not contender.timed_only)
 
 
@@ -187,7 +187,7 @@ def fill(prepared: Prepared) -> Filled:
 def _tried(one: Prepared) -> Filled | str:
     """The cell, or why it cannot be filled; the other methods' table comes nevertheless."""
     try:
-        return one.found() or fill(one)
+        return one.result() or fill(one)
     except Exception as error:  # any error of a plugin
         if no_room(error):  # the others would be trained in vain
             raise
@@ -206,7 +206,7 @@ def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | 
         train: whether missing cells are filled.
         limit_s: no cell is started that would end later [s].
     """
-    missing = [one for one in prepared if one.found() is None]
+    missing = [one for one in prepared if one.result() is None]
     log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(missing))
     started, broken = time.monotonic(), set[str]()
 
@@ -230,5 +230,5 @@ def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | 
     except KeyboardInterrupt:
         message = "interrupted; finished cells are kept: the same command goes on with the others"
         raise KeyboardInterrupt(message) from None
-    results = [one.found() or (None if str(one.cell) in broken else one.found_earlier()) for one in prepared]
+    results = [one.result() or (None if str(one.cell) in broken else one.old_result()) for one in prepared]
     return [one for one in results if one is not None]

@@ -80,13 +80,13 @@ def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:
 
 
 def timed_here(
-    filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem], kept: Path, measure: bool
+    filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem], cells_dir: Path, measure: bool
 ) -> dict[str, dict[str, Latency]]:
     """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
     by_dataset: dict[str, dict[str, Latency]] = {}
     for dataset in dict.fromkeys(one.cell.dataset for one in filled):
         here = [one for one in filled if one.cell.dataset == dataset]
-        split, file = here[0].cell.split, kept / f"latency-{dataset}.json"
+        split, file = here[0].cell.split, cells_dir / f"latency-{dataset}.json"
         first = [one for one in here if one.cell.split == split]
         present = [one for one in first if one.checkpoint.exists()]
         absent = {o.cell.method for o in first} - {o.cell.method for o in present}

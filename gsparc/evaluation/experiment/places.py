@@ -66,14 +66,14 @@ def compare_places(
         rows += _rows(names, facts)
     if not rows:
         raise ValueError("task=locate: no cell keeps a model that states a variance")
-    found = pd.DataFrame(rows, columns=[*NAMES, *FIGURES]).drop_duplicates(NAMES)
-    return found.sort_values(["dataset", "split", "median_m"], ignore_index=True)
+    errors = pd.DataFrame(rows, columns=[*NAMES, *FIGURES]).drop_duplicates(NAMES)
+    return errors.sort_values(["dataset", "split", "median_m"], ignore_index=True)
 
 
-def facts_and_table(found: pd.DataFrame) -> tuple[dict[str, Any], Table]:
+def facts_and_table(errors: pd.DataFrame) -> tuple[dict[str, Any], Table]:
     """`<dataset>/<split>/<method>/<figure>` of what `compare_places` found, and a table for a terminal."""
     facts, lines = dict[str, Any](), []
-    for row in found.astype(object).where(found.notna(), None).to_dict("records"):
+    for row in errors.astype(object).where(errors.notna(), None).to_dict("records"):
         names = [row[name] for name in NAMES]
         facts |= {f"{'/'.join(names)}/{name}": row[name] for name in FIGURES}
         lines.append([*names, *("" if row[name] is None else f"{row[name]:.3g}" for name in FIGURES)])

@@ -142,11 +142,11 @@ def facts_of(result: Path) -> dict[str, Any] | None:
     return facts
 
 
-def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> list[Problem]:
+def stored_problems(cells_dir: Path, dataset: str, splits: Sequence[SplitChoice]) -> list[Problem]:
     """The problems of a dataset that most kept results are of, one per draw of a split."""
     problems = []
     for split in splits:
-        files = sorted(kept.glob(f"{dataset}-{split.name}-*/{RESULT}"))
+        files = sorted(cells_dir.glob(f"{dataset}-{split.name}-*/{RESULT}"))
         facts = [one for file in files if (one := facts_of(file)) is not None]
         for draw in split.numbers:
             known = Counter(
@@ -191,7 +191,7 @@ def _composed(overrides: tuple[str, ...]) -> DictConfig:
     return hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
 
 
-def problems_of(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
+def problems_of(settings: Mapping[str, Any], cells_dir: Path) -> list[Problem]:
     """Every dataset under every split that is meant for it, first draws first: the best-known come first.
 
     Without its path a dataset is there as far as results were kept, for the table alone.
@@ -215,7 +215,7 @@ def problems_of(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
         if here[name]:
             problems += load_problems(name, own, meant) if meant else []
             continue
-        stored = stored_problems(kept, name, meant)
+        stored = stored_problems(cells_dir, name, meant)
         problems += stored
         absent["here as far as results were kept" if stored else "left out"].append(name)
     for how, names in absent.items():

@@ -98,10 +98,10 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
         def context(number: int) -> FitContext:
             own = {"run_dir": folders[number], "resume": resumes[number]}
-            found = context_of(config, loggers=loggers, datamodule=module, **own)
-            if number or found.budget_s is None:
-                return found
-            return replace(found, budget_s=max(found.budget_s - read_s, LEAST_SHARE * found.budget_s))
+            base = context_of(config, loggers=loggers, datamodule=module, **own)
+            if number or base.budget_s is None:
+                return base
+            return replace(base, budget_s=max(base.budget_s - read_s, LEAST_SHARE * base.budget_s))
 
         try:
             make = partial(build, config.model)
@@ -112,12 +112,12 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             cause = str(stopped).partition("; ")[0] or "interrupted"
             raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={run_dir}") from None
         methods = fitted.methods
-        found = evaluate(
+        evaluation = evaluate(
             methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=config.baselines, cache=platform_cache(),
         )  # fmt: skip
         facts: dict[str, Any] = {
-            **found.facts, **provenance(),
+            **evaluation.facts, **provenance(),
             "seed": int(config.seed), "model/limited_by_clock": fitted.limited_by,
         }  # fmt: skip
         if fitted.cost.stages:
@@ -140,9 +140,9 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         if len(objects):
             draw_found(data, objects, run_dir / "found.png", known)
             tracking.picture(loggers, "found", run_dir / "found.png", 0)
-    write_samples(run_dir / "per_sample.csv", found.columns)
+    write_samples(run_dir / "per_sample.csv", evaluation.columns)
     write_summary(run_dir / "summary.json", facts)
-    return facts, Objects(methods, files, data, split, found)
+    return facts, Objects(methods, files, data, split, evaluation)
 
 
 def _data(config: DictConfig) -> DataModule:

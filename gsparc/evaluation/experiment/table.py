@@ -90,10 +90,10 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
     ]  # fmt: skip
     rows = groups[means].mean()
     rows[["figure", "second"]] = groups[["figure", "second"]].first()
-    rows["seeds"], drawn = groups.size(), groups["draws"].any()
-    rows["draws"] = drawn
-    rows["spread_db"] = groups["score_db"].std().where(~drawn, groups["score_db"].sem())
-    rows["value_error"] = groups["value"].sem().where(drawn)
+    rows["seeds"], several = groups.size(), groups["draws"].any()
+    rows["draws"] = several
+    rows["spread_db"] = groups["score_db"].std().where(~several, groups["score_db"].sem())
+    rows["value_error"] = groups["value"].sem().where(several)
     rows["behind_error_db"] = groups["behind_db"].sem()
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
@@ -139,8 +139,8 @@ def title_of(block: pd.DataFrame) -> str:
     budget = block.budget_s.max()
     timed = "" if np.isnan(budget) else f", {budget:g} s of training per model"
     draws = int(block.seeds.max()) if block.draws.any() else 0
-    drawn = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
-    return f"{block.dataset.iloc[0]}, split {block.split.iloc[0]}{timed}{drawn}"
+    count = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
+    return f"{block.dataset.iloc[0]}, split {block.split.iloc[0]}{timed}{count}"
 
 
 def remarks(block: pd.DataFrame, ours: str) -> list[str]:
@@ -206,7 +206,7 @@ def _page(block: pd.DataFrame, ours: str) -> str:
 
 def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
     """Head of each column, and how a row fills it; columns that no row fills are left out."""
-    figure, drawn = block.figure.iloc[0], block.draws.any()
+    figure, draws = block.figure.iloc[0], block.draws.any()
 
     def column(name: str, form: str, error: str | None = None) -> Callable[[Any], str]:
         def write(row: Any) -> str:
@@ -219,10 +219,10 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
         "method": lambda row: row.method + row.label,
         SCORE[figure]: column("score_db", ".2f", "spread_db"),
     }
-    if drawn:
+    if draws:
         columns["behind the best, dB"] = column("behind_db", ".2f", "behind_error_db")
-    if figure == "nmse" or (figure == "rmse_db" and not drawn):  # else it is the score but for its sign
-        columns[figure] = column("value", ".3g" if drawn else ".4g", "value_error")
+    if figure == "nmse" or (figure == "rmse_db" and not draws):  # else it is the score but for its sign
+        columns[figure] = column("value", ".3g" if draws else ".4g", "value_error")
     columns[block.second.iloc[0]] = column("second_value", ".4g")
     for name, head, form in (
         ("after_constant", "after a constant, dB", ".2f"), ("coverage", "in 90 % interval", ".2f"),
@@ -230,7 +230,7 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
     ):  # fmt: skip
         if block[name].notna().any():
             columns[head] = column(name, form)
-    if not drawn:
+    if not draws:
         columns["seeds"] = column("seeds", "d")
     costs = (
         ("train_s", "train s", ".3g"), ("train_cpu_s", "cpu s", ".3g"), ("query_ms", "query ms p50", ".3g"),

@@ -202,7 +202,7 @@ def others_of(
 
 
 def columns_of(
-    points: list[Point], shown: list[int], chosen: list[int], copy_ms: float
+    points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float
 ) -> dict[str, list[Any]]:
     """Columns of `tradeoff.csv`, fastest point first."""
     order = sorted(range(len(points)), key=lambda i: points[i].p50)
@@ -217,7 +217,7 @@ def columns_of(
         "difference_to_full": [p.difference[0] for p in rows],
         "difference_se": [p.difference[1] for p in rows],
         "closeness_db": [p.closeness_db for p in rows],
-        "front": [int(i in shown) for i in order],
+        "front": [int(i in pareto) for i in order],
         "kept_with_model": [int(i in chosen) for i in order],
         "threads": [p.threads for p in rows],
         "num_gaussians": [p.size for p in rows],

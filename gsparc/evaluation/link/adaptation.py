@@ -139,8 +139,8 @@ class Adaptation:
         """Transport-block error rates (n, 28); infinite where there is no such MCS."""
         allocated = torch.full((len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32)
         effective = (10 ** (effective_db / 10))[..., None]
-        found = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
-        return found[3][..., 0].cpu().double()
+        rates = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
+        return rates[3][..., 0].cpu().double()
 
     def _highest(self, fails: Tensor) -> Tensor:
         """The highest MCS (n,) that meets the target; the lowest there is where none does."""
@@ -165,8 +165,8 @@ class Adaptation:
         best = carried.max(1)
         return torch.where(best.values > 0, best.indices, lowest), most - best.values
 
-    def _of_every_mcs(self, count: int, **given: Tensor) -> tuple[Tensor, ...]:
+    def _of_every_mcs(self, count: int, **arguments: Tensor) -> tuple[Tensor, ...]:
         """Sionna's PHY abstraction of every MCS of the table at `count` positions."""
         every = torch.arange(28, dtype=torch.int32)[None, :, None].expand(count, -1, -1)
         table = {"mcs_table_index": 1, "mcs_category": 0, "check_mcs_index_validity": False}
-        return self.abstraction(every, **given, **table)
+        return self.abstraction(every, **arguments, **table)

@@ -37,20 +37,20 @@ RATES = {
 LEAST_RATE = 3e-4
 
 
-def draw_errors(drawn: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
+def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
     """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
-    figure, axes = panels(5.6 * len(drawn), 8, 2, len(drawn), grid=False)
-    for column, (modulation, curves) in enumerate(drawn.items()):
+    figure, axes = panels(5.6 * len(rates), 8, 2, len(rates), grid=False)
+    for column, (modulation, curves) in enumerate(rates.items()):
         for name, (label, colour, line) in STYLES.items():
             if name not in curves:
                 continue
             curve, style = curves[name], {"color": colour, "linestyle": line, "marker": "."}
-            shown = curve.bler.clip(LEAST_RATE).to_numpy()
+            bler = curve.bler.clip(LEAST_RATE).to_numpy()
             counts = zip(curve.errors, curve.blocks, strict=True)
             ends = np.array([binomial_interval(int(e), int(n)) for e, n in counts]).clip(LEAST_RATE)
-            reach = np.maximum([[-1], [1]] * (ends.T - shown), 0)
+            reach = np.maximum([[-1], [1]] * (ends.T - bler), 0)
             style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
-            axes[0, column].errorbar(curve.index, shown, reach, **style_above)
+            axes[0, column].errorbar(curve.index, bler, reach, **style_above)
             axes[1, column].plot(curve.index, curve.ber.clip(1e-6), **style)
         axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
@@ -61,15 +61,15 @@ def draw_errors(drawn: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
     save(figure, path)
 
 
-def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
+def draw_rates(rates: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
     """Throughput over noise, and the confidence of right and wrong choices."""
     figure, ((left, right),) = panels(11, 4, 1, 2)
     for name, (style, label) in RATES.items():
-        mean = [getattr(one, name).mean() / 1e6 for one in found]
-        left.plot([one.snr_db for one in found], mean, style, label=label)
+        mean = [getattr(one, name).mean() / 1e6 for one in rates]
+        left.plot([one.snr_db for one in rates], mean, style, label=label)
     left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput [Mbit/s]", title=title)
     left.legend()
-    middle = found[len(found) // 2]
+    middle = rates[len(rates) // 2]
     miss = np.minimum(np.abs(middle.chosen - middle.oracle), 3)
     groups = {name: score[miss == value] for value, name in enumerate(("0", "1", "2", "more"))}
     present = {f"{name}\n(n={len(group)})": group for name, group in groups.items() if len(group)}
@@ -79,11 +79,11 @@ def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) ->
 
 
 def draw_acceptance(
-    found: Mapping[str, tuple[float, pd.DataFrame]], threshold_share: float, path: Path
+    acceptance: Mapping[str, tuple[float, pd.DataFrame]], threshold_share: float, path: Path
 ) -> None:
     """Block error rate of the surest share of positions, as of `acceptance`, a panel a modulation."""
-    figure, grid = panels(5.5 * len(found), 4, 1, len(found))
-    for axis, (modulation, (ebno_db, rates)) in zip(grid[0], found.items(), strict=True):
+    figure, grid = panels(5.5 * len(acceptance), 4, 1, len(acceptance))
+    for axis, (modulation, (ebno_db, rates)) in zip(grid[0], acceptance.items(), strict=True):
         for name in filter(SHORT.__contains__, rates):
             style, label = SHORT[name]
             axis.plot(rates.index, rates[name], style, label=label)

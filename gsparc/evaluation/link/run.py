@@ -107,8 +107,8 @@ class LinkStudy:
             channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        found = adapt(own, other, self.mcs["snr_db"], self.mcs, tick)
-        return found, rate_facts(found, self.accepted, self.score)
+        rates = adapt(own, other, self.mcs["snr_db"], self.mcs, tick)
+        return rates, rate_facts(rates, self.accepted, self.score)
 
     def send(
         self, modulation: str, levels: list[float], tick: Callable[[str], None]
@@ -126,8 +126,8 @@ class LinkStudy:
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
         blocks = transmit(pusch, self.grid.band(), levels, sizes, tick)
-        drawn, surest = curves(blocks, self.accepted), acceptance(blocks, self.score, SHARES)
-        facts = pusch_facts(modulation, drawn)
+        rates, surest = curves(blocks, self.accepted), acceptance(blocks, self.score, SHARES)
+        facts = pusch_facts(modulation, rates)
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()
             facts |= {f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares}
@@ -138,4 +138,4 @@ class LinkStudy:
             "pilots/saved": pusch.pilot_share * float(self.accepted.mean()),
             f"time/pusch_{modulation}_s": time.perf_counter() - begun,
         }  # fmt: skip
-        return drawn, surest, facts
+        return rates, surest, facts

@@ -102,23 +102,23 @@ def adapt(
         for c in settings["care"]
     }
     care = max(delivered, key=lambda c: delivered[c])
-    found: dict[Rule, list[Rates]] = {"expected": [], "target": []}
+    rates: dict[Rule, list[Rates]] = {"expected": [], "target": []}
     for noise in noises:
-        found["expected"].append(loop.rates(band, noise, care, "expected"))
+        rates["expected"].append(loop.rates(band, noise, care, "expected"))
         backed = {b: loop.rates(aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
-        found["target"].append(loop.rates(band, noise, max(backed, key=lambda b: backed[b])))
+        rates["target"].append(loop.rates(band, noise, max(backed, key=lambda b: backed[b])))
         tick()
-    return found
+    return rates
 
 
-def rate_facts(found: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
     """`mcs/<snr>dB/*` of rule `expected`, `mcs/<snr>dB/target/*` of the other: throughput against the oracle.
 
     `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
     most; of all positions, of accepted ones, and of all where the others send pilots.
     """
     facts: dict[str, Any] = {}
-    for rule, ones in found.items():
+    for rule, ones in rates.items():
         for one in ones:
             stem = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
             facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted, score).items()}
@@ -215,11 +215,11 @@ def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame
     }
 
 
-def pusch_facts(modulation: str, drawn: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
     """`pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %, and how far behind perfect."""
     facts: dict[str, Any] = {}
-    crossings = {name: crossing(curve.bler) for name, curve in drawn.items()}
-    for name, curve in drawn.items():
+    crossings = {name: crossing(curve.bler) for name, curve in rates.items()}
+    for name, curve in rates.items():
         stem, at = f"pusch/{modulation}/{name}", crossings[name]
         reference = crossings["perfect@accepted" if name.endswith("@accepted") else "perfect"]
         facts[f"{stem}/ebno_at_bler_0.1"] = at

@@ -58,13 +58,13 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         study.tables.append(tables.seeds(runs))
     makers = (tables.results, tables.within_minutes, tables.costs, tables.effects, tables.worst)
     study.tables += [table for table in (make(runs) for make in makers) if table.rows]
-    drawn = (
+    figures = (
         plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.latency_cdf(runs), plots.learning(runs),
         plots.costs(runs), plots.measurements(runs), plots.confidence(runs),
     )  # fmt: skip
     study.plots = [
         (str(figure.get_label()), figure.get_figwidth() > plots.WIDE, _unique_ids(plots.svg(figure), i))
-        for i, figure in enumerate(drawn)
+        for i, figure in enumerate(figures)
         if figure is not None
     ]
     firsts = [group[0] for group in tables.grouped(runs).values()]
@@ -104,18 +104,18 @@ def _png(path: Path) -> str:
     return base64.b64encode(out.getvalue()).decode()
 
 
-def html(title: str, made: str, shown: Sequence[Study]) -> str:
-    """The page; `made` says where it comes from."""
+def html(title: str, note: str, sections: Sequence[Study]) -> str:
+    """The page; `note` says where it comes from."""
     text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
-    return Environment(autoescape=True).from_string(text).render(title=title, made=made, studies=shown)
+    return Environment(autoescape=True).from_string(text).render(title=title, made=note, studies=sections)
 
 
-def write(folder: Path, title: str, made: str, shown: Sequence[Study]) -> None:
+def write(folder: Path, title: str, note: str, sections: Sequence[Study]) -> None:
     """`report.html`, `report.md` and a CSV file per table."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.html").write_text(html(title, made, shown), encoding="utf-8")
-    parts = [f"# {title}\n\n{made}\n"]
-    for study in shown:
+    (folder / "report.html").write_text(html(title, note, sections), encoding="utf-8")
+    parts = [f"# {title}\n\n{note}\n"]
+    for study in sections:
         parts.append(f"## {study.title}\n")
         parts += [f"{remark}\n" for remark in study.remarks]
         parts += [table.markdown() for table in study.tables]
@@ -146,9 +146,9 @@ def refresh(path: Path, runs: Sequence[Run]) -> None:
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise ValueError(f"{path}: the lines {BEGIN} and {END} are needed, in this order")
-    shown = "\n".join(_short(f"{name}, split {cut}", group) for (name, cut), group in by_study(runs).items())
+    block = "\n".join(_short(f"{name}, split {cut}", group) for (name, cut), group in by_study(runs).items())
     with whole_file(path) as partial:
-        partial.write_text(f"{before}{BEGIN}\n\n{shown}\n{END}{after}", encoding="utf-8")
+        partial.write_text(f"{before}{BEGIN}\n\n{block}\n{END}{after}", encoding="utf-8")
 
 
 def _short(title: str, runs: Sequence[Run]) -> str:

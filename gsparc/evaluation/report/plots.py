@@ -236,8 +236,8 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     if not stating:
         return None
     figure, ((points, risk),) = panels(WIDE, TALL, 1, 2)
-    shown = [(run, style) for (_, group), style in _styled(stating) for run in group]
-    for run, style in shown[:MOST_CONFIDENCES]:
+    lines = [(run, style) for (_, group), style in _styled(stating) for run in group]
+    for run, style in lines[:MOST_CONFIDENCES]:
         value, stated = sizes(run, name), run.samples["confidence"]
         known = np.isfinite(value) & np.isfinite(stated)
         stated, value = stated[known], value[known]

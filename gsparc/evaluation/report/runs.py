@@ -59,8 +59,8 @@ class Run:
     @cached_property
     def setting(self) -> str:
         """What distinguishes it from others but the seed: the method and its overrides."""
-        shown = [o for o in self.overrides if not o.lstrip("+~").startswith(HIDDEN)]
-        named = [o for o in shown if not o.startswith(("model=", "dataset=", "split="))]
+        overrides = [o for o in self.overrides if not o.lstrip("+~").startswith(HIDDEN)]
+        named = [o for o in overrides if not o.startswith(("model=", "dataset=", "split="))]
         short = [o.removeprefix("model.").removeprefix("trainer.") for o in named]
         return " ".join([str(self.facts.get("model/name", "?")), *short])
 

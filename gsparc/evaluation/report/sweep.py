@@ -106,6 +106,6 @@ def _on_screen(table: Table) -> Shown:
 def _spread(value: Any, column: Column) -> str:
     low, high = (getattr(value, end, None) for end in ("low", "high"))
     if low is None or high is None:
-        return column.shown(value)
+        return column.text(value)
     low, high = format(low, column.form), format(high, column.form)
     return low if low == high else f"{low} to {high}"

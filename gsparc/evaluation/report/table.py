@@ -37,7 +37,7 @@ class Interval:
         ends = (self.value if end is None else end for end in (self.low, self.high))
         return [[max(sign * (end - self.value), 0.0)] for sign, end in zip((-1, 1), ends, strict=True)]
 
-    def shown(self, form: str = ".2f") -> str:
+    def text(self, form: str = ".2f") -> str:
         """`29.08 [27.4, 30.6]`."""
         ends = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
         return f"{self.value:{form}}{ends}"
@@ -104,12 +104,12 @@ class Column:
         """What a run has in this column: text, a number, an interval or None."""
         return run.facts.get(self.of) if isinstance(self.of, str) else self.of(run)
 
-    def shown(self, value: Any) -> str:
+    def text(self, value: Any) -> str:
         """A cell as text."""
         if value is None or (isinstance(value, float) and math.isnan(value)):
             return "–"
         if isinstance(value, Interval):
-            return value.shown(self.form)
+            return value.text(self.form)
         return format(value, self.form) if isinstance(value, (int, float)) else str(value)
 
 
@@ -156,7 +156,7 @@ class Table:
     def markdown(self) -> str:
         """A Markdown table under its title."""
         cells = [
-            [column.shown(value).replace("|", "\\|") for column, value in zip(self.columns, row, strict=True)]
+            [column.text(value).replace("|", "\\|") for column, value in zip(self.columns, row, strict=True)]
             for row in self.rows
         ]
         lines = markdown_table([column.name for column in self.columns], cells)

@@ -121,11 +121,11 @@ def process(features: np.ndarray, places: np.ndarray, seed: int = 0) -> Locator:
         prior, vertical = settings(values, places, seed)
         posterior = given(prior, Values.of(stretched(places, vertical), values), seed)
         grid = np.unique(places, axis=0)
-        found = posterior.answer(torch.from_numpy(stretched(grid, vertical)))
+        estimate = posterior.answer(torch.from_numpy(stretched(grid, vertical)))
         left_out, left = posterior.left_out()
         # One amplitude for all features, of what the process misses at places left out.
         amplitude = float(((posterior.rest - left_out).square().mean(1) / left).mean())
-        mean, variance = found.mean.numpy() + rows.mean(0), amplitude * found.left.numpy()
+        mean, variance = estimate.mean.numpy() + rows.mean(0), amplitude * estimate.left.numpy()
 
         def locate(query: np.ndarray) -> np.ndarray:
             squared = pairwise_distances(query, mean, "sqeuclidean")

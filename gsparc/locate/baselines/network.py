@@ -54,7 +54,7 @@ def _fitted(rows: np.ndarray, places: np.ndarray, end: float, seed: int) -> Loca
         model = nn.Sequential(*layers, nn.Linear(HIDDEN, len(grid)))
         known, order = inputs(rows), torch.randperm(len(rows))
         count = max(round(HELD * len(rows)), 1)
-        held, learned = order[:count].numpy(), order[count:] if len(order) > count else order
+        held_out, learned = order[:count].numpy(), order[count:] if len(order) > count else order
         optimizer = torch.optim.Adam(model.parameters(), RATE)
         best, weights, waited = np.inf, copy.deepcopy(model.state_dict()), 0
         while waited < PATIENCE and time.perf_counter() < end:
@@ -63,7 +63,7 @@ def _fitted(rows: np.ndarray, places: np.ndarray, end: float, seed: int) -> Loca
                 optimizer.zero_grad()
                 nn.functional.cross_entropy(model(known[batch]), label[batch]).backward()
                 optimizer.step()
-            error = np.linalg.norm(locate(rows[held]) - places[held], axis=1).mean()
+            error = np.linalg.norm(locate(rows[held_out]) - places[held_out], axis=1).mean()
             waited += 1
             if error < best:
                 best, weights, waited = error, copy.deepcopy(model.state_dict()), 0

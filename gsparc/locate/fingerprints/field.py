@@ -132,8 +132,8 @@ def learn(
         squares += (error.square() / left[place[rows], None].float()).sum(0)
     common = (squares.sum() / times.sum()).clamp_min(LEAST_DB2)
     variance = (squares + PRIOR_ROWS * common) / (times + PRIOR_ROWS)
-    drawn = torch.from_numpy(np.sort(np.random.default_rng(seed).permutation(len(level))[:ROWS]))
-    odds, sensitivity = hearing(left_out[place[drawn], : len(base)] + mean[0], heard[drawn])
+    sample = torch.from_numpy(np.sort(np.random.default_rng(seed).permutation(len(level))[:ROWS]))
+    odds, sensitivity = hearing(left_out[place[sample], : len(base)] + mean[0], heard[sample])
     return FingerprintField(process, mean, base, variance, odds, sensitivity, vertical)
 
 

@@ -114,10 +114,10 @@ def trusted(
         without = FingerprintLocator.of(
             rows.at(train), locator.offset_db, locator.around, track, locator.field
         )
-        drawn = np.random.default_rng(seed).permutation(len(test))[: -(-HELD_OUT // groups)]
-        looks = list(without.look(rows.at(test if track else test[drawn])))  # a walk is one
-        misfits += [looks[row] for row in drawn] if track else looks
-        true.append(rows.position[test[drawn]])
+        picks = np.random.default_rng(seed).permutation(len(test))[: -(-HELD_OUT // groups)]
+        looks = list(without.look(rows.at(test if track else test[picks])))  # a walk is one
+        misfits += [looks[row] for row in picks] if track else looks
+        true.append(rows.position[test[picks]])
     places = np.concatenate(true)
 
     def error(trust: Trust) -> float:

@@ -91,21 +91,21 @@ def tune(
     def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
         kernel = kernel_at(parameters)
         inverse = inverse_of(kernel)
-        found = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
-        return mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
+        predicted = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
+        return mean_log_error(samples.error(predicted))  # up to a factor, minus the PSNR
 
     if len(positions) < 4:
         return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
     first = min((np.log(start) for start in STARTS), key=objective)
     refined = refine_alignment(aligned, inverse_of(kernel_at(first)), partner)
-    found = minimize(
+    optimum = minimize(
         objective, first, args=(refined,), method="Nelder-Mead",
         options={
             "maxfev": STEPS, "xatol": 0.03, "fatol": 1e-3,
             "initial_simplex": first + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, -1.0]]),
         },
     )  # fmt: skip
-    kernel = kernel_at(found.x)
+    kernel = kernel_at(optimum.x)
     inverse = inverse_of(kernel)
     unknown, predicted = samples.predictions(kernel, inverse, refine_alignment(refined, inverse, partner))
     error = samples.error(predicted)

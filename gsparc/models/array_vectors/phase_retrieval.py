@@ -78,9 +78,9 @@ def recover(
     state, cost = torch.zeros(n, problem.unknowns, dtype=torch.float64), torch.full((n,), torch.inf).double()
     enough = (ENOUGH * problem.expected) ** 2
 
-    def keep(rows: Tensor, found: tuple[Tensor, Tensor]) -> None:
-        better = found[1] < cost[rows]
-        state[rows[better]], cost[rows[better]] = found[0][better], found[1][better]
+    def keep(rows: Tensor, trial: tuple[Tensor, Tensor]) -> None:
+        better = trial[1] < cost[rows]
+        state[rows[better]], cost[rows[better]] = trial[0][better], trial[1][better]
 
     every = torch.arange(n)
     order = torch.from_numpy(np.random.default_rng(seed).permutation(n))

@@ -78,10 +78,10 @@ def through_array(task: InitTask) -> Start:
             "init=vectors solves a linear read-out: set model.emission.hidden=0 and "
             "model.attenuation.inverse_distance=false"
         )
-    found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
+    process = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
     return Start(
-        found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
-        astuple(found.elapsed), found.time_limited, found.left_out,
+        process.prior, partial(start, process=process, receiver=task.receiver), astuple(process.training),
+        astuple(process.elapsed), process.time_limited, process.left_out,
     )  # fmt: skip
 
 
@@ -105,22 +105,22 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         raise ValueError("the training set is empty")
     assert site.array is not None and site.grid is not None and site.wavelength is not None
     watch = TimeBudget()
-    found, training = recovered(data, rows, platform_cache(), seed)
+    recovery, training = recovered(data, rows, platform_cache(), seed)
     elapsed = watch.counted
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
-        report(found, data, rows, run_dir / "array_recovery.csv")
+        report(recovery, data, rows, run_dir / "array_recovery.csv")
     matrix = steering(site.array, site.grid, site.wavelength).numpy()
     partner, places = mirror_elements(site.array), data.tx[rows]
     core = covering(places, MOST_ROWS, seed)
     images = to_real(training_targets(data, rows[core]), "spectrum")
-    tuned = tune(found.vectors[core], places[core], images, matrix, site.wavelength, partner, seed)
+    tuned = tune(recovery.vectors[core], places[core], images, matrix, site.wavelength, partner, seed)
     kernel = tuned.kernel
-    vectors = np.empty(found.vectors.shape, np.complex128)
-    vectors[core] = aligned_by(found.vectors[core], places[core], partner, kernel)
+    vectors = np.empty(recovery.vectors.shape, np.complex128)
+    vectors[core] = aligned_by(recovery.vectors[core], places[core], partner, kernel)
     rest = np.setdiff1d(np.arange(len(rows)), core)
     if len(rest):
         log.info("array: %d of %d spectra, which cover the site, align the others", len(core), len(rows))
-        others = found.vectors[rest], places[rest]
+        others = recovery.vectors[rest], places[rest]
         vectors[rest] = aligned_to(*others, vectors[core], places[core], partner, kernel)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
     features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
@@ -138,21 +138,21 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         tuned.left_out,
         elapsed,
         training,
-        bool(found.time_limited.any()),
+        bool(recovery.time_limited.any()),
     )
 
 
 @torch.no_grad()
-def start(model: GaussianModel, found: Learned, receiver: Pose) -> None:
+def start(model: GaussianModel, process: Learned, receiver: Pose) -> None:
     """Set what a fresh model emits, its mean spectrum and its errors to what was learned."""
     response = model.response
     assert isinstance(response, ArrayResponse)
     view = seen_by_array(model, receiver)  # (N, M)
     left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
     damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(torch.finfo(size.dtype).tiny)
-    readout = found.weights @ ((right.mH * damped) @ left.mH)  # (E, N)
+    readout = process.weights @ ((right.mH * damped) @ left.mH)  # (E, N)
     model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))
     model.emission.bias2.zero_()
-    response.background = found.background
+    response.background = process.background
     if model.error is not None:
-        model.error.set(*found.error)
+        model.error.set(*process.error)

@@ -43,11 +43,11 @@ def recovered(
     missing = rows[~have[rows]]
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         watch = TimeBudget()
-        found = recover(data.site, training_targets(data, part), data.tx[part], seed)
+        recovery = recover(data.site, training_targets(data, part), data.tx[part], seed)
         spent = vars(watch.counted)
-        known = known or _empty(len(data), found)
+        known = known or _empty(len(data), recovery)
         for name, values in known.items():
-            values[part] = spent[name] / len(part) if name in spent else getattr(found, name)
+            values[part] = spent[name] / len(part) if name in spent else getattr(recovery, name)
         if path is not None:
             _write(path, known)
     assert known is not None

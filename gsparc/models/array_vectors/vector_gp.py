@@ -81,8 +81,8 @@ def _walk(positions: np.ndarray) -> np.ndarray:
 def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray, count: int) -> np.ndarray:
     reach = 4 * count
     while True:
-        found = np.atleast_1d(tree.query(positions[i], k=min(reach, len(positions)))[1])
-        near = found[done[found]]
+        neighbours = np.atleast_1d(tree.query(positions[i], k=min(reach, len(positions)))[1])
+        near = neighbours[done[neighbours]]
         if len(near) >= count or reach >= len(positions):
             return near[:count]
         reach *= 4

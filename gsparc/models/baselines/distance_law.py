@@ -198,12 +198,12 @@ class DistanceLaw(Differentiable):
         decibels = to_real(targets, "rssi")[:, 0].astype(np.float64)
         self.law, notes = law_of(Rows(positions, decibels, silent), self.site)
         law = self.law
-        said = (
+        summary = (
             f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "
             f"deviation {law_variance(law) ** 0.5:.3g} dB"
             f" ({time.perf_counter() - started:.2g} s)"
         )
-        return tuple(f"distance_law: {note}" for note in (said, *notes))
+        return tuple(f"distance_law: {note}" for note in (summary, *notes))
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         mean = self._decode(self.law.mean(queries)[:, None].to(dtype))

@@ -152,14 +152,14 @@ class GaussianProcess(Differentiable):
         parts = principal_components(targets[rows], self.kind, self.limit)
         start = choose_kernel(positions[rows], parts.scores, len(parts.mean))
         scores, self.lost = projected(targets, self.kind, parts.mean, parts.axes)
-        kernel, said = kernel_given_nearest(positions, scores, len(parts.mean), start, 0)
+        kernel, fit_note = kernel_given_nearest(positions, scores, len(parts.mean), start, 0)
         once = torch.ones(len(scores), dtype=torch.float64)
         self.scores = given(Prior(kernel), Values(positions, torch.from_numpy(scores), once), 0)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         basis = f"{len(parts.axes)} components of {len(rows)} rows, mean square left out {self.lost:.2e}"
-        told_by = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
+        scheme = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
         settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
-        return tuple(f"gp: {note}" for note in (settings, said, told_by, basis))
+        return tuple(f"gp: {note}" for note in (settings, fit_note, scheme, basis))
 
     def _learn_censored(
         self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
@@ -305,8 +305,8 @@ class ReducedMean(View):
     Args:
         inner: fitted.
         mean, axes: (P,) and (C, P), the basis of targets.
-        scores: what the rows say of components; `kept` of them.
-        kept: see there.
+        scores: what the rows say of components; `components` of them.
+        components: see there.
         shape: of a target.
     """
 

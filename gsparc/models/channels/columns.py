@@ -81,10 +81,10 @@ class Group:
     def __len__(self) -> int:
         return len(self.places)
 
-    def take(self, kept: Tensor) -> Group:
+    def take(self, index: Tensor) -> Group:
         """The rows (m,) of these numbers."""
         parts = (self.rows, self.places, self.target, self.run, self.order)
-        return Group(self.slot, *(part[kept] for part in parts))
+        return Group(self.slot, *(part[index] for part in parts))
 
     @cached_property
     def displacements(self) -> bytes:
@@ -119,7 +119,7 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
     target = torch.from_numpy(np.asarray(data.target[rows])).to(torch.complex128)
-    found = []
+    groups = []
     for number in np.unique(station):
         mine = np.flatnonzero(station == number)
         for slot in _slots(data, int(number), rows[mine], apart):
@@ -131,19 +131,19 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
             chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(here), -1)
             places = slot.places(moving[here], turned[here])
             order = torch.from_numpy(numbers_of[rows[measured]])
-            found.append(Group(slot, here, places, chosen, torch.from_numpy(run[measured]), order))
-    return tuple(found)
+            groups.append(Group(slot, here, places, chosen, torch.from_numpy(run[measured]), order))
+    return tuple(groups)
 
 
 def _order_of(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station."""
     if data.station is None:
         return np.arange(len(data), dtype=np.float64)
-    found = np.empty(len(data))
+    order = np.empty(len(data))
     for number in np.unique(data.station):
         mine = np.flatnonzero(data.station == number)
-        found[mine] = np.arange(len(mine))
-    return found
+        order[mine] = np.arange(len(mine))
+    return order
 
 
 def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> list[Slot]:
@@ -164,11 +164,11 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
             else ((a,), centre + rotation @ offsets[a], zero)
             for a in range(antennas)
         ]
-    found = []
+    slots = []
     for band in bands(frequency, reach):
         wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
-        found += [Slot(station, own, band, end, element, wavenumber) for own, end, element in elements]
-    return found
+        slots += [Slot(station, own, band, end, element, wavenumber) for own, end, element in elements]
+    return slots
 
 
 def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
@@ -234,9 +234,9 @@ def run_factors_of(groups: tuple[Group, ...], factors: list[Factor], runs: int) 
         own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, 1e-300)
         quadratic[: len(own), : len(own)] += own
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
-    heard, found = size > 0, np.ones(runs, np.complex128)
-    found[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
-    measured = torch.from_numpy(found)
+    heard, estimates = size > 0, np.ones(runs, np.complex128)
+    estimates[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
+    measured = torch.from_numpy(estimates)
     return measured / measured.abs() if ends_of(groups) > 1 else measured
 
 
@@ -246,11 +246,11 @@ def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> 
     Groups of as many rows keep the same ones.
     """
     chosen = np.unique(np.linspace(0, len(groups) - 1, min(columns, len(groups))).round().astype(int))
-    found = []
+    subset = []
     for number in chosen:
         group = groups[number]
         if len(group) > rows:
-            kept = np.sort(np.random.default_rng(0).permutation(len(group))[: int(rows)])
-            group = group.take(torch.from_numpy(kept))
-        found.append(group)
-    return tuple(found)
+            index = np.sort(np.random.default_rng(0).permutation(len(group))[: int(rows)])
+            group = group.take(torch.from_numpy(index))
+        subset.append(group)
+    return tuple(subset)

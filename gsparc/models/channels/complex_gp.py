@@ -162,9 +162,9 @@ class ComplexGP(Method):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
         exact, kernel = tx.dtype == torch.float64, self.kernel
-        found = self._fitted().answer(self._moving(tx, rx), exact)
-        share = found.left / (1 + kernel.noise)
-        mean = found.mean.to(tx.dtype.to_complex()).reshape(-1, *self.shape)
+        posterior = self._fitted().answer(self._moving(tx, rx), exact)
+        share = posterior.left / (1 + kernel.noise)
+        mean = posterior.mean.to(tx.dtype.to_complex()).reshape(-1, *self.shape)
         return Prediction(mean, (1 - share).to(tx.dtype).clamp(0, 1), (kernel.amplitude * share).to(tx.dtype))
 
     def gradient_problem(self) -> str | None:

@@ -138,10 +138,10 @@ def image_waves(values: Values, slot: Slot, places: Tensor) -> Tensor:
     if not values.count:
         return places.new_zeros(0, len(places), dtype=torch.complex128)
     end = slot.end + values.offset
-    given = images(end, values.planes, values.sequences)
-    reference = torch.linalg.vector_norm(given - values.middle, dim=-1)
+    sources = images(end, values.planes, values.sequences)
+    reference = torch.linalg.vector_norm(sources - values.middle, dim=-1)
     waves = [
-        steering(places, source, slot.wavenumber, away) for source, away in zip(given, reference, strict=True)
+        steering(places, one, slot.wavenumber, away) for one, away in zip(sources, reference, strict=True)
     ]
     return torch.stack(waves) * mirrored(values.planes, values.sequences, end, values.middle)[:, None]
 
@@ -160,18 +160,18 @@ def diffuse_of(values: Values, wavenumber: float, powers: Tensor, a: Tensor, b: 
 
     `powers` (T, M) are the ends' of directions.
     """
-    found = values.of("isotropic")[0] * plain(a, b, wavenumber, values.envelope)
-    found = found[None].expand(len(powers), *found.shape)
+    covariance = values.of("isotropic")[0] * plain(a, b, wavenumber, values.envelope)
+    covariance = covariance[None].expand(len(powers), *covariance.shape)
     if not len(values.angles):
-        return found.to(torch.complex128)
+        return covariance.to(torch.complex128)
     distance = apart(a, b)
     bound = envelope(distance, values.envelope)
     block = max(BLOCK // max(distance.numel(), 1), 1)
     for angles, power in zip(values.angles.split(block), powers.split(block, dim=1), strict=False):
         if len(angles):
             correlations = directions(angles, values.concentration, wavenumber, a, b, distance)
-            found = found + torch.tensordot(power.to(correlations.dtype), correlations, 1) * bound
-    return found.to(torch.complex128)
+            covariance = covariance + torch.tensordot(power.to(correlations.dtype), correlations, 1) * bound
+    return covariance.to(torch.complex128)
 
 
 def diffuse_fields(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
@@ -179,7 +179,7 @@ def diffuse_fields(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
     alike: dict[tuple[bytes, float], list[int]] = {}
     for number, group in enumerate(groups):
         alike.setdefault((group.displacements, group.slot.wavenumber), []).append(number)
-    found: list[Tensor] = [torch.empty(0)] * len(groups)
+    covariances: list[Tensor] = [torch.empty(0)] * len(groups)
     for (_, wavenumber), numbers in alike.items():
         places = groups[numbers[0]].places
         powers = directional(values, [groups[number].slot for number in numbers])
@@ -187,8 +187,8 @@ def diffuse_fields(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
         parts = [diffuse_of(values, wavenumber, powers, part, places) for part in places.split(rows)]
         whole = torch.cat(parts, 1)
         for at, number in enumerate(numbers):
-            found[number] = whole[min(at, len(whole) - 1)]
-    return found
+            covariances[number] = whole[min(at, len(whole) - 1)]
+    return covariances
 
 
 def directional(values: Values, slots: Sequence[Slot]) -> Tensor:
@@ -241,10 +241,10 @@ def explained(values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
 
 def specular(values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
     """Covariance (n, m) of all but the diffuse field."""
-    found = _of_waves(values, slot, a, b, 0)
+    covariance = _of_waves(values, slot, a, b, 0)
     if not values.constant:
-        return found
-    return found + values.of("constant")[0] * smooth(apart(a, b), values.reach)
+        return covariance
+    return covariance + values.of("constant")[0] * smooth(apart(a, b), values.reach)
 
 
 def _of_waves(values: Values, slot: Slot, a: Tensor, b: Tensor, first: int) -> Tensor:
@@ -267,19 +267,19 @@ def signals(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
 
 def prior(values: Values, slot: Slot, places: Tensor) -> Tensor:
     """Variance (n,) of the signal."""
-    found = values.of("isotropic")[0] + directional(values, [slot])[0].sum()
-    found = found + values.of("constant").sum()
+    variance = values.of("isotropic")[0] + directional(values, [slot])[0].sum()
+    variance = variance + values.of("constant").sum()
     level = waves_of(values, slot, places).abs().square()
-    return (found + torch.stack(values.gains()).sum(0) @ level).expand(len(places))
+    return (variance + torch.stack(values.gains()).sum(0) @ level).expand(len(places))
 
 
 def disturbance(values: Values, group: Group) -> Tensor:
     """Covariance (n, n) float64 of what is no signal of the place: noise and drift of training rows."""
-    found = torch.eye(len(group), dtype=torch.float64) * values.of("noise")
+    covariance = torch.eye(len(group), dtype=torch.float64) * values.of("noise")
     if values.correlated:
         fast, drift = temporal(values.envelope, group)
-        found = found + values.of("fast") * fast + values.of("drift") * drift
-    return found
+        covariance = covariance + values.of("fast") * fast + values.of("drift") * drift
+    return covariance
 
 
 def temporal(length: Tensor | float, group: Group) -> tuple[Tensor, Tensor]:

@@ -28,12 +28,12 @@ LOWEST = 1e-5  # of the white noise
 
 def contiguous_rows(groups: tuple[Group, ...]) -> tuple[Group, ...]:
     """At most `COLUMNS` groups, of `STRETCH` rows that follow each other."""
-    found = []
+    stretches = []
     for group in thinned(groups, COLUMNS):
         order = torch.argsort(group.order, stable=True)
         start = max(len(order) - STRETCH, 0) // 2
-        found.append(group.take(order[start : start + STRETCH]))
-    return tuple(found)
+        stretches.append(group.take(order[start : start + STRETCH]))
+    return tuple(stretches)
 
 
 def with_drift(groups: tuple[Group, ...], signals: list[Tensor], values: Values) -> tuple[Values, float]:
@@ -62,7 +62,7 @@ def with_drift(groups: tuple[Group, ...], signals: list[Tensor], values: Values)
 
     start = np.log(noise * np.array(SHARES))
     bounds = [(math.log(noise * LOWEST), math.log(noise) + 5)] * 3
-    found = minimize(
+    optimum = minimize(
         objective,
         start,
         jac=True,
@@ -73,9 +73,9 @@ def with_drift(groups: tuple[Group, ...], signals: list[Tensor], values: Values)
     )
     power = torch.cat([values.power.clone(), torch.zeros(2, dtype=torch.float64)])
     fresh = replace(values, correlated=True, power=power)
-    for name, level in zip(("noise", "fast", "drift"), np.exp(found.x), strict=True):
+    for name, level in zip(("noise", "fast", "drift"), np.exp(optimum.x), strict=True):
         power[fresh.where(name)] = float(level)
-    return fresh, before - float(found.fun)
+    return fresh, before - float(optimum.fun)
 
 
 def _likelihood(

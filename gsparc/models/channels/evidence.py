@@ -128,7 +128,7 @@ def compressed(
 
     `cache` keeps matrices of places that further candidates and groups need again.
     """
-    cache, found = {} if cache is None else cache, []
+    cache, parts = {} if cache is None else cache, []
     noise = float(values.of("noise")[0] / values.of("isotropic")[0])
     for group in groups:
         places = group.displacements
@@ -145,8 +145,8 @@ def compressed(
         bins = torch.zeros(len(values.angles), 0, dtype=torch.float64)
         if len(values.towards):
             bins = angle_knot_weights(values, (group.slot.end + values.offset)[None], len(values.towards))[0]
-        found.append(Compressed(group, basis, room, terms, bins, *_projected(group, basis)))
-    return tuple(found)
+        parts.append(Compressed(group, basis, room, terms, bins, *_projected(group, basis)))
+    return tuple(parts)
 
 
 def _projected(group: Group, basis: Tensor) -> tuple[Tensor, float]:
@@ -168,9 +168,9 @@ def _field(group: Group, values: Values, noise: float) -> tuple[Tensor, Tensor]:
     bound = envelope(distance, values.envelope)
     alike = plain(places, places, wavenumber, values.envelope)
     size, vectors = torch.linalg.eigh(alike)
-    kept = size > FLOOR * noise
-    whole = int(kept.sum()) > WORTH * len(group)
-    basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
+    mask = size > FLOOR * noise
+    whole = int(mask.sum()) > WORTH * len(group)
+    basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, mask]
     room = [alike.to(torch.complex128)]
     for angle in values.angles:
         one = directions(angle[None], values.concentration, wavenumber, places, places, distance)
@@ -186,19 +186,19 @@ def _field(group: Group, values: Values, noise: float) -> tuple[Tensor, Tensor]:
 def _roots(group: Group, length: float) -> Tensor:
     """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
     size, vectors = torch.linalg.eigh(smooth(apart(group.places, group.places), length))
-    kept = size > LOW_RANK * size[-1]
-    return vectors[:, kept] * size[kept].sqrt()
+    mask = size > LOW_RANK * size[-1]
+    return vectors[:, mask] * size[mask].sqrt()
 
 
 def _factors(
     group: Group, values: Values, basis: Tensor, fixed: Tensor, varying: Tensor
 ) -> tuple[Tensor, ...]:
     wide = basis.T.to(torch.complex128)
-    found = [wide @ fixed.to(torch.complex128)] if values.constant else []
+    columns = [wide @ fixed.to(torch.complex128)] if values.constant else []
     waves = waves_of(values, group.slot, group.places)[:, :, None]
     for part in waves.split([int(values.direct), values.count]):
-        found += [wide @ (wave * root) for root in (fixed, varying) for wave in part]
-    return tuple(found)
+        columns += [wide @ (wave * root) for root in (fixed, varying) for wave in part]
+    return tuple(columns)
 
 
 def without(part: Compressed, left: Tensor) -> Compressed:
@@ -235,14 +235,14 @@ def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
     weights = at.given.weights
     weight = at.given.factor.inverse.addmm(weights, weights.mH, beta=outputs, alpha=-1 / at.scale)
     room = len(part.room)
-    found = torch.zeros_like(power)
-    found[:room] = (part.room.reshape(room, -1) @ weight.T.reshape(-1)).real
+    gradient = torch.zeros_like(power)
+    gradient[:room] = (part.room.reshape(room, -1) @ weight.T.reshape(-1)).real
     for number, term in enumerate(part.terms, room):
-        found[number] = term.trace(weight)
+        gradient[number] = term.trace(weight)
     noise = room + len(part.terms)
-    found[noise] = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[noise]
-    found[noise] -= part.rest / (at.scale * power[noise] ** 2)
-    return found * power
+    gradient[noise] = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[noise]
+    gradient[noise] -= part.rest / (at.scale * power[noise] ** 2)
+    return gradient * power
 
 
 def evidence(parts: tuple[Compressed, ...], values: Values) -> float:
@@ -274,10 +274,10 @@ def fit_powers(
             own = part.own(power, tilt)
             at = solved(part, own)
             total += at.nll
-            found = slope(part, own, at)
-            gradient[:count] += found
+            part_slope = slope(part, own, at)
+            gradient[:count] += part_slope
             if len(tilt):
-                gradient[count:] += part.ways.T @ found[1 : len(part.room)]
+                gradient[count:] += part.ways.T @ part_slope[1 : len(part.room)]
         total += TILTED * float(tilt.square().sum())
         gradient[count:] += 2 * TILTED * tilt
         if angles and shrinkage > 0:
@@ -290,7 +290,7 @@ def fit_powers(
         return total, (gradient + 2 * WEAK * (log - begin)).numpy()
 
     bounds = [(LOWEST, HIGHEST)] * count + [(-HIGHEST, HIGHEST)] * len(towards)
-    found = minimize(
+    part_slope = minimize(
         objective,
         begin.numpy(),
         jac=True,
@@ -299,7 +299,7 @@ def fit_powers(
         options={"maxiter": steps, "ftol": SETTLED},
         callback=stop_when_late,
     )
-    power, towards = torch.from_numpy(found.x[:count]).exp(), torch.from_numpy(found.x[count:])
+    power, towards = torch.from_numpy(part_slope.x[:count]).exp(), torch.from_numpy(part_slope.x[count:])
     fitted = replace(values, power=power, towards=towards)
     return fitted, evidence(parts, fitted)
 
@@ -312,7 +312,7 @@ def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list
     at, noise = solved(part, power), power[len(part.room) + len(part.terms)]
     wide, inverse = part.basis.to(torch.complex128), at.given.factor.inverse
     alpha = wide @ at.given.weights + (part.group.target - wide @ part.target) / noise
-    found = []
+    errors = []
     for groups in groupings:
         if groups is None:
             inside, outside = (wide @ inverse) * wide.conj(), 1 - wide.abs().square().sum(1)
@@ -324,5 +324,5 @@ def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list
                 block = own @ (inverse @ own.mH) - own @ own.mH / noise
                 block.diagonal().add_(1 / noise)
                 error[mine] = Factor.of(block).solved(alpha[mine])
-        found.append(error)
-    return found
+        errors.append(error)
+    return errors

@@ -67,8 +67,8 @@ class Weights:
         root = Factor(lower).root
         few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
         short = root.to(torch.float32 if self.is_real else torch.complex64)
-        found = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)
-        error = (found - few.abs().square().sum(1)).abs().max()
+        squares = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)
+        error = (squares - few.abs().square().sum(1)).abs().max()
         return short if float(error) <= ROUNDED * self.noise else root
 
     def learned(self, cross: Tensor) -> Tensor:
@@ -208,16 +208,16 @@ class ChannelField(ConditionalField):
         if factors is None:
             factors = run_factors_of(groups, all_factors, len(runs))
         self.runs = RunFactors(runs, factors)
-        found, noise = [], float(values.of("noise"))
+        weights, noise = [], float(values.of("noise"))
         for group, factor in zip(groups, all_factors, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])
             given = Conditioned(factor, aligned.target, factor.solved(aligned.target))
-            found.append(Weights(aligned, given, max(given.scale, 1e-300), noise, values.is_real))
-        self.weights = tuple(found)
+            weights.append(Weights(aligned, given, max(given.scale, 1e-300), noise, values.is_real))
+        self.weights = tuple(weights)
         self.stations = {}
-        for known in found:
+        for known in weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
-        heard = [(known.group, known.given.weights, known.scale) for known in found]
+        heard = [(known.group, known.given.weights, known.scale) for known in weights]
         self.common = Common.of(self._constants, heard) if len(self.stations) > 1 else None
 
     def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
@@ -252,11 +252,11 @@ class ChannelField(ConditionalField):
 
     def answer(self, batch: Batch) -> Posterior:
         """Answer rows of known stations, in the phase and level of their runs."""
-        found = self(batch.tx, batch.rx, batch.station)
-        turned: Posterior = self.runs.restored(found, batch.run)
-        if turned is found or found.explained is None:
+        posterior = self(batch.tx, batch.rx, batch.station)
+        turned: Posterior = self.runs.restored(posterior, batch.run)
+        if turned is posterior or posterior.explained is None:
             return turned
-        return replace(turned, explained=found.explained * self.runs.factor(found.mean, batch.run))
+        return replace(turned, explained=posterior.explained * self.runs.factor(posterior.mean, batch.run))
 
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
@@ -297,7 +297,7 @@ class ChannelField(ConditionalField):
         self, moving: Tensor, turned: Tensor, station: Tensor
     ) -> list[list[tuple[Weights, Tensor, Tensor]]]:
         """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
-        found: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
+        by_places: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
         for number in station.unique().tolist():
             here = torch.nonzero(station == number).flatten()
             for known in self.stations.get(number, ()):
@@ -306,8 +306,8 @@ class ChannelField(ConditionalField):
                 first = numbers(learned.places)[0].tobytes()
                 queried = numbers(places).tobytes()
                 key = (slot.wavenumber, learned.displacements, first, queried)
-                found.setdefault(key, []).append((known, here, places))
-        return list(found.values())
+                by_places.setdefault(key, []).append((known, here, places))
+        return list(by_places.values())
 
     def _of_unheard(
         self,
@@ -326,9 +326,9 @@ class ChannelField(ConditionalField):
             slot = template.group.slot
             slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
             places = slot.places(moving[here], turned[here])
-            found, variance, prior_variance = self.common.at(values, slot, places)
+            common, variance, prior_variance = self.common.at(values, slot, places)
             outputs = template.group.target.shape[1]
-            slot.put(mean, here, found[:, None].expand(-1, outputs))
+            slot.put(mean, here, common[:, None].expand(-1, outputs))
             after.index_add_(0, here, variance * outputs / size)
             before.index_add_(0, here, prior_variance * outputs / size)
 
@@ -373,7 +373,7 @@ class ChannelField(ConditionalField):
             "groups": [
                 {
                     **{one.name: getattr(group, one.name) for one in fields(group)},
-                    "slot": _stored(group.slot),
+                    "slot": _slot_state(group.slot),
                     "target": group.target * self.runs.factors[group.run][:, None],
                 }
                 for group in groups
@@ -383,15 +383,15 @@ class ChannelField(ConditionalField):
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
-    shape, kept = dict(state["shape"]), state["values"]
+    shape, values = dict(state["shape"]), state["values"]
     shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
-    learned = {name: kept[name] for name in ("offset", "towards", "planes") if name in kept}
-    logs = {name: kept[f"log_{name}"].exp() for name in ("power", "envelope", "gain")}
+    learned = {name: values[name] for name in ("offset", "towards", "planes") if name in values}
+    logs = {name: values[f"log_{name}"].exp() for name in ("power", "envelope", "gain")}
     antennas, tones = (int(n) for n in state["channel"])
     field = ChannelField(site, Values(**shape, **learned, **logs), (antennas, tones))
     with torch.no_grad():
         for name, parameter in field.named_parameters():
-            parameter.copy_(kept[name])
+            parameter.copy_(values[name])
     field.rows, runs = state["rows"].numpy(), RunFactors.read(state)
     groups = tuple(Group(**{**each, "slot": _read(each["slot"])}) for each in state["groups"])
     with torch.no_grad():
@@ -405,7 +405,7 @@ def _covariances(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
     return [signal + disturbance(values, group) for signal, group in both]
 
 
-def _stored(slot: Slot) -> dict[str, Any]:
+def _slot_state(slot: Slot) -> dict[str, Any]:
     """What `_read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
     unknown = bool(slot.end.isnan().any())
     return {**vars(slot), "end": slot.end[:0] if unknown else slot.end}

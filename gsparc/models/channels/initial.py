@@ -152,9 +152,9 @@ def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tupl
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     few, began = thinned(looked, 8, FEWEST), budget.spent
     _grid_point(few, [plain(g.places, g.places, g.slot.wavenumber, wavelength) for g in few], 1.0, runs)
-    given = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
+    max_s = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
     most = (
-        int(FEWEST * (given / max(budget.spent - began, 1e-6)) ** (1 / 3)) if given < math.inf else CHOSEN_ON
+        int(FEWEST * (max_s / max(budget.spent - began, 1e-6)) ** (1 / 3)) if max_s < math.inf else CHOSEN_ON
     )
     if most < max(len(group) for group in looked):
         budget.limited = True
@@ -207,8 +207,8 @@ def _strongest(values: Values) -> Values:
     strong = beyond > WEAKEST * everywhere
     isotropic_power = everywhere - beyond[strong].sum()
     rest = power[len(numbers) + 1 :]
-    kept = torch.cat([isotropic_power[None], beyond[strong], rest])
-    return replace(values, angles=values.angles[strong], power=kept)
+    powers = torch.cat([isotropic_power[None], beyond[strong], rest])
+    return replace(values, angles=values.angles[strong], power=powers)
 
 
 def _groupings(places: Tensor) -> list[Grouping]:
@@ -253,40 +253,40 @@ class _Search:
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes; what the seconds end is as if it had not been tried."""
         notes: list[str] = []
-        kept = [self._measured(self.start, self._compressed(self.start))]
+        steps = [self._measured(self.start, self._compressed(self.start))]
         longest = max(len(group) for group in self.every)
         reserve = WEIGHTS * len(self.every) * factor_s(longest)  # for the weights in the end
         end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
         try:
             with cancelled_by(partial(budget.over, end)):
-                self._grow(kept, notes, budget)
+                self._grow(steps, notes, budget)
         except Cancelled:
             notes.append("waves: the seconds ended the search for terms")
-        return kept[-1], notes
+        return steps[-1], notes
 
-    def _grow(self, kept: list[Candidate], notes: list[str], budget: TimeBudget) -> None:
-        """Append what each further term makes of the last of `kept`."""
+    def _grow(self, steps: list[Candidate], notes: list[str], budget: TimeBudget) -> None:
+        """Append what each further term makes of the last of `steps`."""
         wanted = self.settings
 
         def step(after: Candidate, name: str) -> None:
-            kept.append(self._step(kept[-1], after, name, notes))
+            steps.append(self._step(steps[-1], after, name, notes))
 
         step(self._fitted(self.start), "powers by likelihood")
         one_end = self.one_end  # where both move, what waves have in common is not known
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
-            step(self._with_fixed(kept[-1], direct, budget), "leakage and direct wave")
-        if wanted.mirrors and kept[-1].values.direct and ends_of(self.every) > 1:
-            mirrored = self._with_mirrors(kept[-1], budget)
+            step(self._with_fixed(steps[-1], direct, budget), "leakage and direct wave")
+        if wanted.mirrors and steps[-1].values.direct and ends_of(self.every) > 1:
+            mirrored = self._with_mirrors(steps[-1], budget)
             if mirrored is not None:
                 step(mirrored, f"mirror planes of all ends ({len(mirrored.values.planes)})")
         if wanted.directions and one_end:
-            step(self._with_directions(kept[-1]), "directions")
+            step(self._with_directions(steps[-1]), "directions")
         if ends_of(self.every) > 1:
-            self._of_all_ends(kept, known, notes)
+            self._of_all_ends(steps, known, notes)
         if wanted.correlated:
-            kept.append(self._with_drift(kept[-1], notes))
+            steps.append(self._with_drift(steps[-1], notes))
 
     def _step(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
         keep = after.beats(before)
@@ -346,16 +346,16 @@ class _Search:
                 tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
         return self._moved(self._fitted(min(tried, key=lambda each: each[1])[0]))
 
-    def _moved(self, found: Candidate) -> Candidate:
+    def _moved(self, candidate: Candidate) -> Candidate:
         """With static ends where they really are."""
-        values = found.values
+        values = candidate.values
         if not values.direct or not self.one_end:
-            return found
+            return candidate
         offset = best_offset(self._compressed(values), values, self.wavelength)
         if offset is None:
-            return found
+            return candidate
         moved = self._fitted(replace(values, offset=offset))
-        return moved if moved.nll < found.nll else found
+        return moved if moved.nll < candidate.nll else candidate
 
     def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
@@ -377,13 +377,13 @@ class _Search:
         mirrored = replace(values, sequences=sequences, planes=planes, power=power)
         return self._without_weak(self._fitted(mirrored))
 
-    def _without_weak(self, found: Candidate) -> Candidate:
+    def _without_weak(self, candidate: Candidate) -> Candidate:
         """Without the images that have no power."""
-        values, power = found.values, found.values.power
+        values, power = candidate.values, candidate.values.power
         fixed, varying = (torch.tensor(values.where(name)) for name in ("source", "source_smooth"))
         heard = power[fixed] + power[varying] > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
-            return found
+            return candidate
         silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
         rest = power[[i for i in range(len(power)) if i not in silent]]
         seen = tuple(one for one, has in zip(values.sequences, heard.tolist(), strict=True) if has)
@@ -395,17 +395,17 @@ class _Search:
         parts = self._compressed(values)
         errors = self._crossed(parts, values)
         values, _ = fit_powers(parts, values, SHRINKAGE, 2 * SHORT)
-        found = self._fitted(_strongest(values))
-        return replace(found, errors=np.maximum(found.errors, errors))
+        after = self._fitted(_strongest(values))
+        return replace(after, errors=np.maximum(after.errors, errors))
 
-    def _of_all_ends(self, kept: list[Candidate], known: bool, notes: list[str]) -> None:
+    def _of_all_ends(self, steps: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
-        wide, before = replace(self, groups=thinned(self.every, ENDS, self.settings.rows)), kept[-1]
-        kept.append(wide._fitted(before.values))
-        kept.append(wide._moved(kept[-1]))
+        wide, before = replace(self, groups=thinned(self.every, ENDS, self.settings.rows)), steps[-1]
+        steps.append(wide._fitted(before.values))
+        steps.append(wide._moved(steps[-1]))
         if known and self.settings.directions:
-            kept.append(
-                wide._step(kept[-1], wide._with_tied(kept[-1]), "directions by angles to ends", notes)
+            steps.append(
+                wide._step(steps[-1], wide._with_tied(steps[-1]), "directions by angles to ends", notes)
             )
 
     def _with_tied(self, before: Candidate) -> Candidate:
@@ -443,11 +443,11 @@ class _Search:
         values, gain = drift.with_drift(groups, known, before.values)
         errors = np.zeros((2, 1 + len(DEPTHS)))
         for group, signal in zip(groups, known, strict=True):
-            for found, at in zip(errors, (before.values, values), strict=True):
+            for sums, at in zip(errors, (before.values, values), strict=True):
                 other = disturbance(at, group).to(torch.complex128)
                 given = Conditioned.of(signal + other, group.target)
                 left = [given.left_out_signal(other, rows)[0] for rows in _groupings(group.places)]
-                found += [float(error.abs().square().mean()) / len(groups) for error in left]
+                sums += [float(error.abs().square().mean()) / len(groups) for error in left]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
         after = Candidate(values, worth - gain, errors[1])
         start = replace(before, nll=0.0, errors=errors[0])

@@ -139,8 +139,8 @@ def find_mirrors(
     while len(search.planes) < most and not late():
         scores = search.gains(search.rough, grid, _single(len(grid)), _about).max(1).values
         if not len(search.planes):
-            kept = scores.topk(min(PROMISING, len(grid))).indices
-            grid, scores = grid[kept], scores[kept]
+            top = scores.topk(min(PROMISING, len(grid))).indices
+            grid, scores = grid[top], scores[top]
         moved = [search.moved(start, turn / 2) for start in search.starts(grid, scores)]
         plane, level, gain = max(moved, key=lambda m: m[2])
         if gain < PARAMETERS * worth:
@@ -167,15 +167,15 @@ def candidates(probes: Probes, values: Values, wavelength: float) -> tuple[Tenso
     azimuth = torch.arange(4 * math.ceil(count / 4), dtype=torch.float64)
     turn = math.pi / len(azimuth)
     normals = torch.stack([(azimuth * turn).cos(), (azimuth * turn).sin(), 0 * azimuth], 1)
-    found = []
+    planes = []
     for normal in torch.cat([normals, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)]):
         low, high = (points @ normal).aminmax()
         margin = max(MARGIN * float(high - low), LEAST_MARGIN_M)
         number = min(max(int((float(high - low) + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
         offsets = torch.linspace(float(low) - margin, float(high) + margin, number, dtype=torch.float64)
         offsets = offsets[(offsets - values.middle @ normal).abs() > STEP * wavelength]
-        found.append(torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1))
-    return torch.cat(found), turn
+        planes.append(torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1))
+    return torch.cat(planes), turn
 
 
 def _single(count: int) -> tuple[Reflections, ...]:

@@ -120,5 +120,5 @@ def best_offset(parts: tuple[Compressed, ...], values: Values, wavelength: float
         step = step / 2
         near = torch.tensor([-step, 0.0, step], dtype=torch.float64)
         grid = torch.cartesian_prod(near, near, near)
-    none, found = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
-    return best if math.isfinite(found) and found > none else None
+    none, best_gain = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
+    return best if math.isfinite(best_gain) and best_gain > none else None

@@ -127,19 +127,19 @@ class DirectionalGP(FramedMethod):
             known = np.sort(np.random.default_rng(self.seed).choice(known, MAX_RECEIVERS, replace=False))
         places = data.rx_position[known].astype(np.float64)
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
-        found = Rays.of(places, rays)
-        clusters = triangulate(found, self.seed)
-        seen = torch.from_numpy(clusters.seen(found))
-        kept = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
-        if not len(kept):
+        all_rays = Rays.of(places, rays)
+        clusters = triangulate(all_rays, self.seed)
+        seen = torch.from_numpy(clusters.seen(all_rays))
+        sources = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
+        if not len(sources):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
-        kept = kept[seen[:, kept].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
+        sources = sources[seen[:, sources].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
-        points, covariance = (torch.from_numpy(v)[kept] for v in (clusters.points, clusters.covariance))
+        points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         self.positions = UncertainPositions(points - self.frame.middle, covariance)
-        self.visibility = VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, kept])
+        self.visibility = VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, sources])
         self.rows = self.frame.inside(everything)
         at = {int(row): k for k, row in enumerate(known)}
         self.observer = torch.tensor([at[int(row)] for row in everything.receiver])

@@ -63,9 +63,9 @@ class UncertainPositions:
         slope = wave_vectors(self.points, places, frequency)
         return (slope @ self.lower).to(dtype)
 
-    def only(self, kept: Tensor) -> UncertainPositions:
+    def only(self, index: Tensor) -> UncertainPositions:
         """A subset of the sources."""
-        return UncertainPositions(self.points[kept], self.covariance[kept])
+        return UncertainPositions(self.points[index], self.covariance[index])
 
     def uncertain(self, places: Tensor, frequency: Tensor) -> Tensor:
         """Indices of the sources that are not coherent over these places."""

@@ -60,9 +60,9 @@ class Rays:
     def __len__(self) -> int:
         return len(self.owner)
 
-    def take(self, kept: np.ndarray) -> Rays:
+    def take(self, mask: np.ndarray) -> Rays:
         """A subset, of the same receivers."""
-        return Rays(self.places, self.direction[kept], self.owner[kept])
+        return Rays(self.places, self.direction[mask], self.owner[mask])
 
     def squared_error(self, points: np.ndarray) -> np.ndarray:
         """Squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
@@ -105,10 +105,10 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
     points: list[np.ndarray] = []
     free = np.ones(len(rays), bool)
     for _ in range(ROUNDS):
-        found = _matching_round(rays, free, error, rng)
-        if not found:
+        new = _matching_round(rays, free, error, rng)
+        if not new:
             break
-        points += found
+        points += new
         clusters = expectation_maximisation(rays, np.stack(points), error)
         points, error = list(clusters.points), clusters.error
         free = clusters.responsibility.sum(0) < 0.5
@@ -136,12 +136,12 @@ def expectation_maximisation(rays: Rays, points: np.ndarray, error: float) -> Ra
         points, covariance, responsibility, evidence = (
             v[order] for v in (points, covariance, responsibility, evidence)
         )
-        kept = _distinct(points, covariance)
-        if kept.all():
-            kept = evidence >= MIN_EVIDENCE
-        if kept.all():
+        mask = _distinct(points, covariance)
+        if mask.all():
+            mask = evidence >= MIN_EVIDENCE
+        if mask.all():
             return RayClusters(points, covariance, responsibility, error)
-        points = points[kept]
+        points = points[mask]
 
 
 def _gain(squared_error: np.ndarray, error: float) -> np.ndarray:
@@ -183,12 +183,12 @@ def _steps(
 
 def _distinct(points: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Whether each point (K,) differs from all before it by more than their errors."""
-    kept = np.ones(len(points), bool)
+    mask = np.ones(len(points), bool)
     for k in range(1, len(points)):
         apart = points[:k] - points[k]
         whitened = np.linalg.solve(covariance[:k] + covariance[k], apart[..., None])[..., 0]
-        kept[k] = not bool((((apart * whitened).sum(1) < SAME_SIGMAS**2) & kept[:k]).any())
-    return kept
+        mask[k] = not bool((((apart * whitened).sum(1) < SAME_SIGMAS**2) & mask[:k]).any())
+    return mask
 
 
 def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:
@@ -223,21 +223,21 @@ def _matching_round(rays: Rays, free: np.ndarray, error: float, rng: np.random.G
     if not len(proposed):
         return []
     gain = np.maximum(_gain(left.squared_error(proposed), error), 0).astype(np.float32)
-    score, found, failed = gain.sum(1), [], 0
+    score, points, failed = gain.sum(1), [], 0
     while failed < MAX_FAILURES and score.max() > MIN_EVIDENCE:
         top = int(score.argmax())
         near = left.take(left.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
         point, evidence = _refined(near, proposed[top], error)
         assigned = gain[top] > 0
         if evidence >= MIN_EVIDENCE:
-            found.append(point)
+            points.append(point)
             assigned |= _gain(left.squared_error(point[None])[0], error) > 0
         else:
             failed += 1
         score -= gain[:, assigned].sum(1)
         gain[:, assigned] = 0
         score[top] = 0
-    return found
+    return points
 
 
 def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, most: int) -> np.ndarray:
@@ -247,17 +247,17 @@ def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mos
     if len(owners) < 2:
         return np.zeros((0, 3))
     groups = np.split(order, starts[1:])
-    drawn = rng.integers(len(groups), size=(pairs, 2))
+    couples = rng.integers(len(groups), size=(pairs, 2))
     points = []
-    for a, b in drawn[drawn[:, 0] != drawn[:, 1]]:
+    for a, b in couples[couples[:, 0] != couples[:, 1]]:
         one, two = rays.direction[groups[a]], rays.direction[groups[b]]
         here, there = rays.places[owners[a]], rays.places[owners[b]]
         s, t, gap = closest_approach(here, one, there, two)
         near = gap < 3 * error * np.hypot(s, t)
         i, j = np.nonzero(near)
         points.append((here + s[i, j, None] * one[i] + there + t[i, j, None] * two[j]) / 2)
-    found = np.concatenate([np.zeros((0, 3)), *points])
-    found = found[np.linalg.norm(found - rays.places.mean(0), axis=1) < REACH_M]
-    if len(found) > most:
-        found = found[rng.choice(len(found), most, replace=False)]
-    return found
+    midpoints = np.concatenate([np.zeros((0, 3)), *points])
+    midpoints = midpoints[np.linalg.norm(midpoints - rays.places.mean(0), axis=1) < REACH_M]
+    if len(midpoints) > most:
+        midpoints = midpoints[rng.choice(len(midpoints), most, replace=False)]
+    return midpoints

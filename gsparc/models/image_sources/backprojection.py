@@ -93,8 +93,8 @@ def search_box(
     Each is its place (3,) float64 [m], score () and amplitude (), the best first.
     `spread` gives the images of the static end's antennas, as `score` takes them.
     """
-    drawn = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
-    candidates = box[0] + (box[1] - box[0]) * drawn
+    share = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
+    candidates = box[0] + (box[1] - box[0]) * share
     rough = quick_score(rows, spread(candidates), conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
     exact = torch.cat([score(rows, spread(part), conditioned)[0] for part in candidates.split(512)])

@@ -42,9 +42,9 @@ def element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     conditioned = Posterior(rows, scene).conditioned
     known, run = np.unique(rows.element.numpy(), return_inverse=True)
     inverse = conditioned.factor.inverse.to(torch.complex128).numpy()
-    found = run_factors(inverse, rows.target.to(torch.complex128).numpy(), run)
+    estimate = run_factors(inverse, rows.target.to(torch.complex128).numpy(), run)
     each = np.ones(len(rows.array), np.complex128)
-    each[known] = found / found[0]
+    each[known] = estimate / estimate[0]
     factors = torch.from_numpy(each.astype(np.complex64))
     target = rows.target * factors[rows.element, None]
     scale = target.abs().square().mean().sqrt()  # a common factor is the sources' to have

@@ -72,7 +72,7 @@ def search_many(
         ended = at_noise_floor(errors, noise_floor) or (bool(errors) and beaten(min(errors), rival))
         return stopped.is_set() or ended
 
-    def made(number: int) -> Member:
+    def solve(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
         rows, last_round = row_sets[number], partial(budget.over, ROUNDS_END)
         scene = Search(rows, transmitter, settings, seed + number, last_round).run()
@@ -87,14 +87,14 @@ def search_many(
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if done := cache.find(number, noise_floor):
-            errors.append(done.left_out)
-            return done
+        if member := cache.find(number, noise_floor):
+            errors.append(member.left_out)
+            return member
         if unwanted() or (number > 0 and budget.over(LAST_START)):
             return None
         try:
             with cancelled_by(unwanted), late_when(partial(budget.over, SEARCH_END)):
-                member = made(number)
+                member = solve(number)
         except Cancelled:
             return None
         scene = member.scene
@@ -114,12 +114,12 @@ def search_many(
     try:
         running = [pool.submit(search, number) for number in range(len(row_sets))]
         _watch(running, budget)
-        found = [member for each in running if (member := each.result()) is not None]
+        members = [member for each in running if (member := each.result()) is not None]
     finally:
         stopped.set()
         pool.shutdown(cancel_futures=True)  # waits for the step of each search
         torch.set_num_threads(threads)
-    return sorted(found, key=lambda member: member.left_out)
+    return sorted(members, key=lambda member: member.left_out)
 
 
 def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
@@ -165,16 +165,16 @@ def beaten(error: float, rival: float) -> bool:
     return error > BEATEN * rival
 
 
-def affordable_rows(rows: Rows, found: list[Member], budget: TimeBudget) -> int:
+def affordable_rows(rows: Rows, members: list[Member], budget: TimeBudget) -> int:
     """Rows of final processes that fit into the rest of the budget; all of one search at least.
 
     A covariance of n rows takes n^3; that of a search's rows is timed.
     """
     started = budget.spent
-    assert Posterior(rows, found[0].scene).conditioned
+    assert Posterior(rows, members[0].scene).conditioned
     each = max(budget.spent - started, 1e-6)
     rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
-    return max(int(len(rows) * (rest / (each * len(found))) ** (1 / 3)), len(rows))
+    return max(int(len(rows) * (rest / (each * len(members))) ** (1 / 3)), len(rows))
 
 
 def ensemble_weights(members: list[Member]) -> Tensor:

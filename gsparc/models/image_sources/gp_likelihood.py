@@ -62,12 +62,12 @@ class CircularGains:
     def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """Derivatives (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
         real, imag = slope.real.contiguous(), slope.imag.contiguous()
-        found = torch.empty_like(scaled)
+        slopes = torch.empty_like(scaled)
         for k, one in enumerate(correlation):
             pair = torch.stack([scaled[:, k].real, scaled[:, k].imag], 1)
             a, b = (real * one) @ pair, (imag * one) @ pair
-            found[:, k] = torch.complex(a[:, 0] - b[:, 1], a[:, 1] + b[:, 0])
-        return 2 * found
+            slopes[:, k] = torch.complex(a[:, 0] - b[:, 1], a[:, 1] + b[:, 0])
+        return 2 * slopes
 
     def by_noise(self, slope: Tensor) -> Tensor:
         """The derivative () by the variance of the noise."""
@@ -113,14 +113,14 @@ class PhasedGains(CircularGains):
 
     def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """See `CircularGains`."""
-        n, found = len(scaled), torch.empty_like(scaled)
+        n, slopes = len(scaled), torch.empty_like(scaled)
         blocks = slope.view(2, n, 2, n)
         for k, one in enumerate(correlation):
             pair = torch.stack(stacked(scaled[:, k]), 1) * shares(self.quadrature)
             by = (blocks * one[None, :, None, :]).view(2 * n, 2 * n) @ pair
             # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
-            found[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
-        return found
+            slopes[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
+        return slopes
 
     def by_noise(self, slope: Tensor) -> Tensor:
         """See `CircularGains`."""
@@ -152,10 +152,10 @@ class Posterior:
 
     @cached_property
     def _summed(self) -> CircularGains:
-        found, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
+        gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
-            found.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
-        return found
+            gains.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
+        return gains
 
     @cached_property
     def conditioned(self) -> Conditioned:

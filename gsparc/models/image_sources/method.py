@@ -149,22 +149,22 @@ class ImageSourceGP(FramedMethod):
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
         row_sets = self._row_sets(data, known, self.searches)
-        found = self._search(row_sets, self.settings, budget, self.clutter, cache)
+        members = self._search(row_sets, self.settings, budget, self.clutter, cache)
         if calibrated:
-            again = self._calibrated(data, row_sets[found[0].number], found[0].scene)
+            again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known, self.searches)
-                found = [refined(row_sets[one.number], one) for one in found]
-        self.weights = ensemble_weights(found)
+                members = [refined(row_sets[one.number], one) for one in members]
+        self.weights = ensemble_weights(members)
         rows = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-        affordable = affordable_rows(row_sets[0], found, budget)
+        affordable = affordable_rows(row_sets[0], members, budget)
         if affordable < len(rows):
             budget.limited = True
             notes.append(f"{self.name}: {affordable} of {len(rows)} rows in the final process: time is short")
             rows = rows.take(torch.linspace(0, len(rows) - 1, affordable).long())
-        self._conditioned(rows, [member.scene for member in found])
-        self.held = self._left_out_rows(data, known, found, len(rows))
-        notes += self._described(found, budget)
+        self._conditioned(rows, [member.scene for member in members])
+        self.held = self._left_out_rows(data, known, members, len(rows))
+        notes += self._described(members, budget)
         limited = less_repeatable(budget.limited_by, cache.limited_by)
         return FitReport(budget.counted.wall, tuple(notes), limited)
 
@@ -173,16 +173,16 @@ class ImageSourceGP(FramedMethod):
         self.members = [Posterior(rows, scene) for scene in scenes]
         self.query = Query(self.members)
 
-    def _described(self, found: list[Member], budget: TimeBudget) -> list[str]:
+    def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
         scene, notes = self.members[0].scene, []
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
-        agree = at_noise_floor([member.left_out for member in found], self.noise_floor)
+        agree = at_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
-        if beaten(min(member.left_out for member in found), self._rival):
+        if beaten(min(member.left_out for member in members), self._rival):
             ended = "far behind another solution"
         ended += ", ended by the time budget" if budget.limited else ""
-        notes.append(f"{len(found)} of {self.searches} searches ({ended}), {counts} sources")
+        notes.append(f"{len(members)} of {self.searches} searches ({ended}), {counts} sources")
         inside = int(scatterers(scene.sources, box_of(self.members[0].rows, scene.transmitter)).sum())
         notes.append(f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers")
         clutter = scene.clutter
@@ -229,26 +229,26 @@ class ImageSourceGP(FramedMethod):
 
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
         """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""
-        parts = [gather(data, self._seen(known, i), self.search_rows, self.seed + i) for i in range(count)]
+        parts = [gather(data, self._rows_of(known, i), self.search_rows, self.seed + i) for i in range(count)]
         return [self.frame.inside(part) for part in parts]
 
-    def _seen(self, known: np.ndarray, number: int) -> np.ndarray:
+    def _rows_of(self, known: np.ndarray, number: int) -> np.ndarray:
         """The rows of a search by its number."""
         groups = self._groups
         return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
 
     def _left_out_rows(
-        self, data: Measurements, known: np.ndarray, found: list[Member], most: int
+        self, data: Measurements, known: np.ndarray, all_members: list[Member], most: int
     ) -> LeftOutRows | None:
         """Rows of every group predicted by the searches that left it out, from at most `most` others."""
         if not self._groups:
             return None
         rows, means = [], []
         for turn, group in enumerate(self._groups):
-            members = [one for one in found if one.number % len(self._groups) == turn]
+            members = [one for one in all_members if one.number % len(self._groups) == turn]
             if not members:
                 continue
-            apart = self.frame.inside(gather(data, self._seen(known, turn), most, self.seed))
+            apart = self.frame.inside(gather(data, self._rows_of(known, turn), most, self.seed))
             twin = copy.copy(self)
             twin._conditioned(apart, [member.scene for member in members])
             twin.weights = ensemble_weights(members)
@@ -294,11 +294,11 @@ class ImageSourceGP(FramedMethod):
         predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
         mask = None if data.mask is None else data.mask[known]
         carrier = self.frame.carrier_hz
-        found = estimate(
+        offsets = estimate(
             data.target[known], predicted, frequency, carrier, self.offsets == "phase_timing", mask
         )
         target = data.target.copy()
-        target[known] = found.removed(data.target[known], frequency, carrier)
+        target[known] = offsets.removed(data.target[known], frequency, carrier)
         return replace(data, target=target)
 
     # ---- predicting ----
@@ -402,5 +402,5 @@ class ImageSourceGP(FramedMethod):
 def _loudest(member: Posterior, share: float, contribution: Tensor) -> Posterior:
     """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
     count = max(1, math.ceil(share * len(contribution)))
-    kept = sorted({0, *contribution.topk(count).indices.tolist()})
-    return Posterior(member.rows, member.scene.only(kept))
+    loudest = sorted({0, *contribution.topk(count).indices.tolist()})
+    return Posterior(member.rows, member.scene.only(loudest))

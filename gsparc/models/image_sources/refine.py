@@ -116,10 +116,10 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
     optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=(0.8, 0.95))
 
     def current() -> Scene:
-        found = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
+        trial = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
         if scene.quadrature == 1:
-            return found
-        return replace(found, quadrature=float(torch.sigmoid(value.detach()[3])))
+            return trial
+        return replace(trial, quadrature=float(torch.sigmoid(value.detach()[3])))
 
     for _ in range(steps):
         if late():

@@ -58,14 +58,14 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     )
     if distance[int(strength.argmax())].min() > tolerance:
         return None
-    sequences, kept = list(scene.sequences), set(range(len(scene.sequences)))
+    sequences, numbers = list(scene.sequences), set(range(len(scene.sequences)))
     for row, i in enumerate(users):
         candidate = candidates[nearest[row]]
         if distance[row].min() < tolerance and candidate not in sequences:
             sequences[i] = candidate
         else:
-            kept.discard(i)
-    return replace(scene, sequences=tuple(sequences)).only(sorted(kept))
+            numbers.discard(i)
+    return replace(scene, sequences=tuple(sequences)).only(sorted(numbers))
 
 
 def _distances(scene: Scene, sequences: list[Reflections], places: Tensor, per_reflection: float) -> Tensor:
@@ -167,23 +167,23 @@ def reassign(scene: Scene, walls: Tensor) -> Scene:
     base = replace(scene, planes=walls)
     candidates = all_sequences(list(range(len(walls))), 3)
     distance = _distances(base, candidates, sources, 1.5 * LENGTH_PENALTY_M)
-    planes, kept, taken = [*walls], [0], set()
+    planes, ids, assigned = [*walls], [0], set()
     sequences: list[Reflections] = [()]
     for i in range(1, len(sources)):
         near = [j for j in distance[i].argsort()[:6].tolist() if distance[i, j] < tolerance[i]]
-        free = next((candidates[j] for j in near if candidates[j] not in taken), None)
+        free = next((candidates[j] for j in near if candidates[j] not in assigned), None)
         if free is not None:
-            taken.add(free)
+            assigned.add(free)
             sequences.append(free)
-            kept.append(i)
+            ids.append(i)
         elif not near:  # else a duplicate of an assigned source
             planes.append(bisector(sources[0], sources[i]))
             sequences.append((len(planes) - 1,))
-            kept.append(i)
+            ids.append(i)
     explained = replace(
-        scene, planes=torch.stack(planes), sequences=tuple(sequences), log_amplitude=scene.log_amplitude[kept]
+        scene, planes=torch.stack(planes), sequences=tuple(sequences), log_amplitude=scene.log_amplitude[ids]
     )
-    return explained.only(list(range(len(kept))))
+    return explained.only(list(range(len(ids))))
 
 
 def prune(rows: Rows, scene: Scene, least: float) -> Scene:
@@ -192,16 +192,16 @@ def prune(rows: Rows, scene: Scene, least: float) -> Scene:
     weakest_first: list[Reflections] = sorted(
         scene.sequences[1:], key=lambda sequence: float(scene.log_amplitude[scene.sequences.index(sequence)])
     )
-    kept = set(range(len(scene.sequences)))
+    indices = set(range(len(scene.sequences)))
     for sequence in weakest_first:
         if late():
             break
         i = scene.sequences.index(sequence)
-        sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in sequence)
-        current = scene.only(sorted(kept))
-        position = sorted(kept).index(i)
+        sole_user = any(sum(index in scene.sequences[j] for j in indices) == 1 for index in sequence)
+        current = scene.only(sorted(indices))
+        position = sorted(indices).index(i)
         if posterior.without(position) - posterior.nll < (2 * least if sole_user else least):
-            kept.discard(i)
-            current = scene.only(sorted(kept))
+            indices.discard(i)
+            current = scene.only(sorted(indices))
             posterior = Posterior(rows, current)
-    return scene.only(sorted(kept))
+    return scene.only(sorted(indices))

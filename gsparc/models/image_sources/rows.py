@@ -108,13 +108,13 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
         index = index[np.sort(rng.permutation(len(index))[:limit])]
     places = measured_places(data, index)
     per = places.shape[1]
-    drawn = min(max(limit // max(len(index), 1), 1), per)
-    wanted = min(max(limit // max(len(index) * drawn, 1), 1), tones)
+    most = min(max(limit // max(len(index), 1), 1), per)
+    wanted = min(max(limit // max(len(index) * most, 1), 1), tones)
     position, tone, target, receiver, element = [], [], [], [], []
     for row, place in zip(index, places, strict=True):
         values = data.target[row]  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
-        for e in np.sort(rng.permutation(per)[:drawn]) if drawn < per else range(per):
+        for e in np.sort(rng.permutation(per)[:most]) if most < per else range(per):
             known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(known))
             if count == 0:

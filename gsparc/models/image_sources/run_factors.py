@@ -60,13 +60,13 @@ class RunFactors:
         """The same (B, 1, 1) in the dtype and on the device of channels."""
         return self.of(run).to(mean.device)[:, None, None].to(mean.dtype)
 
-    def restored(self, found: P, run: Tensor | None) -> P:
+    def restored(self, answer: P, run: Tensor | None) -> P:
         """A prediction for the largest run in the phase and level of rows of runs (B,)."""
         if run is None or len(self) == 1:
-            return found
-        level = self.of(run).to(found.mean.device).abs().square().float()
-        variance = None if found.variance is None else found.variance * level
-        return replace(found, mean=found.mean * self.factor(found.mean, run), variance=variance)
+            return answer
+        level = self.of(run).to(answer.mean.device).abs().square().float()
+        variance = None if answer.variance is None else answer.variance * level
+        return replace(answer, mean=answer.mean * self.factor(answer.mean, run), variance=variance)
 
     def aligned(self, data: Measurements) -> Measurements:
         """The channels in the phase and level of the largest run, as of one run."""

@@ -101,18 +101,18 @@ class Scene:
             self, sequences=(*self.sequences, *sequences), log_amplitude=log_amplitude, phase=phase
         )
 
-    def only(self, kept: list[int], planes: Iterable[int] = ()) -> Scene:
+    def only(self, indices: list[int], planes: Iterable[int] = ()) -> Scene:
         """The sources of these indices, and the planes that they use, or that are named."""
-        sequences = [self.sequences[i] for i in kept]
+        sequences = [self.sequences[i] for i in indices]
         used = sorted({index for sequence in sequences for index in sequence}.union(planes))
         new = {old: i for i, old in enumerate(used)}
         return replace(
             self,
             planes=self.planes[used],
             sequences=tuple(tuple(new[index] for index in sequence) for sequence in sequences),
-            log_amplitude=self.log_amplitude[kept],
+            log_amplitude=self.log_amplitude[indices],
             clutter=self.clutter.renamed(new),
-            phase=None if self.phase is None else self.phase[kept],
+            phase=None if self.phase is None else self.phase[indices],
         )
 
     def state(self) -> dict[str, Any]:

@@ -170,12 +170,12 @@ class Search:
             if number and late():
                 break
             spread = partial(self._spread, parent)
-            found = search_box(
+            sources = search_box(
                 self.rows, posterior.conditioned, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
                 self.generator, spread,
             )  # fmt: skip
             added = 0
-            for position, gained, amplitude in found:
+            for position, gained, amplitude in sources:
                 if gained < FREE_SCORE:
                     continue
                 sequence, plane = self._parent(position, posterior)
@@ -212,8 +212,8 @@ class Search:
         mirrored = reflect(scene.sources[None], planes[:, None])  # (parents, K, 3)
         flat = mirrored.flatten(0, 1)
         candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
-        taken = torch.cat([scene.sources, position[None]])
-        new = torch.cdist(flat, taken).amin(1) > 0.5 * self.wavelength
+        sources = torch.cat([scene.sources, position[None]])
+        new = torch.cdist(flat, sources).amin(1) > 0.5 * self.wavelength
         scores = score(self.rows, candidates, posterior.conditioned)[0].reshape(mirrored.shape[:2])
         order = torch.tensor([len(scene.sequences[i]) for i in able])
         gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order

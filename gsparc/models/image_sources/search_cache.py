@@ -59,7 +59,7 @@ class SearchCache:
     ) -> None:  # fmt: skip
         self._path = None if folder is None or folder == Path() else folder / FILE
         self._depends_on = dict(depends_on or {})
-        self._kept: dict[str, dict[str, Any]] = {}
+        self._searches: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
         self.spent = NOTHING
         self.limited_by: Clock | None = None
@@ -70,8 +70,8 @@ class SearchCache:
     def _open(self, file: Path) -> None:
         try:
             stored = torch.load(stored_archive(file), weights_only=True)
-            before, kept, wall = dict(stored["depends_on"]), dict(stored[SEARCHES]), float(stored["spent_s"])
-            spent = Spent(wall, float(stored["processor_s"]))
+            before, wall = dict(stored["depends_on"]), float(stored["spent_s"])
+            searches, spent = dict(stored[SEARCHES]), Spent(wall, float(stored["processor_s"]))
         except Exception as error:  # any error of a damaged or foreign file
             raise ValueError(
                 f"ckpt_path={file}: holds no finished searches ({type(error).__name__}); start without it"
@@ -79,22 +79,22 @@ class SearchCache:
         other = [name for name, value in self._depends_on.items() if before.get(name) != value]
         if other:
             raise ValueError(f"ckpt_path={file}: is of other {', '.join(other)}; start without it")
-        self._kept, self.spent, self.limited_by = kept, spent, stored.get("limited_by")
-        log.info("reusing %d cached searches (%.0f s of training time)", len(kept), wall)
+        self._searches, self.spent, self.limited_by = searches, spent, stored.get("limited_by")
+        log.info("reusing %d cached searches (%.0f s of training time)", len(searches), wall)
 
     def find(self, number: int, noise_floor: float) -> Member | None:
         """The finished search of this number, or None."""
         with self._lock:
-            kept = self._kept.get(f"search {number}")
-        if kept is None:
+            search = self._searches.get(f"search {number}")
+        if search is None:
             return None
-        return Member(Scene.from_state(kept["scene"], noise_floor), kept["left_out"], number)
+        return Member(Scene.from_state(search["scene"], noise_floor), search["left_out"], number)
 
     def put(self, member: Member, limited_by: Clock | None) -> None:
         """Store a finished search, and what has ended one so far; the file is written atomically."""
         with self._lock:
             self.limited_by = less_repeatable(self.limited_by, limited_by)
-            self._kept[f"search {member.number}"] = {
+            self._searches[f"search {member.number}"] = {
                 "scene": member.scene.state(),
                 "left_out": member.left_out,
             }
@@ -106,7 +106,7 @@ class SearchCache:
             if self._path is None:
                 return "the search was interrupted; it has no folder to leave a checkpoint in"
             self._write()
-            count = len(self._kept)
+            count = len(self._searches)
         return f"the search was interrupted, {count} finished; go on with ckpt_path={self._path}"
 
     def _write(self) -> None:
@@ -116,4 +116,4 @@ class SearchCache:
         facts = {"spent_s": spent.wall, "processor_s": spent.processor, "limited_by": self.limited_by}
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(self._path) as partial, partial.open("wb") as file:
-            torch.save({"depends_on": self._depends_on, **facts, SEARCHES: self._kept}, file)
+            torch.save({"depends_on": self._depends_on, **facts, SEARCHES: self._searches}, file)

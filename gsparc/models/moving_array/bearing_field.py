@@ -74,9 +74,9 @@ class BearingField(MethodField):
     def _powers(self, index: np.ndarray, where: Tensor) -> list[Tensor]:
         """Powers (B, K) per search that the others predict of rows (B,) at places (B, 3) [m]."""
         order = np.argsort(self.rows)
-        found = np.searchsorted(self.rows, index, sorter=order).clip(max=len(order) - 1)
-        position = torch.from_numpy(order[found])
-        known = torch.from_numpy(self.rows[order[found]] == index)[:, None]
+        slot = np.searchsorted(self.rows, index, sorter=order).clip(max=len(order) - 1)
+        position = torch.from_numpy(order[slot])
+        known = torch.from_numpy(self.rows[order[slot]] == index)[:, None]
         far = torch.cdist(where, torch.from_numpy(self.method.positions).float())
         pairs = zip(self.method.trends, self.method.left_powers, strict=True)
         return [torch.where(known, left[position], trend.powers(far)) for trend, left in pairs]

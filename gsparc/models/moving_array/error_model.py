@@ -117,8 +117,8 @@ def fit_error_model(
     """
     errors = relative_error.clamp(MIN_ERROR, MAX_ERROR).log()
     distance, rows = (
-        torch.from_numpy(found)
-        for found in cKDTree(places).query(places, k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))
+        torch.from_numpy(part)
+        for part in cKDTree(places).query(places, k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))
     )
     distance, others = distance.float()[:, 1:], rows[:, 1:]  # a row is not its own neighbour
     known = torch.from_numpy(places)

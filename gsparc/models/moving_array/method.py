@@ -286,11 +286,11 @@ class MovingArrayField(Differentiable):
         relative, features, errors = [], [], []
         for start, image in zip(range(0, len(targets), BLOCK), self._blocks(targets), strict=True):
             part = slice(start, start + BLOCK)
-            found = self.basis.images(self._left[part]).clamp_(0, 1)
-            error = (found - image).square().mean((1, 2))
+            images = self.basis.images(self._left[part]).clamp_(0, 1)
+            error = (images - image).square().mean((1, 2))
             relative.append(error / image.square().mean((1, 2)).clamp_min(1e-12))
             errors.append(error)
-            features.append(image_features(found, energy[part]))
+            features.append(image_features(images, energy[part]))
         # two images drawn at random differ by twice the variance
         prior = 2 * float((spectra.values - spectra.values.mean(0)).square().mean(0).sum()) / targets[0].size
         self.error_model = fit_error_model(
@@ -311,19 +311,19 @@ class MovingArrayField(Differentiable):
         return self._posterior(self.where(tx, rx), tx.dtype)
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
-        found = self._posterior(queries, dtype)
-        return Prediction(found.mean, 1 - found.unknown, found.variance)
+        posterior = self._posterior(queries, dtype)
+        return Prediction(posterior.mean, 1 - posterior.unknown, posterior.variance)
 
     def _posterior(self, where: Tensor, dtype: torch.dtype) -> Posterior:
         query, errors = self.query(), self.error_model
         if dtype == torch.float64:
             query, errors = query.exact, in_double(errors)
-        found = query(where)
-        mean = found.image.clamp_(0, 1)
-        features = image_features(mean, found.added / mean[0].numel())
+        answer = query(where)
+        mean = answer.image.clamp_(0, 1)
+        features = image_features(mean, answer.added / mean[0].numel())
         power = mean.flatten(1).square().mean(1)
-        unknown, variance = errors.expected(found.far, features, power)
-        return Posterior(mean, variance, found.explained.clamp(0, 1), unknown)
+        unknown, variance = errors.expected(answer.far, features, power)
+        return Posterior(mean, variance, answer.explained.clamp(0, 1), unknown)
 
     def where(self, tx: Tensor, rx: Pose) -> Tensor:
         """Receivers' places (B, 3) float64 [m]; `ValueError` before `fit` or `restore`."""

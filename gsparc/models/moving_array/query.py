@@ -51,12 +51,12 @@ class Array:
 
     def render(self, sources: Tensor, receivers: Tensor, power: Tensor, least: float = 0.0) -> Tensor:
         """Images (n, H, W) of sources of powers (n, K), pixels of power at least `least`."""
-        found = self.space.spectrum(mixture(power, self.atoms(sources, receivers)), self._pixels)
-        found = found.clamp_min(least) if least else found
-        if self.exponent == 1 or not followed(found):
-            return found if self.exponent == 1 else found.sqrt()
-        bright = found > 0  # at 0 a root has no slope
-        return torch.where(bright, torch.where(bright, found, 1.0).sqrt(), 0.0)
+        images = self.space.spectrum(mixture(power, self.atoms(sources, receivers)), self._pixels)
+        images = images.clamp_min(least) if least else images
+        if self.exponent == 1 or not followed(images):
+            return images if self.exponent == 1 else images.sqrt()
+        bright = images > 0  # at 0 a root has no slope
+        return torch.where(bright, torch.where(bright, images, 1.0).sqrt(), 0.0)
 
 
 class Found(NamedTuple):

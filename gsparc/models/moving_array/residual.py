@@ -61,10 +61,10 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
     predicted = centred - missed
     energy, axes = principal(predicted, limit)
     left_out = (predicted**2).sum() - energy.sum() + energy[::-1].cumsum()[::-1] - energy
-    kept = axes[: 1 + int((left_out > SPARED * (missed**2).sum()).sum())]
-    turned = torch.from_numpy(weights @ kept.T).float().contiguous()
-    residual = Residual(kernel, mean, torch.from_numpy(kept).float().contiguous(), turned)
-    return residual, torch.addmm(mean, torch.from_numpy(predicted @ kept.T).float(), residual.axes)
+    basis = axes[: 1 + int((left_out > SPARED * (missed**2).sum()).sum())]
+    turned = torch.from_numpy(weights @ basis.T).float().contiguous()
+    residual = Residual(kernel, mean, torch.from_numpy(basis).float().contiguous(), turned)
+    return residual, torch.addmm(mean, torch.from_numpy(predicted @ basis.T).float(), residual.axes)
 
 
 def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:

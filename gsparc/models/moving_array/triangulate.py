@@ -64,15 +64,15 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     gram = atoms @ atoms.mT
     gram.diagonal(dim1=-2, dim2=-1).add_(ridge)
     correlation = (atoms @ lags[..., None])[..., 0]
-    found = torch.linalg.solve(gram, correlation).clamp_(min=0)
-    slope = (gram @ found[..., None])[..., 0] - correlation
+    power = torch.linalg.solve(gram, correlation).clamp_(min=0)
+    slope = (gram @ power[..., None])[..., 0] - correlation
     curvature = gram.diagonal(dim1=-2, dim2=-1)
     for _ in range(SWEEPS):
-        for k in range(found.shape[1]):
-            step = (found[:, k] - slope[:, k] / curvature[:, k]).clamp_(min=0) - found[:, k]
-            found[:, k] += step
+        for k in range(power.shape[1]):
+            step = (power[:, k] - slope[:, k] / curvature[:, k]).clamp_(min=0) - power[:, k]
+            power[:, k] += step
             slope += step[:, None] * gram[:, k]
-    return found
+    return power
 
 
 def mixture(power: Tensor, atoms: Tensor) -> Tensor:
@@ -105,45 +105,45 @@ def find_sources(
         seconds: that are left [s]; sources are added for a part of them, and the schedule of the refinement
             ends with them.
     """
-    given = seconds()
-    end = REFINED * given if given < math.inf else 0.0
+    limit_s = seconds()
+    end = REFINED * limit_s if limit_s < math.inf else 0.0
     generator = torch.Generator().manual_seed(seed)
     low, high = receivers.min(0).values, receivers.max(0).values
     far = settings.reach * float((high - low).norm())
     low, high = low - far, high + far
     known = torch.empty(0, 3) if first is None else first.reshape(1, 3).float()
 
-    def left(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
+    def residual_of(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Residual lags (n, Q) of sources of the best powers."""
         atoms = space.atoms(bearings(sources, receivers, rotation))
         return lags - mixture(powers(lags, atoms, settings.ridge), atoms)
 
-    found, residual = known, left(lags, receivers, known) if len(known) else lags
+    positions, residual = known, residual_of(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())
-    while len(found) < settings.sources:
+    while len(positions) < settings.sources:
         candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
         amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
         new = _best(candidates, amplitude, receivers, rotation, grid, settings)
         if not len(new):
             break
-        found = torch.cat([found, new[: settings.sources - len(found)]])
-        residual = left(lags, receivers, found)
+        positions = torch.cat([positions, new[: settings.sources - len(positions)]])
+        residual = residual_of(lags, receivers, positions)
         before, energy = energy, float(residual.square().sum())
         if energy > (1 - settings.least_gain) * before or seconds() <= end:
             break
-    if settings.steps == 0 or len(found) == len(known):
-        return found
+    if settings.steps == 0 or len(positions) == len(known):
+        return positions
     # Powers are optimal at every step, so that their derivative does not enter the gradient.
-    free = found[len(known) :].clone().requires_grad_(True)
+    free = positions[len(known) :].clone().requires_grad_(True)
     optimiser = torch.optim.Adam([free], lr=settings.rate)
     whole = seconds()
     for step in range(settings.steps):
-        done = max(step / settings.steps, 1 - seconds() / whole if 0 < whole < math.inf else 0.0)
-        if done >= 1 or whole <= 0:
+        progress = max(step / settings.steps, 1 - seconds() / whole if 0 < whole < math.inf else 0.0)
+        if progress >= 1 or whole <= 0:
             break
-        optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * done)) / 2
+        optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         some = torch.randperm(len(receivers), generator=generator)[:64]
-        residual = left(lags[some], receivers[some], torch.cat([known, free]))
+        residual = residual_of(lags[some], receivers[some], torch.cat([known, free]))
         loss = residual.square().sum() / lags[some].square().sum()
         optimiser.zero_grad()
         loss.backward()

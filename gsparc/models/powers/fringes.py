@@ -180,7 +180,7 @@ def find_fringes(
     """
     own = TimeBudget(SECONDS, "processor")
     chosen = draw(rows.silent, MOST_ROWS, seed)
-    drawn = f" (of {len(chosen)} of {len(rows.places)} rows)" if len(chosen) < len(rows.places) else ""
+    tail = f" (of {len(chosen)} of {len(rows.places)} rows)" if len(chosen) < len(rows.places) else ""
     rows, numbers = rows.at(chosen), numbers[chosen]
     count, level = len(chosen), 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
     basis = basis_of(rows.places, wavelength)
@@ -206,10 +206,10 @@ def find_fringes(
         if len(weights) >= TRIED and not gain.exceeds(0.0):
             break
     if fringes is None or gain is None or not gain.exceeds(0.0):
-        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{drawn}"
+        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{tail}"
     share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
     note = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
-    return fringes, f"{note} between rows and a block away, the process the rest{drawn}"
+    return fringes, f"{note} between rows and a block away, the process the rest{tail}"
 
 
 def _held_out_mean(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:

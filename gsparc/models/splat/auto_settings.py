@@ -48,9 +48,9 @@ def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choice
     emission, spectra, static = settings.emission, site.kind == "spectrum", site.static_end == "rx"
     notes: list[str] = []
 
-    def decide(name: str, given: str, choice: str, reason: str) -> str:
-        if given != AUTO:
-            return given
+    def decide(name: str, setting: str, choice: str, reason: str) -> str:
+        if setting != AUTO:
+            return setting
         notes.append(f"{name}=auto -> {choice}: {reason}")
         return choice
 

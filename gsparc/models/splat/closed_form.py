@@ -169,8 +169,8 @@ def _errors(seen: Seen, inverse: Tensor, noise: float, mean: Tensor) -> tuple[fl
     """
     residual, variance = left_out(inverse, inverse @ (seen.outputs - mean))
     unknown = (variance - noise).clamp(0, 1)
-    shown = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
-    error = torch.cat([(image - seen.images).square().mean(1) for image in shown])
+    images = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
+    error = torch.cat([(image - seen.images).square().mean(1) for image in images])
     return fit_errors(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
 
 

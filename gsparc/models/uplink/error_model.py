@@ -39,23 +39,23 @@ def error_features(result: SearchResult, mean: Tensor, aperture: Aperture) -> Te
     Noise, misfit, posterior variance, variance by delays alone (which saturates), cancellation, number and
     delay spread of the sources, variance of their gains, fading depth at the aperture, and its size.
     """
-    found = result.sources
+    sources = result.sources
     power = result.uplink.abs().square().mean((1, 2)).clamp_min(1e-30)
-    strength = found.gain.abs().square()
+    strength = sources.gain.abs().square()
     total = strength.sum(1).clamp_min(1e-30)
     turns = 2 * math.pi * aperture.tones.abs().max()
-    delay_error = (strength * (1 - torch.exp(-(turns**2) * found.delay_variance))).sum(1)
-    gain_variance = found.variance.sum(1)
+    delay_error = (strength * (1 - torch.exp(-(turns**2) * sources.delay_variance))).sum(1)
+    gain_variance = sources.variance.sum(1)
     share = strength / total[:, None]
-    middle = (share * found.delay).sum(1, keepdim=True)
+    middle = (share * sources.delay).sum(1, keepdim=True)
     columns = [
         result.noise / power,
         result.residual.abs().square().mean((1, 2)) / result.noise.clamp_min(1e-30),
-        found.error_variance(aperture) / power,
+        sources.error_variance(aperture) / power,
         (delay_error + gain_variance) / power,
         total / power,
         1 / share.square().sum(1),
-        (share * (found.delay - middle) ** 2).sum(1).sqrt(),
+        (share * (sources.delay - middle) ** 2).sum(1).sqrt(),
         gain_variance / power,
         mean.abs().square().mean((1, 2)) / power,
         torch.full_like(power, mean[0].numel()),

@@ -146,11 +146,11 @@ class UplinkField(UplinkMethod):
         parts = [
             self.search(straight[i : i + CHUNK], noise[i : i + CHUNK]) for i in range(0, len(uplink), CHUNK)
         ]
-        found, left = parts[0]
+        sources, left = parts[0]
         if len(parts) > 1:
-            found = Sources(*(torch.cat([getattr(p, name) for p, _ in parts]) for name in vars(found)))
+            sources = Sources(*(torch.cat([getattr(p, name) for p, _ in parts]) for name in vars(sources)))
             left = torch.cat([rest for _, rest in parts])
-        return SearchResult(replace(found, delay=found.delay + mean[:, None]), left, uplink, noise)
+        return SearchResult(replace(sources, delay=sources.delay + mean[:, None]), left, uplink, noise)
 
     def _prepare(self, site: Site, settings: SearchSettings) -> None:
         assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None

@@ -243,6 +243,6 @@ def _grid(aperture: Aperture, s: SearchSettings) -> tuple[Tensor, Tensor, tuple[
         cells = max(1, round(2 * s.oversampling * (extent * 2 + 1) / 2)) if extent > 1e-6 else 1
         axes.append((torch.arange(cells) + 0.5) / cells * 2 - 1)
     step = 1 / (len(aperture.tones) * s.oversampling)
-    found = torch.arange(s.delay_window[0], s.delay_window[1], step)
+    delay_grid = torch.arange(s.delay_window[0], s.delay_window[1], step)
     cosines = torch.cartesian_prod(*axes)
-    return cosines, found, (len(axes[0]), len(axes[1]), len(found))
+    return cosines, delay_grid, (len(axes[0]), len(axes[1]), len(delay_grid))

@@ -27,17 +27,17 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
         ValueError: another model.
     """
     site = predictor.site
-    found = located_paths(predictor, place) if site.static_position is not None else None
-    if found is None or found.direction is None:
+    paths = located_paths(predictor, place) if site.static_position is not None else None
+    if paths is None or paths.direction is None:
         raise ValueError("to=deepmimo: channels made of paths, of a static end at a known place, are needed")
     still = np.asarray(site.static_position, np.float64) + site.origin
-    power = np.square(np.abs(found.gain[:, 0].astype(np.complex128)))
+    power = np.square(np.abs(paths.gain[:, 0].astype(np.complex128)))
     order = np.argsort(-power, axis=1)[:, :PATHS]
 
     def top(value: np.ndarray) -> np.ndarray:
         return np.take_along_axis(value, order.reshape(order.shape + (1,) * (value.ndim - 2)), 1)
 
-    strongest, towards, delay = top(power), top(found.direction), top(found.delay_s[:, 0])
+    strongest, towards, delay = top(power), top(paths.direction), top(paths.delay_s[:, 0])
     away = LIGHT * delay[..., None] * towards  # from a place to the source
     normal = place[:, None] + away - still
     apart = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -51,7 +51,7 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
     silent = strongest <= 0
     arrays = {
         "power": 10 * np.log10(np.where(silent, np.nan, strongest)), "delay": delay,
-        "phase": np.degrees(np.angle(top(found.gain[:, 0]))), "inter": np.where(direct, 0.0, 1.0),
+        "phase": np.degrees(np.angle(top(paths.gain[:, 0]))), "inter": np.where(direct, 0.0, 1.0),
         "inter_pos": meets[:, :, None],
     }  # fmt: skip
     for name, one in (("aoa", towards), ("aod", leaves)):
@@ -63,7 +63,7 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
         np.savez_compressed(folder / f"{name}_t000_tx000_r001.npz", **{name: value.astype(np.float32)})
     np.savez_compressed(folder / "vertices.npz", vertices=np.zeros((0, 3), np.float32))
     (folder / "objects.json").write_text("[]")
-    (folder / "params.json").write_text(json.dumps(_parameters(found.reference_hz, place, silent), indent=1))
+    (folder / "params.json").write_text(json.dumps(_parameters(paths.reference_hz, place, silent), indent=1))
     return int((~silent).sum(1).max()), float(1 - strongest.sum() / max(power.sum(), 1e-300))
 
 

@@ -133,13 +133,13 @@ def _sionna_rk(folder: Path, symbols: int) -> Reading:
         (not all(np.isfinite(rows[name]).all() for name in ("norm", "taps")), "a value that is no number"),
         ((off & (rows["norm"] > 0)).any(), "taps whose norm is not 1, which are played as they are"),
     )  # fmt: skip
-    refused = tuple(said for fault, said in faults if fault)
+    refused = tuple(message for fault, message in faults if fault)
     return Reading(f"{count} OFDM symbols of {taps} taps, {count // symbols} slots", refused)
 
 
 def _vrtsim(folder: Path) -> Reading:
     text = read_yaml(folder / "vrtsim.yaml", "vrtsim reads it beside cir_db.bin", "a list called entries")
-    raw, refused, shown = (folder / "cir_db.bin").read_bytes(), list[str](), list[str]()
+    raw, refused, summary = (folder / "cir_db.bin").read_bytes(), list[str](), list[str]()
     entries = text.get("entries")
     for number, one in enumerate(entries if isinstance(entries, list) else []):
         try:
@@ -150,7 +150,7 @@ def _vrtsim(folder: Path) -> Reading:
         except (ValueError, KeyError, TypeError, AttributeError):
             refused.append(f"entry {number}: expected numbers {', '.join(WHOLE)}, fs_hz, snapshot_dt_s")
             continue
-        shown.append(f"{count} snapshots of {n_tx} x {n_rx} x {taps} taps")
+        summary.append(f"{count} snapshots of {n_tx} x {n_rx} x {taps} taps")
         faults = (
             (
                 values.nbytes < stored or stored <= 0,
@@ -162,7 +162,7 @@ def _vrtsim(folder: Path) -> Reading:
             (taps > PUBLISHED, f"{taps} taps, the first {PUBLISHED} are played"),
             (max(n_tx, n_rx) > ANTENNAS, f"{n_tx} x {n_rx} antennas, at most {ANTENNAS} an end"),
         )
-        refused += [f"entry {number}: {said}" for fault, said in faults if fault]
-    if not shown and not refused:
+        refused += [f"entry {number}: {message}" for fault, message in faults if fault]
+    if not summary and not refused:
         raise DataError(f"{folder}/vrtsim.yaml: expected a list called entries")
-    return Reading("; ".join(shown), tuple(refused))
+    return Reading("; ".join(summary), tuple(refused))

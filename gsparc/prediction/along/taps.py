@@ -143,10 +143,10 @@ def fitted(
 
     early: float | None = None
     look = places[:: max(len(places) // CHUNK, 1)][:CHUNK]
-    known, found = ask(look), located_paths(predictor, look, antennas)
-    if found is not None and np.linalg.norm(found.channel(tones) - known) < SAME * np.linalg.norm(known):
+    known, rays = ask(look), located_paths(predictor, look, antennas)
+    if rays is not None and np.linalg.norm(rays.channel(tones) - known) < SAME * np.linalg.norm(known):
         tones = carrier + rate_hz * OCCUPIED * np.linspace(-0.5, 0.5, FITTED)
-        early = np.floor(found.delay_s.min() * rate_hz) - taps  # beyond what tones can tell apart
+        early = np.floor(rays.delay_s.min() * rate_hz) - taps  # beyond what tones can tell apart
         known = ask(look) * np.exp(2j * np.pi * (tones - carrier) / rate_hz * early)
         parts.clear()
     if np.ptp(tones) > rate_hz:
@@ -175,10 +175,10 @@ def fitted(
 def located_paths(predictor: Predictor, place: np.ndarray, antennas: int = 1) -> Paths | None:
     """Of the first antennas at places (B, 3) [m, world]; None where the model is not made of paths."""
     try:
-        found = predictor.paths(**{predictor.site.moving_end: place})
+        paths = predictor.paths(**{predictor.site.moving_end: place})
     except ValueError:
         return None
-    return replace(found, gain=found.gain[:, :antennas], delay_s=found.delay_s[:, :antennas])
+    return replace(paths, gain=paths.gain[:, :antennas], delay_s=paths.delay_s[:, :antennas])
 
 
 def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -198,9 +198,9 @@ def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
     energy = np.convolve(np.concatenate([profile, profile])[: apart + taps - 1], np.ones(taps), "valid")
     middle = int(energy.argmax())
 
-    def left(first: int) -> float:
+    def residual(first: int) -> float:
         columns, solve = _atoms(turns, first, taps)
         return float(np.square(np.abs(rows @ solve.T @ columns.T - rows)).sum())
 
-    best = min(range(middle - 4, middle + 5), key=left)
+    best = min(range(middle - 4, middle + 5), key=residual)
     return best if best < apart / 2 or apart <= taps else best - apart

@@ -86,24 +86,24 @@ def claims(
     torch.set_num_threads(threads)
     try:
         fields = [scene(count, projection) for count in counts]
-        middle, found = fields[len(fields) // 2], []
+        middle, results = fields[len(fields) // 2], []
         size = len(middle)
         ratio = _ratio(kernels.backward(middle, 1).kernel, kernels.moving(middle, 1).kernel, clock)
-        found.append(Claim(f"backward / forward at {size}", ratio, 3.0))
+        results.append(Claim(f"backward / forward at {size}", ratio, 3.0))
         for field in fields[1:]:
             bound = FORWARD[projection][len(field) > MANY]
-            found.append(_limit("forward / limit", kernels.moving(field, 1), bound, machine, clock))
+            results.append(_limit("forward / limit", kernels.moving(field, 1), bound, machine, clock))
         queries = {"moving": kernels.moving(middle, 1), "one": kernels.frozen(middle, 1)}
         queries["many"] = kernels.frozen(middle, batch)
         times = _times({name: _whole(case) for name, case in queries.items()}, clock)
         each, together = times["moving"] / times["one"], batch * times["moving"] / times["many"]
-        found.append(Claim(f"moving / frozen at {size}", each, 3.0, True))
-        found.append(Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True))
+        results.append(Claim(f"moving / frozen at {size}", each, 3.0, True))
+        results.append(Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True))
         for field in fields[1:]:
-            found.append(_limit("frozen / bytes", kernels.frozen(field, 1), FROZEN, machine, clock))
+            results.append(_limit("frozen / bytes", kernels.frozen(field, 1), FROZEN, machine, clock))
         one, many = (_whole(layers.channel(middle, *shape)) for shape in ((1, 1), layers.MANY))
-        found.append(Claim(f"1664 channels / 1 at {size}", _ratio(many, one, clock), 2.0))
-        return [*found, *_growth(fields, clock), _learning(projection)]
+        results.append(Claim(f"1664 channels / 1 at {size}", _ratio(many, one, clock), 2.0))
+        return [*results, *_growth(fields, clock), _learning(projection)]
     finally:
         torch.set_num_threads(before)
 
@@ -125,12 +125,12 @@ def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
     """Time per doubling of N between neighbouring sizes."""
     calls = {str(len(field)): kernels.moving(field, 1).kernel for field in fields}
     times = _times(calls, clock)
-    found = []
+    results = []
     for small, large in pairwise(fields):
         doublings = np.log2(len(large) / len(small))
         growth = (times[str(len(large))] / times[str(len(small))]) ** (1 / doublings)
-        found.append(Claim(f"time per doubling, {len(small)} to {len(large)}", growth, 2.2))
-    return found
+        results.append(Claim(f"time per doubling, {len(small)} to {len(large)}", growth, 2.2))
+    return results
 
 
 def _whole(case: Case) -> Call:

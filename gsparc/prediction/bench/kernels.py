@@ -36,10 +36,10 @@ def moving(scene: Scene, batch: int) -> Case:
 def plan(scene: Scene, batch: int) -> Case:
     """Project, cull, order and bin."""
     poses = receivers(batch)
-    made = scene.plan(poses)
+    layout = scene.plan(poses)
     return Case(
         *("plan", scene.projection, len(scene), batch),
-        work=Work(size(scene.geometry) + size(made.buffers)),
+        work=Work(size(scene.geometry) + size(layout.buffers)),
         kernel=lambda: scene.plan(poses),
         whole=lambda: scene.model.plan(poses),
         **_reference(scene, batch, lambda: scene.plan(poses, backend="reference")),
@@ -49,19 +49,19 @@ def plan(scene: Scene, batch: int) -> Case:
 def static(scene: Scene, batch: int) -> Case:
     """A static receiver's plan made once: blend (kernel); emission too (whole)."""
     pose = receiver()
-    made = scene.plan(pose)
+    layout = scene.plan(pose)
     features = scene.features.expand(batch, -1, -1).contiguous()
     tx = places(batch) + 1
 
     def whole() -> Tensor:
         values = scene.model.features(tx, pose if batch == 1 else Pose.identity(places(batch)))
-        return composite(made, *scene.geometry, values).image
+        return composite(layout, *scene.geometry, values).image
 
     dense = scene.plan(pose, backend="reference") if _dense_bytes(scene, 1) <= REFERENCE_BYTES else None
     return Case(
         *("forward, static receiver", scene.projection, len(scene), batch),
         work=_blending(scene, pose, batch * COMPLEX),
-        kernel=lambda: composite(made, *scene.geometry, features).image,
+        kernel=lambda: composite(layout, *scene.geometry, features).image,
         whole=whole,
         **_reference(scene, 1, lambda: dense and composite(dense, *scene.geometry, features).image),
     )
@@ -86,12 +86,12 @@ def frozen(scene: Scene, batch: int) -> Case:
 def backward(scene: Scene, batch: int) -> Case:
     """Gradients of blending (kernel); a training step's forward and backward (whole)."""
     pose = receiver()
-    made = scene.plan(pose)
+    layout = scene.plan(pose)
     means, quats, scales, opacities = (tensor.clone().requires_grad_() for tensor in scene.geometry)
     features = scene.features.expand(batch, -1, -1).clone().requires_grad_()
     leaves = (means, quats, scales, opacities, features)
     with torch.enable_grad():
-        image = composite(made, *leaves).image
+        image = composite(layout, *leaves).image
     slope = torch.rand(image.shape, generator=torch.Generator().manual_seed(0))
     tx, rx = places(batch) + 1, Pose.identity(places(batch))
 
@@ -103,7 +103,7 @@ def backward(scene: Scene, batch: int) -> Case:
             scene.model.zero_grad(set_to_none=True)
             values = scene.model.features(tx, rx)
             g = scene.model.gaussians.geometry()
-            composite(made, *g, values).image.backward(slope)
+            composite(layout, *g, values).image.backward(slope)
 
     def dense() -> object:
         with torch.enable_grad():

@@ -151,7 +151,7 @@ def measure(
 def facts(row: Row) -> dict[str, float | str | None]:
     """Flat keys of one row for the summary; times in milliseconds."""
     stem = f"bench/{row.case.key}/t{row.threads}"
-    found: dict[str, float | str | None] = {
+    values: dict[str, float | str | None] = {
         f"{stem}/limit_ms": row.limit,
         f"{stem}/over_limit": row.over,
         f"{stem}/bound": row.bound,
@@ -161,6 +161,6 @@ def facts(row: Row) -> dict[str, float | str | None]:
     }
     for name, times in (("kernel", row.kernel), ("end_to_end", row.whole)):
         if times is not None:
-            found[f"{stem}/{name}_ms_p50"] = float(np.median(times))
-            found[f"{stem}/{name}_ms_p95"] = float(np.quantile(times, 0.95))
-    return found
+            values[f"{stem}/{name}_ms_p50"] = float(np.median(times))
+            values[f"{stem}/{name}_ms_p95"] = float(np.quantile(times, 0.95))
+    return values

@@ -52,7 +52,7 @@ def packed(form: Form, origin: np.ndarray, error: float) -> bytes:
 
 def write(path: Path, form: Form, origin: np.ndarray, error: float) -> int:
     """Write `packed` whole or not at all; returns its bytes."""
-    found = packed(form, origin, error)
+    blob = packed(form, origin, error)
     with whole_file(path) as partial:
-        partial.write_bytes(found)
-    return len(found)
+        partial.write_bytes(blob)
+    return len(blob)

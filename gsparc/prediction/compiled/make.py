@@ -41,12 +41,12 @@ class Compiled:
     Attributes:
         form: to be written.
         error: root mean square difference at random places, of that of the answers; 0: none but rounding.
-        said: in words, for people.
+        summary: in words, for people.
     """
 
     form: Form
     error: float
-    said: str
+    summary: str
 
 
 def compiled(predictor: Predictor, count: int = 256, seed: int = 0) -> Compiled:
@@ -69,11 +69,11 @@ def compiled(predictor: Predictor, count: int = 256, seed: int = 0) -> Compiled:
     places = random_places(site, count, seed + 1)
     own, whole = (answers(one, places) for one in (form.predictor, predictor))
     error = float(np.sqrt(np.mean(np.abs(own - whole) ** 2) / np.mean(np.abs(whole) ** 2)))
-    said = f"{_NAMES[form.kind]}, distilled: {error:.2%} of the answers' root mean square from {method.name}"
+    note = f"{_NAMES[form.kind]}, distilled: {error:.2%} of the answers' root mean square from {method.name}"
     if site.kind == "rssi":
         apart = 10 * np.log10(np.maximum(own, 1e-30) / np.maximum(whole, 1e-30))
-        said += f", {math.sqrt(float(np.mean(apart**2))):.2g} dB"
-    return Compiled(form, max(error, 1e-12), f"{said} at {count} random places")
+        note += f", {math.sqrt(float(np.mean(apart**2))):.2g} dB"
+    return Compiled(form, max(error, 1e-12), f"{note} at {count} random places")
 
 
 _NAMES = {1: "an array's spectrum", 2: "a frozen image", 3: "a sum of sources", 4: "a process of powers"}
@@ -131,11 +131,11 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
     """
     method, site = predictor.method, predictor.site
     if isinstance(method, PlannedField) and method.field is None and method._average is not None:
-        found = _rendered(method, site)  # without the process that it is averaged with
-        if found is not None:
+        own_form = _rendered(method, site)  # without the process that it is averaged with
+        if own_form is not None:
             alone = LearnedField.__new__(type(method))
             alone.__dict__.update(method.__dict__, _average=None)
-            return replace(found, predictor=Predictor(alone, site))
+            return replace(own_form, predictor=Predictor(alone, site))
     sources = _sources_of(method) if site.kind == "csi" else None
     data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
     if sources is not None:

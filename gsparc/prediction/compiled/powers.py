@@ -31,7 +31,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
         return None
     assert isinstance(posterior, (Exact, Nearest))
     every = isinstance(posterior, Exact)
-    given = posterior._near if isinstance(posterior, Exact) else posterior
+    nearest = posterior._near if isinstance(posterior, Exact) else posterior
     columns = posterior._columns
     if isinstance(posterior, Exact):
         values, weighed = posterior.weights[:, 0], columns.T @ posterior.weights
@@ -42,9 +42,9 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
     places, count = posterior.places.numpy(), len(posterior.places)
     order, sets, boxes = np.arange(count), np.zeros((0, 3), np.int64), np.zeros(0)
     root, unsure = np.zeros(0), np.zeros((columns.shape[1],) * 2)
-    if given is not None:
-        order, sets, boxes = _trees(given.near, given.most)
-        unsure = given.spread.numpy()
+    if nearest is not None:
+        order, sets, boxes = _trees(nearest.near, nearest.most)
+        unsure = nearest.spread.numpy()
     else:
         whole = posterior.factor.root.numpy()  # type: ignore[union-attr]
         root = whole[np.tril_indices(count)]
@@ -59,7 +59,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
         "still": np.array([] if law is None else law.place or [], np.float64), "sets": sets, "boxes": boxes,
     }  # fmt: skip
     numbers = [
-        places.shape[1], count, sets[:, 1].sum(), len(sets), columns.shape[1], every, given is None, every,
+        places.shape[1], count, sets[:, 1].sum(), len(sets), columns.shape[1], every, nearest is None, every,
         law is not None, len(kernel.lengths), shares[0], lengths[0], shares[1], lengths[1], kernel.noise,
         kernel.amplitude, process.heard, process._reach, *about, trend.middle, trend.spread, scale,
     ]  # fmt: skip
@@ -71,10 +71,10 @@ def _trees(near: Neighbourhood, most: int) -> tuple[np.ndarray, np.ndarray, np.n
     order, sets, boxes = [], [], []
     for rows, neighbours in near.shares(most):
         depth = max(0, math.ceil(math.log2(len(rows) / LEAF)))
-        own, found = _tree(near.places[rows], depth)
+        own, tree = _tree(near.places[rows], depth)
         order.append(rows[own])
         sets.append((len(rows), min(neighbours, len(rows)), depth))
-        boxes.append(found.ravel())
+        boxes.append(tree.ravel())
     return np.concatenate(order), np.array(sets, np.int64), np.concatenate(boxes)
 
 

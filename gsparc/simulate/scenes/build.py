@@ -86,8 +86,8 @@ class SceneSettings:
     def __post_init__(self) -> None:
         sources = [k for k in SOURCES if getattr(self, k) is not None]
         if len(sources) != 1:
-            given = ", ".join(sources) or "none"
-            raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {given}")
+            names = ", ".join(sources) or "none"
+            raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {names}")
         if self.transmitter_m is not None and self.transmitters is not None:
             raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
         if self.transmitters is not None and not self.transmitters:
@@ -164,8 +164,8 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
     else:
         suffix = Path(stated).suffix.lower()
         builtin = "builder" if stated in BUILDERS else "builtin"
-        given: dict[str, Any] = {{".osm": "file", ".xml": "xml"}.get(suffix, builtin): stated}
-        scene = SceneSettings(stated, MIN_RECEIVERS, carrier_hz, 0.0, 1, **given)
+        source: dict[str, Any] = {{".osm": "file", ".xml": "xml"}.get(suffix, builtin): stated}
+        scene = SceneSettings(stated, MIN_RECEIVERS, carrier_hz, 0.0, 1, **source)
     for path in (scene.file, scene.xml):
         if path is not None and not Path(path).is_file():
             raise ValueError(f"the scene's file {path} is not here; name it with model.scene=FILE")

@@ -122,8 +122,8 @@ def receivers(
         across, time_s = _along(how, area, streets)
         if not 0 < len(across) <= MOST:
             raise ValueError(f"scene.receivers: {len(across)} places; expected 1 to {MOST:,}")
-        drawn = np.random.default_rng(seed).uniform(min(height), max(height), len(across))
-        flat = np.column_stack([across, drawn])
+        heights = np.random.default_rng(seed).uniform(min(height), max(height), len(across))
+        flat = np.column_stack([across, heights])
         names = [f"({x:.1f}, {y:.1f})" for x, y in across]
     points = ground.lift(flat)
     free = ground.allowed(points)
@@ -168,10 +168,10 @@ def _along(
 
 
 def _lines(how: Layout) -> list[np.ndarray]:
-    given: Any = how.points_m
+    points: Any = how.points_m
     try:
-        nested = given is not None and np.ndim(given[0]) == 2
-        lines = [np.array(line, dtype=np.float64) for line in (given if nested else [given])]
+        nested = points is not None and np.ndim(points[0]) == 2
+        lines = [np.array(line, dtype=np.float64) for line in (points if nested else [points])]
     except (TypeError, ValueError, IndexError):
         lines = []
     if not lines or any(x.ndim != 2 or x.shape[1] != 2 or len(x) < 2 for x in lines):
@@ -245,8 +245,8 @@ def place(
     rng = np.random.default_rng(seed)
     places = np.empty((0, 3))
     for _ in range(TRIES * -(-count // DRAWN)):
-        drawn = rng.uniform(low, high, size=(DRAWN, 3))
-        places = np.concatenate([places, drawn[allowed(drawn)]])
+        sample = rng.uniform(low, high, size=(DRAWN, 3))
+        places = np.concatenate([places, sample[allowed(sample)]])
         if len(places) >= count:
             return places[:count]
     fit = f"only {len(places)} of {count} receivers fit into scene.area_m"

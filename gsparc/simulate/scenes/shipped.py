@@ -9,8 +9,8 @@ from typing import Any
 
 def shipped() -> list[str]:
     """Names, sorted; none where Sionna is not installed."""
-    found = importlib.util.find_spec("sionna")
-    folders = () if found is None else tuple(found.submodule_search_locations or ())
+    spec = importlib.util.find_spec("sionna")
+    folders = () if spec is None else tuple(spec.submodule_search_locations or ())
     files = (path for folder in folders for path in Path(folder).glob("rt/scenes/*/*.xml"))
     return sorted(path.stem for path in files if path.stem == path.parent.name)
 

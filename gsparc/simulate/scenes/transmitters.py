@@ -86,7 +86,7 @@ def stations(
     Raises:
         ValueError: an entry with an unknown setting, without a place, or two of one name.
     """
-    made: list[Transmitter] = []
+    transmitters: list[Transmitter] = []
     for number, entry in enumerate(entries):
         where = f"scene.transmitters[{number}]"
         mast = from_settings(Mast, entry, where)
@@ -100,12 +100,12 @@ def stations(
         for sector in range(mast.sectors):
             azimuth = (mast.azimuth_deg + 360 * sector / mast.sectors) % 360
             label = name if mast.sectors == 1 else f"{name}-{sector + 1}"
-            made.append(Transmitter(label, position, Antenna(pattern, azimuth, mast.downtilt_deg)))
-    names = [one.name for one in made]
+            transmitters.append(Transmitter(label, position, Antenna(pattern, azimuth, mast.downtilt_deg)))
+    names = [one.name for one in transmitters]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"scene.transmitters: {twice[0]!r} twice; expected a name for each")
-    return made
+    return transmitters
 
 
 def _position(
@@ -115,13 +115,13 @@ def _position(
     georeference: Georeference | None,
 ) -> np.ndarray:
     """(3,) [m], world."""
-    given = [n for n in ("position_m", "position_deg") if getattr(mast, n) is not None]
-    if len(given) != 1:
+    names = [n for n in ("position_m", "position_deg") if getattr(mast, n) is not None]
+    if len(names) != 1:
         raise ValueError(f"{where}: give position_m=[x,y,z] or position_deg=[latitude,longitude]")
-    values = np.array(getattr(mast, given[0]), dtype=np.float64)
+    values = np.array(getattr(mast, names[0]), dtype=np.float64)
     if values.shape not in ((2,), (3,)) or not np.isfinite(values).all():
-        raise ValueError(f"{where}.{given[0]}={values.tolist()}: expected two or three finite numbers")
-    if given[0] == "position_deg":
+        raise ValueError(f"{where}.{names[0]}={values.tolist()}: expected two or three finite numbers")
+    if names[0] == "position_deg":
         if georeference is None:
             raise ValueError(f"{where}.position_deg: this scene is nowhere on Earth; give position_m")
         values = georeference.from_degrees(values[:1], values[1:2])[0]

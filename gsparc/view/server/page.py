@@ -80,14 +80,14 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             nodes |= {part.name: draw(api, scene.frame, part) for part in parts}
             recorder.insert_sleep(PAUSE_S)
             count += 1
-    shown = ""
+    which = ""
     if len(viewed.stations) > 1:
-        shown = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
+        which = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
         some = len(names) < len(viewed.stations)
-        shown += "; station=NAME shows another" if some else ", one after another"
-    said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=shown)]
+        which += "; station=NAME shows another" if some else ", one after another"
+    notes = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=which)]
     title = scene.title if len(names) == 1 else scene.title.removesuffix(f": {names[0]}")
-    return recorder.as_html(), _side_panel(replace(scene, title=title), said, legends)
+    return recorder.as_html(), _side_panel(replace(scene, title=title), notes, legends)
 
 
 def _still(
@@ -118,9 +118,9 @@ def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.nda
     return Sheet("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
 
 
-def _side_panel(scene: Scene, said: list[str], legends: list[Legend]) -> str:
+def _side_panel(scene: Scene, notes: list[str], legends: list[Legend]) -> str:
     title = html.escape(scene.title)
-    lines = "".join(f"<p style='margin:.3em .6em'>{html.escape(line)}</p>" for line in said)
+    lines = "".join(f"<p style='margin:.3em .6em'>{html.escape(line)}</p>" for line in notes)
     return (
         "<details open style='position:fixed;top:8px;left:8px;z-index:1000;width:250px;background:#fffe;"
         "border:1px solid #bbb;border-radius:6px;font:13px/1.35 system-ui,sans-serif;color:#222'>"

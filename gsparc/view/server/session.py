@@ -70,14 +70,14 @@ class Session:
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
-        self.made: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # layers of a map, as they are chosen
+        self.map_layers: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # as they are chosen
         for grid, one in view.layers:
-            self.made[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
+            self.map_layers[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
         self._draw_still()
         first_view(client.camera)
         self._panel()
         self._add_gizmos()
-        self.wanted()
+        self.want_answer()
         self.want_plane()
 
     @property
@@ -120,7 +120,7 @@ class Session:
             names = tuple(str(name) for name in viewed.stations)
             choice = gui.add_dropdown("station", names, initial_value=names[0])
             choice.on_update(lambda event: self._station_changed(event.target.value))
-        self.said = gui.add_markdown("asking ...")
+        self.answer_text = gui.add_markdown("asking ...")
         self.picture: Any = None
         self.curves: dict[str, Any] = {}
         self.vectors = {}
@@ -155,16 +155,16 @@ class Session:
             if has[VALUES]:
                 points = {"values": VALUES, **({"errors": ERRORS} if has[ERRORS] else {})}
                 chosen = gui.add_dropdown("measured points", (*points, NOTHING), initial_value="values")
-                self._on(chosen, partial(self._shown, points))
+                self._on(chosen, partial(self._show_only, points))
             if has[GAUSSIANS]:
-                self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._shown, CLOUD))
+                self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._show_only, CLOUD))
                 button = gui.add_button("download Gaussians as PLY")
                 button.on_click(lambda _: self._download())
             self.chosen: Any = None
-            if self.view.grid is not None or self.made:
+            if self.view.grid is not None or self.map_layers:
                 known = self.one.about.usual
                 far = (BEYOND,) if known is not None and np.isfinite(known.at_one) else ()
-                names = (*((PREDICTED, *far) if self.view.grid is not None else ()), *self.made)
+                names = (*((PREDICTED, *far) if self.view.grid is not None else ()), *self.map_layers)
                 self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
                 self._on(self.chosen, lambda value: self.want_plane())
                 self.progress = gui.add_markdown("")
@@ -175,18 +175,18 @@ class Session:
                 self._on(self.height, lambda value: self.want_plane())
 
     def _notes(self) -> list[str]:
-        said = [*self.scene.notes, f"grid: {self.cell:g} m"]
+        notes = [*self.scene.notes, f"grid: {self.cell:g} m"]
         if self.site.static_end is not None:
-            said.append(
+            notes.append(
                 f"the {ENDS[self.site.static_end]} stood still when measured: the model knows it there alone"
             )
         else:
-            said.append(
+            notes.append(
                 "both ends moved: measured points are where the receiver was, wherever its transmitter"
             )
         if len(self.view.viewed.ways) == 1:
-            said.append("`gsparc tradeoff ckpt=FILE` stores faster operating points with the model")
-        return said
+            notes.append("`gsparc tradeoff ckpt=FILE` stores faster operating points with the model")
+        return notes
 
     def _on(self, handle: Any, act: Any) -> None:
         """Do something with a value that the client changed, not with one that we set."""
@@ -206,13 +206,13 @@ class Session:
 
         return moved
 
-    def _move(self, end: str, given: ArrayLike) -> None:
-        self.places[end] = place = np.asarray(given, np.float64)
+    def _move(self, end: str, position: ArrayLike) -> None:
+        self.places[end] = place = np.asarray(position, np.float64)
         self.gizmos[end].position = self.scene.frame.drawn(place)
         self._moved(end)
 
     def _moved(self, end: str) -> None:
-        self.wanted()
+        self.want_answer()
         if end == "tx" and self.site.static_end is None:
             self.want_plane()  # which shows the power of this transmitter
 
@@ -220,22 +220,22 @@ class Session:
         moving = self.view.viewed.moving[-1]
         place = self.view.starts(self.station)[moving]
         if where == WEAKEST and self.plane is not None:
-            found = weakest(self.plane, self.visited)
-            if found is None:  # all were visited
+            weak_place = weakest(self.plane, self.visited)
+            if weak_place is None:  # all were visited
                 self.visited.clear()
-                found = weakest(self.plane)
-            if found is not None:
-                self.visited.append(found)
-                place = found
+                weak_place = weakest(self.plane)
+            if weak_place is not None:
+                self.visited.append(weak_place)
+                place = weak_place
         self._move(moving, place)
 
-    def _shown(self, parts: Mapping[str, str], choice: str) -> None:
+    def _show_only(self, parts: Mapping[str, str], choice: str) -> None:
         """Of parts, by the words to choose them by, show the one that was chosen alone."""
         for word, name in parts.items():
-            self._seen(name, word == choice)
+            self._set_visible(name, word == choice)
         self._legends()
 
-    def _seen(self, name: str, visible: bool) -> None:
+    def _set_visible(self, name: str, visible: bool) -> None:
         """Show or hide a part; what is hidden at first is sent when it is first shown."""
         if name in self.nodes:
             self.nodes[name].visible = visible
@@ -246,7 +246,7 @@ class Session:
         self.queries.clear()
         self.delays.clear()
         self.front.data = self._front()
-        self.wanted()
+        self.want_answer()
 
     def _front(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first, and
@@ -274,7 +274,7 @@ class Session:
 
     # -- what the worker does ----------------------------------------------------------------------
 
-    def wanted(self) -> None:
+    def want_answer(self) -> None:
         """Have the present places answered."""
         self.asked_s = time.perf_counter()
         self.work.ask((self.client.client_id, "answer"), self._answered, urgent=True)
@@ -286,14 +286,14 @@ class Session:
     def _show_station(self, name: str) -> Iterator[None]:
         self.station, self.one = name, self.view.station(name)
         choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
-        shown = {name: self.nodes[name].visible for name in choices if name in self.nodes}
+        visibility = {name: self.nodes[name].visible for name in choices if name in self.nodes}
         with self.client.atomic():
             self._draw_still()
-            for name, visible in shown.items():
-                self._seen(name, visible)
+            for name, visible in visibility.items():
+                self._set_visible(name, visible)
         self.title.content = f"**{self.scene.title}**"
         self._legends()
-        self.wanted()
+        self.want_answer()
         self.want_plane()
         yield
 
@@ -309,7 +309,7 @@ class Session:
         try:
             answer = ask(self.view.viewed.predictor_of(self.station, way), places)
         except ValueError as error:
-            self.said.content = f"**{error}**"
+            self.answer_text.content = f"**{error}**"
             return
         self._show(answer)
         self.answers += 1
@@ -325,7 +325,7 @@ class Session:
         one = self.one
         why = reasons(answer, self.view.viewed.moving[-1], one.about)
         with self.client.atomic():
-            self.said.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
+            self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
             for end in self.vectors:
                 self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
             if answer.spectrum is not None:
@@ -390,14 +390,14 @@ class Session:
         )  # fmt: skip
 
     def _after(self) -> float:
-        return float(self.said.order) + 0.1 + 0.1 * len(self.curves)
+        return float(self.answer_text.order) + 0.1 + 0.1 * len(self.curves)
 
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
         self.power = None
-        if name in self.made:
-            grid, *_ = self.made[name]
-            self._lay(*self.made[name])
+        if name in self.map_layers:
+            grid, *_ = self.map_layers[name]
+            self._lay(*self.map_layers[name])
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
         elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
             grid = replace(self.view.grid, height=float(self.height.value))
@@ -428,9 +428,9 @@ class Session:
             self._lay(grid, plane.level_db, legend)
             if first:
                 self._legends()
-            asked = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
+            suffix = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
             self.progress.content = (
-                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{asked}, "
+                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{suffix}, "
                 f"{time.perf_counter() - begin:.1f} s"
             )
             yield
@@ -445,9 +445,9 @@ class Session:
 
     def _legends(self) -> None:
         legends = self.scene.legends
-        shown = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
-        shown += [PATHS] if RAYS in self.nodes else []
-        shown += [self.power] if PLANE in self.nodes and self.power is not None else []
+        entries = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
+        entries += [PATHS] if RAYS in self.nodes else []
+        entries += [self.power] if PLANE in self.nodes and self.power is not None else []
         name = NOTHING if self.chosen is None else self.chosen.value
-        shown += [self.made[name][2]] if name in self.made else []
-        self.legend.content = legend_html(shown, self.scene.parts)
+        entries += [self.map_layers[name][2]] if name in self.map_layers else []
+        self.legend.content = legend_html(entries, self.scene.parts)

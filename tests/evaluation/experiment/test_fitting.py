@@ -49,13 +49,13 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     write("toy-random-gp-grid", **{"dataset/identity": "of another grid"})
     write("toy-random-gp-cut")
     (tmp_path / "toy-random-gp-cut" / "cell.json").write_text("{")
-    assert prepared.found() is None and prepared.found_earlier() is None
+    assert prepared.result() is None and prepared.old_result() is None
     write("toy-random-gp-old", made="2026-01-01")
     write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
-    found = prepared.found_earlier()
+    found = prepared.old_result()
     assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
     write("toy-random-gp-today")
-    assert prepared.found().earlier is None
+    assert prepared.result().earlier is None
     random, sparse = SplitChoice("random"), SplitChoice("sparse")
     for name in ("old", "newer", "today"):
         kept = {**facts, "dataset/identity": "i"}

@@ -54,13 +54,13 @@ class Clutter:
     def without(self, number: int) -> Clutter:
         """One piece less; boxes count before patches."""
         boxes = [i for i in range(len(self.boxes)) if i != number]
-        kept = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
-        return Clutter(self.boxes[boxes], self.patches[kept], tuple(self.plane[i] for i in kept))
+        patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
+        return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
 
     def renamed(self, new: dict[int, int]) -> Clutter:
         """Planes of new indices; patches of planes without one are dropped."""
-        kept = [i for i, plane in enumerate(self.plane) if plane in new]
-        return replace(self, patches=self.patches[kept], plane=tuple(new[self.plane[i]] for i in kept))
+        patches = [i for i, plane in enumerate(self.plane) if plane in new]
+        return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
 
 
 def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:

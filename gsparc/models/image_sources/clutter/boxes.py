@@ -40,8 +40,8 @@ def evolve(
         parents = torch.where(better[:, None], heirs, parents)
         best, spread = torch.maximum(best, scores), spread * FALL
         if number in HALVED:
-            kept = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
-            parents, best = parents[kept], best[kept]
+            top = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
+            parents, best = parents[top], best[top]
     first = int(best.argmax())
     return parents[first], float(best[first])
 
@@ -78,11 +78,11 @@ def find_box(
     def repaired(boxes: Tensor) -> Tensor:
         return inside_out(boxes, room)
 
-    drawn = repaired(_random(draws, room, generator))
-    drawn = drawn[score(drawn).topk(min(parents, draws)).indices]
+    starts = repaired(_random(draws, room, generator))
+    starts = starts[score(starts).topk(min(parents, draws)).indices]
     if seeds is not None:
-        drawn = torch.cat([drawn, repaired(seeds)])
-    return evolve(drawn, score, repaired, generator)
+        starts = torch.cat([starts, repaired(seeds)])
+    return evolve(starts, score, repaired, generator)
 
 
 def inside_out(boxes: Tensor, room: Tensor) -> Tensor:

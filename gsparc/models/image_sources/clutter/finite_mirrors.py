@@ -78,9 +78,9 @@ def find_patch(
 
     middle = low + (high - low) * torch.rand(DRAWS, 2, generator=generator)
     side = SMALLEST * torch.exp(torch.rand(DRAWS, 2, generator=generator) * math.log(LARGEST / SMALLEST))
-    drawn = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
-    drawn = drawn[score(drawn).topk(8).indices]
-    return evolve(drawn, score, repaired, generator, rounds=10)
+    starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
+    starts = starts[score(starts).topk(8).indices]
+    return evolve(starts, score, repaired, generator, rounds=10)
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def find_mirrors(
     """
     wavelength = LIGHT / float(rows.frequency.mean())
     alpha, known = scorer.alpha, planes[numbers]
-    found: list[SmallMirror] = []
+    mirrors: list[SmallMirror] = []
     scale = scorer.root.square().sum(0).view(2, -1).mean(0)  # of rows, diagonal of K^-1
     normals: list[Tensor] = []
     for plane in known:
@@ -155,8 +155,8 @@ def find_mirrors(
         ]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
         for number in total.topk(min(2 * most, len(total))).indices.tolist():
-            found.append(SmallMirror(candidates[number], corners[number], float(total[number])))
-    return _apart(found, 0.5 * wavelength)[:most]
+            mirrors.append(SmallMirror(candidates[number], corners[number], float(total[number])))
+    return _apart(mirrors, 0.5 * wavelength)[:most]
 
 
 def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
@@ -167,12 +167,12 @@ def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
     return bool((high > low).all())
 
 
-def _apart(found: list[SmallMirror], least: float) -> list[SmallMirror]:
-    kept: list[SmallMirror] = []
-    for mirror in sorted(found, key=lambda m: -m.score):
-        if not any(same_mirror(mirror, other, least) for other in kept):
-            kept.append(mirror)
-    return kept
+def _apart(mirrors: list[SmallMirror], least: float) -> list[SmallMirror]:
+    apart: list[SmallMirror] = []
+    for mirror in sorted(mirrors, key=lambda m: -m.score):
+        if not any(same_mirror(mirror, other, least) for other in apart):
+            apart.append(mirror)
+    return apart
 
 
 def _raster(
@@ -232,15 +232,15 @@ def _sources(
     """Waves (C, n) of every sequence over a candidate, and where it is met (C, n, 3), NaN if not."""
     places = rows.position.float()
     once, *more = _images(transmitter, candidates, known)
-    found = [_meeting(places, once, candidates)]
+    meetings = [_meeting(places, once, candidates)]
     for wall, after, before in zip(known, more[::2], more[1::2], strict=True):
-        found.append(_meeting(places, after, candidates))
+        meetings.append(_meeting(places, after, candidates))
         first = _meeting(places, before, wall[None].expand(len(candidates), 4))
-        found.append(_meeting(first, once, candidates))
+        meetings.append(_meeting(first, once, candidates))
     sources = (
         [once, *more] if rows.array is None else _images(rows.static_ends(transmitter), candidates, known)
     )
-    away = ((_distance(rows, source), met) for source, met in zip(sources, found, strict=True))
+    away = ((_distance(rows, source), met) for source, met in zip(sources, meetings, strict=True))
     return [(wave(distance, rows.frequency), met) for distance, met in away]
 
 

@@ -63,9 +63,9 @@ def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
     """
     # The kernel learned without clutter explains it: reset
     fresh = replace(scene, visibility=INITIAL_KERNEL, quadrature=min(scene.quadrature, QUADRATURE))
-    found = _ClutterSearcher(rows, fresh, generator).run()
-    before, after = (Posterior(rows, each).nll for each in (scene, found))
-    return found if after < before - PROGRESS else scene
+    trial = _ClutterSearcher(rows, fresh, generator).run()
+    before, after = (Posterior(rows, each).nll for each in (scene, trial))
+    return trial if after < before - PROGRESS else scene
 
 
 class _ClutterSearcher:
@@ -123,9 +123,9 @@ class _ClutterSearcher:
         return False
 
     def _descend(self, steps: int, soft: float = SOFT) -> None:
-        found = descend(self.residual, self.scene, self.paths, steps, soft, self.phase_prior)
-        boxes = inside_out(found.clutter.boxes, self.room)
-        self._set_scene(replace(found, clutter=replace(found.clutter, boxes=boxes)))
+        scene = descend(self.residual, self.scene, self.paths, steps, soft, self.phase_prior)
+        boxes = inside_out(scene.clutter.boxes, self.room)
+        self._set_scene(replace(scene, clutter=replace(scene.clutter, boxes=boxes)))
 
     # ---- the loop ----
     def run(self) -> Scene:
@@ -186,13 +186,13 @@ class _ClutterSearcher:
 
     def _mirrors(self) -> None:
         scene = self.scene
-        found = find_mirrors(
+        mirrors = find_mirrors(
             self.rows, self._scorer(), scene.transmitter, scene.planes,
             walls(scene.planes, scene.sequences), self.room, 2 * MIRRORS,
         )  # fmt: skip
-        found = [mirror for mirror in found if mirror.score > MIN_GAIN]
+        mirrors = [mirror for mirror in mirrors if mirror.score > MIN_GAIN]
         scorer = self._scorer()
-        placed = [self._placed(mirror, scorer) for mirror in [*found, *self._mirrors_on_boxes()]]
+        placed = [self._placed(mirror, scorer) for mirror in [*mirrors, *self._mirrors_on_boxes()]]
         added: list[SmallMirror] = []
         for mirror in sorted(placed, key=lambda m: -m.score):
             if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
@@ -203,7 +203,7 @@ class _ClutterSearcher:
 
     def _mirrors_on_boxes(self) -> list[SmallMirror]:
         """Faces of boxes that are not on floor or walls, as mirrors."""
-        found = []
+        mirrors = []
         for box in self.scene.clutter.boxes:
             for axis in range(3):
                 for end in (0, 3):
@@ -216,9 +216,9 @@ class _ClutterSearcher:
                     patch = torch.cat([corners.amin(0), corners.amax(0)])
                     mirror = SmallMirror(plane, patch, 0.0)
                     if not any(same_mirror(mirror, other, SAME_FACE_M) for other in self.tried):
-                        found.append(mirror)
-        self.tried += found
-        return found
+                        mirrors.append(mirror)
+        self.tried += mirrors
+        return mirrors
 
     def _placed(self, mirror: SmallMirror, scorer: CandidateScorer) -> SmallMirror:
         """The mirror at the offset along its normal that fits the phase prior best."""
@@ -296,14 +296,14 @@ class _ClutterSearcher:
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
         scene, scorer = self.scene, self._scorer()
-        visible_waves, found = self.waves * self.visible.T, []
+        visible_waves, patches = self.waves * self.visible.T, []
         for number in set(range(len(scene.planes))) - set(scene.clutter.plane):
             patch, score = find_patch(
                 scorer, self.paths, scene.sequences, number, scene.planes[number], visible_waves, self.room,
                 self.generator,
             )  # fmt: skip
-            found.append((score, number, patch))
-        for score, number, patch in sorted(found, key=lambda f: -f[0]):
+            patches.append((score, number, patch))
+        for score, number, patch in sorted(patches, key=lambda f: -f[0]):
             if score < MIN_GAIN:
                 break
             own = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
@@ -365,10 +365,10 @@ class _ClutterSearcher:
     def _drop_sequences(self) -> None:
         """Remove sources whose constant and varying parts both gain too little."""
         gains = self.residual.nats_per_source(self.visible, self.scene.log_amplitude)
-        kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
-        dropped = len(gains) - len(kept)
+        rest = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
+        dropped = len(gains) - len(rest)
         if dropped:
-            fewer = partial(self._refactor, self.scene.only(kept))
+            fewer = partial(self._refactor, self.scene.only(rest))
             self._changed(fewer, -dropped * self.parameter_cost)
 
 

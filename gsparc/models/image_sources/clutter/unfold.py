@@ -61,7 +61,7 @@ class Unfolding:
         height: (L - 1, K, M, 1) float32 [m], of the image after the reflection over its plane; -1 beyond, so
             that legs there have no length.
         plane: (K, M, 1, L) in the order in which a path meets them, -1 where there is none.
-        given: (K, M, 1) bool, whether the entry exists.
+        present: (K, M, 1) bool, whether the entry exists.
     """
 
     chain: Tensor
@@ -69,7 +69,7 @@ class Unfolding:
     offset: Tensor
     height: Tensor
     plane: Tensor
-    given: Tensor
+    present: Tensor
 
     @staticmethod
     def of(transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]) -> Unfolding:
@@ -77,27 +77,27 @@ class Unfolding:
         variants = _equivalent_sequences(transmitter, planes, sequences)
         most, order = max(map(len, variants)), max(map(len, sequences), default=0)
         plane = torch.full((order, len(sequences), most, 1), -1)
-        given = torch.zeros(len(sequences), most, 1, dtype=torch.bool)
+        present = torch.zeros(len(sequences), most, 1, dtype=torch.bool)
         for k, mine in enumerate(variants):
             for m, sequence in enumerate(mine):
                 plane[: len(sequence), k, m, 0] = torch.tensor(sequence, dtype=torch.long)
-                given[k, m] = True
+                present[k, m] = True
         table = planes if len(planes) else torch.tensor([[1.0, 0, 0, 0]], dtype=planes.dtype)
         used, exists = table[plane.clamp_min(0)], plane >= 0
-        chain = [transmitter.expand(*given.shape, 3)]
+        chain = [transmitter.expand(*present.shape, 3)]
         for mirror, here in zip(used, exists, strict=True):
             chain.append(torch.where(here[..., None], reflect(chain[-1], mirror), chain[-1]))
         length = torch.linalg.vector_norm(used[..., :3], dim=-1, keepdim=True)
         normal = (used[..., :3] / length).float() * exists[..., None]
         offset, images_at = used[..., 3].float() * exists, torch.stack(chain).float()
         height = (images_at[1:] * normal).sum(-1) - offset
-        met = torch.cat([plane.flip(0), torch.full((1, *given.shape), -1)]).permute(1, 2, 3, 0)
-        return Unfolding(images_at, normal, offset, torch.where(exists, height, -1.0), met, given)
+        met = torch.cat([plane.flip(0), torch.full((1, *present.shape), -1)]).permute(1, 2, 3, 0)
+        return Unfolding(images_at, normal, offset, torch.where(exists, height, -1.0), met, present)
 
     @staticmethod
     def concatenate(many: list[Unfolding]) -> Unfolding:
         """Of several scenes, with consecutive plane indices."""
-        variants = max(u.given.shape[1] for u in many)
+        variants = max(u.present.shape[1] for u in many)
         length = max(len(u.chain) for u in many)
         parts = zip(*(vars(u.padded(variants, length)).values() for u in many), strict=True)
         return Unfolding(*(torch.cat(part, 0 if i > 3 else 1) for i, part in enumerate(parts)))
@@ -105,7 +105,7 @@ class Unfolding:
     def padded(self, variants: int, length: int) -> Unfolding:
         """With room for more variants and reflections."""
         pad = torch.nn.functional.pad
-        more, longer = variants - self.given.shape[1], length - len(self.chain)
+        more, longer = variants - self.present.shape[1], length - len(self.chain)
         chain = torch.cat([self.chain, self.chain[-1:].expand(longer, -1, -1, -1, -1)])
         return Unfolding(
             pad(chain, (0, 0, 0, 0, 0, more)),
@@ -113,7 +113,7 @@ class Unfolding:
             pad(self.offset, (0, 0, 0, more, 0, 0, 0, longer)),
             pad(self.height, (0, 0, 0, more, 0, 0, 0, longer), value=-1.0),
             pad(self.plane, (longer, 0, 0, 0, 0, more), value=-1),
-            pad(self.given, (0, 0, 0, more)),
+            pad(self.present, (0, 0, 0, more)),
         )
 
     def with_offset(self, first: int) -> Unfolding:
@@ -122,8 +122,8 @@ class Unfolding:
 
     def paths(self, places: Tensor) -> Paths:
         """From places (n, 3) [m]."""
-        shape = (*self.given.shape[:2], len(places))
-        here, valid = places.to(self.chain.dtype).expand(*shape, 3), self.given.expand(shape)
+        shape = (*self.present.shape[:2], len(places))
+        here, valid = places.to(self.chain.dtype).expand(*shape, 3), self.present.expand(shape)
         points = [here]
         steps = list(zip(self.normal, self.offset, self.height, self.chain[1:], strict=True))
         for normal, offset, height, image in reversed(steps):
@@ -150,7 +150,7 @@ def _equivalent_sequences(
     transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]
 ) -> list[list[Reflections]]:
     """Each sequence, then its permutations with the same image."""
-    found = []
+    groups = []
     for sequence in sequences:
         others = [
             other
@@ -161,5 +161,5 @@ def _equivalent_sequences(
             places = images(transmitter, planes, [sequence, *others])
             same = (places[1:] - places[0]).norm(dim=1) < SAME_M
             others = [other for other, alike in zip(others, same.tolist(), strict=True) if alike]
-        found.append([sequence, *others])
-    return found
+        groups.append([sequence, *others])
+    return groups

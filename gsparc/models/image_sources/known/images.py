@@ -66,12 +66,12 @@ class Mirrors:
                 ends = torch.from_numpy(part) @ along.T
                 patches.append(torch.cat([ends.amin(0), ends.amax(0)]))
                 indices.append(number)
-        found = torch.stack(patches) if patches else torch.zeros(0, 4, dtype=torch.float64)
-        size = (found[:, 2:] - found[:, :2]).prod(1)
-        kept = size.topk(min(MOST_PATCHES, len(size))).indices.sort().values.tolist()
+        rectangles = torch.stack(patches) if patches else torch.zeros(0, 4, dtype=torch.float64)
+        size = (rectangles[:, 2:] - rectangles[:, :2]).prod(1)
+        top = size.topk(min(MOST_PATCHES, len(size))).indices.sort().values.tolist()
         boxes = torch.from_numpy((walls.boxes - origin).reshape(-1, 6)).float()
-        plane = tuple(indices[i] for i in kept)
-        return Mirrors(planes, Clutter(boxes, found[kept].float(), plane), len(found) - len(kept))
+        plane = tuple(indices[i] for i in top)
+        return Mirrors(planes, Clutter(boxes, rectangles[top].float(), plane), len(rectangles) - len(top))
 
     def mirroring(self, smallest: float) -> list[int]:
         """Numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
@@ -103,18 +103,18 @@ def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> 
 
 def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:
     """Planes (4,) and the faces on each; the largest face gives the plane."""
-    found: list[tuple[np.ndarray, list[np.ndarray]]] = []
+    planes: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for face in sorted(faces, key=area, reverse=True):
         normal = normal_of(face)
         normal = normal / np.linalg.norm(normal)
-        for plane, members in found:
+        for plane, members in planes:
             apart = np.abs(face @ plane[:3] - plane[3]).max()
             if abs(float(normal @ plane[:3])) > PARALLEL and apart < SAME_PLANE_M:
                 members.append(face)
                 break
         else:
-            found.append((np.append(normal, normal @ face.mean(0)), [face]))
-    return found
+            planes.append((np.append(normal, normal @ face.mean(0)), [face]))
+    return planes
 
 
 def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
@@ -172,18 +172,18 @@ def visible_sequences(
             for part in every.split(SEQUENCES_AT_ONCE)
         ]
     )
-    kept = scores.topk(min(SHORTLIST * most, len(sequences))).indices
-    kept = kept[scores[kept] > 0]
-    if hidden and len(kept):
+    best = scores.topk(min(SHORTLIST * most, len(sequences))).indices
+    best = best[scores[best] > 0]
+    if hidden and len(best):
         seen = torch.cat(
             [
-                _seen(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
-                for part in kept.split(50)
+                _share(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
+                for part in best.split(50)
             ]
         )
-        kept, power = kept[seen > SEEN], (scores[kept] * seen)[seen > SEEN]
-        kept = kept[power.argsort(descending=True)]
-    return ((), *(sequences[i] for i in kept[: most - 1].tolist()))
+        best, power = best[seen > SEEN], (scores[best] * seen)[seen > SEEN]
+        best = best[power.argsort(descending=True)]
+    return ((), *(sequences[i] for i in best[: most - 1].tolist()))
 
 
 def hiding(
@@ -193,13 +193,13 @@ def hiding(
     clutter = mirrors.clutter
     paths = Unfolding.of(transmitter, mirrors.planes, sequences).paths(places)
     used = {index for sequence in sequences for index in sequence}
-    kept = []
+    numbers = []
     for number, plane in enumerate(clutter.plane):
         one = Clutter(clutter.boxes[:0], clutter.patches[number : number + 1], (plane,))
-        taken = 1 - visible_share(paths, one, mirrors.planes)
-        if plane in used or float(taken.max()) > HIDES:
-            kept.append(number)
-    return replace(clutter, patches=clutter.patches[kept], plane=tuple(clutter.plane[i] for i in kept))
+        shadow = 1 - visible_share(paths, one, mirrors.planes)
+        if plane in used or float(shadow.max()) > HIDES:
+            numbers.append(number)
+    return replace(clutter, patches=clutter.patches[numbers], plane=tuple(clutter.plane[i] for i in numbers))
 
 
 def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor) -> list[Reflections]:
@@ -207,15 +207,15 @@ def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor)
     if not sequences:
         return []
     places = images(transmitter, planes, sequences)
-    kept: list[int] = []
+    distinct: list[int] = []
     numbers = sorted(range(len(sequences)), key=lambda i: (len(sequences[i]), sorted(sequences[i])))
     for _, group in groupby(numbers, key=lambda i: sorted(sequences[i])):
         mine: list[int] = []
         for i in group:
             if all(float((places[i] - places[j]).norm()) > SAME_M for j in mine):
                 mine.append(i)
-        kept += mine
-    return [sequences[i] for i in sorted(kept)]
+        distinct += mine
+    return [sequences[i] for i in sorted(distinct)]
 
 
 def _power(
@@ -244,7 +244,7 @@ def _reflected(mirrors: Mirrors, paths: Paths) -> Tensor:
     return (inside.all(-1) & paths.valid).float()
 
 
-def _seen(mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor) -> Tensor:
+def _share(mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor) -> Tensor:
     """Mean visible share (W,) of sequences, walls and boxes in the way included."""
     paths = Unfolding.of(transmitter, mirrors.planes, tuple(sequences)).paths(places)
     return visible_share(paths, mirrors.clutter, mirrors.planes).mean(1)

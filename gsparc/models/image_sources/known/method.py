@@ -108,14 +108,14 @@ class KnownWallsGP(ImageSourceGP):
         sequences = visible_sequences(
             mirrors, indices, transmitter, rows.position, order, settings.max_sources, hidden
         )
-        held = hiding(mirrors, sequences, transmitter, rows.position) if hidden else Clutter.none()
+        obstacles = hiding(mirrors, sequences, transmitter, rows.position) if hidden else Clutter.none()
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
             transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
             math.log(settings.noise), settings.visibility, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide
-        return replace(bare, clutter=held).only([*range(len(sequences))], held.plane)
+        return replace(bare, clutter=obstacles).only([*range(len(sequences))], obstacles.plane)
 
 
 def walls_cost(

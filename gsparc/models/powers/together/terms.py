@@ -122,8 +122,8 @@ class Terms:
     def known_at(self, rows: LinkRows, most: int, seed: int) -> Terms:
         """The same with g known at so many places of rows, drawn evenly."""
         every = np.unique(rows.places[:, :3], axis=0)
-        drawn = np.random.default_rng(seed).permutation(len(every))[:most]
-        return replace(self, inducing=torch.from_numpy(every[np.sort(drawn)]))
+        order = np.random.default_rng(seed).permutation(len(every))[:most]
+        return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
 
     def columns(self, places: Tensor) -> Tensor:
         """(n, P) [dB] at places of both ends (n, 6) [m]."""
