@@ -37,7 +37,7 @@ class OpacityReset(Checked, L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Reset when the schedule says so."""
         step = module.schedule_step(self.interval)
-        if step is None or module.conditional or module.solved:
+        if step is None or module.solved:
             return
         interval = in_steps(self.interval, module.total_steps)
         if not due(step, module.global_step, 1, self.stop, self.interval, module.total_steps):

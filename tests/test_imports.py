@@ -27,7 +27,7 @@ ARROWS = {
     "data": "conf ops processes",
     "simulate": "data ops physics",
     "field": "data ops physics processes",
-    "training": "data field ops processes",
+    "training": "data field ops",
     "models": "data field ops physics processes simulate training",
     "prediction": "data field locate models ops physics processes training",
     "locate": "data models ops processes training",

@@ -202,7 +202,7 @@ def stored(field: ConditionalField) -> dict[str, Any]:
     if not isinstance(field, Mixture):
         return {"kind": field.kind, **field.state()}
     residual = None if field.residual is None else stored(field.residual)
-    members = [stored(member) for member in field.members]  # type: ignore[arg-type]
+    members = [stored(member) for member in field.members]
     return {"members": members, "residual": residual, **field.state()}
 
 

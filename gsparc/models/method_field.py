@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method
@@ -29,7 +29,6 @@ class MethodField(ConditionalField):
     makes: ClassVar[type[Method]]
 
     def __init__(self, method: Any) -> None:
-        super().__init__()
         self.method, self.site = method, method.site
 
     @property
@@ -37,15 +36,11 @@ class MethodField(ConditionalField):
         """Gaussians, of the largest search."""
         return self.method.size()
 
-    def loss(self, batch: Batch) -> Tensor:
-        """Of nothing that could be learned: `ValueError`."""
-        raise ValueError(f"{self.kind}: it has nothing that gradient steps move")
-
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`."""
         self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
 
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
         """See `ConditionalField`."""
         result = self.method.predict(tx, rx)
         return Posterior(

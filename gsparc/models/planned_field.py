@@ -1,8 +1,7 @@
 """A field of whatever a plan calls for: rendered, or solutions in closed form that are weighed.
 
 Where Gaussians are rendered it is trained by rendering (`LearnedField`). Where weights follow from the rows
-in closed form (`ConditionalField`), initialisers find the Gaussians, held-out rows weigh what they found, and
-steps of gradient refine it as long as validation gains.
+in closed form (`ConditionalField`), initialisers find the Gaussians, and held-out rows weigh what they found.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -26,44 +24,31 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.models import stations
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.fields import INITIALISERS, restored, stored
-from gsparc.models.haste import factor_s
+from gsparc.models.fields import restored, stored
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.mixture import solutions
-from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.closed_forms import DEFAULT_BUDGET_S, solve, with_cost
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.mixture.weights import comparable
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Blended, averaged, contributions, knobs, mean_alone, reduced
 from gsparc.models.refined_places import displaced, refined
 from gsparc.models.splat.auto_settings import resolve
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
 from gsparc.models.terms import EffectSettings, Plan
 from gsparc.ops import Pose
-from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import approximated
 from gsparc.processes.powers import PowerProcess
-from gsparc.training.conditional import ConditionalField, learns
+from gsparc.training.conditional import ConditionalField
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.fit import run_stage, total_steps
-from gsparc.training.keep_best import SHORT, KeepBest
+from gsparc.training.fit import total_steps
 from gsparc.training.module import GaussianModule
-from gsparc.training.pace import Pace
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
 
-DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
-STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
-BEFORE, AFTER = 3.0, 3.0  # validations that steps take at least, and that may follow when seconds end them
 MEASURED_SHARE = 0.4  # of the seconds, for the fit that positions with errors are refined by
-LEAST_STEPS_S = 0.5  # less is not worth to set up
-RAYS_FACTORS = 1_500.0  # the same of measured rays, fitted and given all rows
-LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fit makes, and rows of one
-VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
 
 
 class PlannedField(LearnedField):
@@ -126,7 +111,7 @@ class PlannedField(LearnedField):
     # -- learning ----------------------------------------------------------------------------------
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Choose the terms, initialise, weigh, take the steps that pay."""
+        """Choose the terms, initialise, weigh; take the steps that pay where Gaussians are rendered."""
         self.site, self.field, self._average, self._average_mean = data.site, None, None, None
         self.runs = RunFactors.none()
         self.plan = self.planned(data)
@@ -190,7 +175,7 @@ class PlannedField(LearnedField):
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}
-        return _with_cost(report, Cost(spent, unused))
+        return with_cost(report, Cost(spent, unused))
 
     @property
     def _alone(self) -> bool:
@@ -212,126 +197,13 @@ class PlannedField(LearnedField):
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
     ) -> FitReport:
-        if context.budget_s is None:
-            context = replace(context, budget_s=DEFAULT_BUDGET_S)
-        budget = context.time_budget()
-        log.info(
-            "training a Gaussian field with closed-form weights: init=%s, then at most %d gradient steps, "
-            "within %.3g s; callbacks: %s", " and ".join(chosen.parts), self._most_steps(context),
-            context.budget_s, KeepBest.__name__,
-        )  # fmt: skip
-        known = np.sort(np.concatenate([fold.train, fold.val]))
-        count = 1 if data.site.stations is None else len(data.site.stations)
-        one_fit = LEAST_FACTORS * count * factor_s(min(len(known) // count, MOST_FACTORED))
-        least = one_fit if len(chosen.parts) == 1 else one_fit * (1 + solutions.GROUPS)
-        if "rays" in chosen.parts:
-            least += RAYS_FACTORS * factor_s(min(len(known), MOST_FACTORED))
-        if least > budget.seconds:
-            log.warning(
-                "%g s are too few: the least fit of these rows takes about %.0f s", budget.seconds, least
-            )
-        several = len(chosen.parts) > 1
-        cut = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
+        if self.most_steps:
+            log.info("model.steps=%d is not used: closed-form weights take no steps", self.most_steps)
         init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
-        until_s = budget.seconds * (1 - STEPS_SHARE)
-        share = solutions.CLOSED_SHARE * max(budget.seconds - budget.spent, solutions.LEAST_S)
-        data = self._aligned(data, known, replace(context, budget_s=share))
-        fields, reports = solutions.find(
-            chosen.parts, init, self.switches, data, fold, context, budget, until_s, cut
-        )
-        members = solutions.weighed(fields, data, fold, cut)
-        self.field, self.started = solutions.joined(members), "+".join(members)
-        self.field.site = data.site
-        self.init_s = budget.counted.wall
-        log.info(
-            "%s of %d Gaussians from init=%s, terms %s", type(self.field).__name__, self.field.count,
-            self.started, ", ".join(self.field.terms) or "none",
-        )  # fmt: skip
-        self.steps, moved = self._take_steps(data, fold, context, budget, several)
-        stepped = budget.counted.wall
-        if moved or several:  # else it is of these rows already
-            self.field.condition(data, known)
-        seconds = budget.counted.wall
-        stages = {name: report.seconds for name, report in reports.items()}
-        gain = _late_gain(reports)
-        stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
-        stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
-        weighed = {*members, "weighing", "final weights", *(("gradient steps",) if self.steps else ())}
-        unused = {name: spent for name, spent in stages.items() if name not in weighed}
-        notes = [note for name in self.started.split("+") for note in reports[name].notes]
-        limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return _with_cost(FitReport(seconds, tuple(notes), limited), Cost(stages, unused, gain))
-
-    def _aligned(self, data: Measurements, known: np.ndarray, context: FitContext) -> Measurements:
-        """Channels of several runs in the phase and level of one, by the waves that explain rows (n,)."""
-        if not RunFactors.several(data, known):
-            return data
-        field, _ = INITIALISERS["diffuse"](data, known, self.init, True, context)
-        assert isinstance(field.runs, RunFactors)
-        self.runs = field.runs
-        log.info(
-            "channels of %d runs: the factor of each was estimated with the waves' field", len(self.runs)
-        )
-        return self.runs.aligned(data)
-
-    def _take_steps(
-        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, apart: bool
-    ) -> tuple[int, bool]:
-        """Gradient steps under Lightning, as many as validation gains by.
-
-        Args:
-            apart: whether the field was conditioned on training rows alone.
-
-        Returns:
-            Their number, and whether the field is conditioned on other rows than before, or has moved.
-        """
-        field = self.field
-        assert field is not None
-        if not len(fold.val):
-            log.info("gradient steps: none, there are no validation rows to say whether they pay")
-            return 0, False
-        began = budget.spent
-        if field.count:
-            if not apart:
-                field.condition(data, fold.train)
-            batch = data.batch(fold.val)
-            target, result = comparable(batch.target, data.site), field(batch.tx, batch.rx)
-            assert result.explained is not None
-            own = comparable(result.explained, data.site)
-            self.explained = solution_weights.explained(own, target, data.site.kind != "csi")
-        if isinstance(getattr(getattr(field, "process", None), "posterior", None), Nearest):
-            log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
-            return 0, field.count > 0
-        steps = self._most_steps(context)
-        if not (steps and learns(field)):
-            why = "nothing to move" if steps else "weights are in closed form (model.steps=N takes some)"
-            log.info("gradient steps: none, %s", why)
-            return 0, field.count > 0
-        each = factor_s(min(len(fold.train), MOST_FACTORED))  # about what a validation takes
-        if (BEFORE + AFTER) * each + LEAST_STEPS_S > budget.seconds - budget.spent:
-            log.info("gradient steps: none, no seconds are left")
-            return 0, field.count > 0
-        if not field.count:
-            field.condition(data, fold.train)  # as a validation does
-        left = budget.seconds - budget.spent - AFTER * (budget.spent - began)
-        if left < BEFORE * (budget.spent - began) or left < LEAST_STEPS_S:
-            log.info("gradient steps: none, no seconds are left")
-            return 0, True
-        inner = context.within("steps", resume=None)
-        module = GaussianModule(field, self.loss, self.rates, steps, inner.run_dir, Pace(steps, left))
-        files = GsparcCheckpointIO(self, context.config_yaml, {"stage": "steps"})
-        try:
-            ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
-        except KeyboardInterrupt:  # these steps are taken anew; what searches found is kept
-            searched = context.run_dir / "last.ckpt"
-            advice = f"go on with ckpt_path={searched}" if searched.exists() else "there is no checkpoint yet"
-            raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
-        return ran.steps, True
-
-    def _most_steps(self, context: FitContext) -> int:
-        if self.closed_forms_end:
-            return 0
-        return total_steps(context) if self.most_steps is None else self.most_steps
+        found = solve(chosen.parts, init, self.switches, data, fold, context)
+        self.field, self.started, self.runs = found.field, found.started, found.runs
+        self.explained, self.init_s, self.steps = found.explained, found.init_s, 0
+        return found.report
 
     def best_stations(
         self, data: Measurements, fold: Fold, context: FitContext
@@ -459,8 +331,9 @@ class PlannedField(LearnedField):
         if method is None:
             return self
         result = reduced(method, settings, measured)
-        more = isinstance(whole, Mixture) and whole.residual is not None
-        return Blended(result, whole.residual, whole.share) if more else result  # type: ignore[union-attr, arg-type]
+        if isinstance(whole, Mixture) and whole.residual is not None:
+            return Blended(result, whole.residual, whole.share)
+        return result
 
     # -- storing -----------------------------------------------------------------------------------
 
@@ -511,17 +384,3 @@ class PlannedField(LearnedField):
             "model/variance_explained": self.explained,
             "time/init_s": self.init_s,
         }
-
-
-def _with_cost(report: FitReport, cost: Cost) -> FitReport:
-    """The report of a fit, whose last line is what it cost."""
-    log.info("cost: %s", cost.described(report.limited_by))
-    return replace(report, cost=cost)
-
-
-def _late_gain(reports: dict[str, FitReport]) -> float | None:
-    """Least held-out error of solutions found in the first half of their seconds, over that of all."""
-    ends = np.cumsum([one.seconds for one in reports.values()])
-    early = [one for one, end in zip(reports.values(), ends, strict=True) if end <= ends[-1] / 2]
-    first, last = solutions.least_error(early), solutions.least_error(reports.values())
-    return first / max(last, 1e-12) if np.isfinite(first) else None

@@ -1,6 +1,6 @@
 """Fields whose weights are known in closed form once Gaussians and covariances are: conditioned on rows.
 
-What is learned by gradient are places, sizes and covariance parameters; the weights follow from the training
+Searches and likelihoods find places, sizes and covariance parameters; the weights follow from the training
 rows as in a Gaussian process (Rasmussen and Williams 2006, section 2.2), of which such a field is one: its
 covariance is a sum of terms, one of them the Gaussians'. Without Gaussians it is the plain process.
 """
@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.ops import Pose
-from gsparc.processes.conditioned import Conditioned
 
 
 @dataclass(frozen=True)
@@ -52,24 +51,19 @@ class LeftOutRows:
     variance: Tensor
 
 
-class ConditionalField(nn.Module, ABC):
-    """Parameters by gradient, weights in closed form.
-
-    `parameters()` are what gradient steps move; `condition` sets everything else.
+class ConditionalField(ABC):
+    """Gaussians and covariances as an initialiser found them; `condition` sets the weights.
 
     Attributes:
         kind: the initialiser that makes it, see `gsparc.models.fields.INITIALISERS`; none of composed ones.
         site: what the dataset declares; set where the field is made.
         held: rows of groups, predicted by searches that left their group out; None where none did.
-        rates: Adam's rate by the beginning of a parameter's name; what is not named has `RATE`.
     """
 
     kind: ClassVar[str] = ""
     site: Site
     held: LeftOutRows | None = None
-    reads_rows: ClassVar[bool] = False  # whether `answer` knows more than `forward`
-    RATE: ClassVar[float] = 0.01  # of logarithms of lengths and variances
-    rates: ClassVar[dict[str, float]] = {}
+    reads_rows: ClassVar[bool] = False  # whether `answer` knows more than places tell
 
     @property
     @abstractmethod
@@ -78,7 +72,7 @@ class ConditionalField(nn.Module, ABC):
 
     @property
     def forgets(self) -> bool:
-        """Whether `condition` on other rows leaves nothing of earlier ones but a few parameters."""
+        """Whether `condition` on other rows leaves nothing of earlier ones but a few numbers."""
         return False
 
     @property
@@ -86,20 +80,12 @@ class ConditionalField(nn.Module, ABC):
     def terms(self) -> tuple[str, ...]:
         """Terms that are computed, as in `model.effects`: `phase`, `power`, `residual` and so on."""
 
-    def loss(self, batch: Batch) -> Tensor:
-        """Loss per row (B,), differentiable in the parameters; of a field that has any.
-
-        The negative log density [nats per real entry] of each row given the others of the batch: the
-        leave-one-out predictive density.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has nothing that gradient steps move")
-
     @abstractmethod
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """Set the weights from rows (n,) with the parameters as they are; no gradients."""
+        """Set the weights from rows (n,)."""
 
     @abstractmethod
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
         """Answer at tx (B, 3) [m] and one shared or B receiver poses, local coordinates.
 
         Followed by autograd, and of double precision, where positions are float64.
@@ -107,8 +93,7 @@ class ConditionalField(nn.Module, ABC):
 
     def answer(self, batch: Batch) -> Posterior:
         """Answer rows, whose stations and runs may matter."""
-        result: Posterior = self(batch.tx, batch.rx)
-        return result
+        return self(batch.tx, batch.rx)
 
     def objects(self) -> SiteObjects:
         """What it found to stand in the site."""
@@ -121,21 +106,3 @@ class ConditionalField(nn.Module, ABC):
     @abstractmethod
     def state(self) -> dict[str, Any]:
         """Tensors, numbers and strings from which it is made again."""
-
-
-def learns(field: nn.Module) -> bool:
-    """Whether there is anything that gradient steps move."""
-    return any(parameter.requires_grad for parameter in field.parameters())
-
-
-def leave_one_out_density(covariance: Tensor, target: Tensor) -> Tensor:
-    """Negative log density (n,) [nats per real entry] of each row given the others.
-
-    Rasmussen and Williams (2006), eq. 5.10 to 5.12; circular where complex; up to a constant.
-
-    Args:
-        covariance: (n, n) real or complex, noise included.
-        target: (n, R).
-    """
-    residual, variance = Conditioned.of(covariance, target).left_out()
-    return (residual.abs().square() / variance[:, None] + variance.log()[:, None]).mean(1) / 2

@@ -32,7 +32,6 @@ log = logging.getLogger(__name__)
 
 TAKEN = "steps/taken"
 KEPT = ("steps/kept", "steps/kept_position")
-CONDITIONAL_ROWS = 256  # of a step of a conditional field: it factors a matrix of this size
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 
 # What conf/trainer/cpu.yaml says, for callers from Python.
@@ -151,9 +150,7 @@ def run_stage(
     before = budget.counted
     budget.pause()
     budget.go()  # what other processes go on from
-    if module.conditional:  # a row is predicted from the others of its batch
-        batches = Loaded(data, min(len(fold.train), CONDITIONAL_ROWS))
-    elif batches is None or batches.measurements is not data:
+    if batches is None or batches.measurements is not data:
         batches = Loaded(data, context.batch_size)
     batches.use(fold, context.seed)
     _quieten_lightning()
@@ -177,10 +174,7 @@ def run_stage(
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     options["max_steps"] = module.total_steps if pace is None else -1
     processes = Processes.named(make.keywords.get("strategy"))
-    if module.conditional and processes is not None:
-        log.info("weights in closed form: one process takes these steps, each needs all rows of its batch")
-        options |= {"devices": 1, "num_nodes": 1, "strategy": "auto"}
-    elif processes is not None:
+    if processes is not None:
         options["strategy"] = processes
     trainer = make(
         max_epochs=-1,

@@ -10,7 +10,6 @@ import lightning.pytorch as L
 import torch
 
 from gsparc.field import edit
-from gsparc.field.model import GaussianModel
 from gsparc.training.fit import KEPT
 from gsparc.training.module import GaussianModule
 from gsparc.training.processes import agreed
@@ -50,7 +49,6 @@ class KeepBest(L.Callback):
     def _measure(self, trainer: L.Trainer, module: GaussianModule) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
         if len(data.fold.val):
-            module.prepare_validation(data)
             with torch.no_grad():
                 parts = [(len(b), module.error(b.to(module.device)).mean()) for b in data.val_dataloader()]
             error = sum(n * float(e) for n, e in parts) / sum(n for n, _ in parts)
@@ -82,8 +80,7 @@ class KeepBest(L.Callback):
         if self.step == trainer.global_step:
             return
         model = module.model
-        if isinstance(model, GaussianModel):
-            edit.resize(model, model.gaussians, len(self._kept["gaussians.ids"]))
+        edit.resize(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
         steps = trainer.global_step
         log.info(

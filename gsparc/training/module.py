@@ -18,9 +18,8 @@ from gsparc.field.confidence import weighted
 from gsparc.field.initial import Snapshot
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian
-from gsparc.training.conditional import ConditionalField
 from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ssim
-from gsparc.training.optimizer import OptimizerSettings, conditional_optimizer, optimizer_for, scheduler_for
+from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.training.pace import Pace
 from gsparc.training.processes import count
 from gsparc.training.schedule import in_steps
@@ -46,7 +45,7 @@ class NonFiniteLoss(RuntimeError):
 
 
 class GaussianModule(L.LightningModule):
-    """Trains a Gaussian field: by rendering, or by the density of left-out rows where weights follow.
+    """Trains a Gaussian field by rendering.
 
     Args:
         model: what is trained.
@@ -58,11 +57,11 @@ class GaussianModule(L.LightningModule):
     """
 
     def __init__(
-        self, model: GaussianModel | ConditionalField, loss: LossSettings, optimizer: OptimizerSettings,
+        self, model: GaussianModel, loss: LossSettings, optimizer: OptimizerSettings,
         total_steps: int, run_dir: Path, pace: Pace | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.model: Any = model
+        self.model = model
         self.loss, self.rates = loss, optimizer
         self.total_steps, self.run_dir, self.pace = total_steps, run_dir, pace
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
@@ -86,11 +85,6 @@ class GaussianModule(L.LightningModule):
             self.global_step if self.pace is None else self.pace.passed(in_steps(interval, self.total_steps))
         )
 
-    @property
-    def conditional(self) -> bool:
-        """Whether weights follow from the rows in closed form."""
-        return isinstance(self.model, ConditionalField)
-
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Loss per sample (B,) before confidence; what was not measured counts as met."""
         if self.model.site.kind == "spectrum":
@@ -109,9 +103,6 @@ class GaussianModule(L.LightningModule):
     def training_step(self, batch: Batch, step: int) -> Tensor:
         """Confidence-weighted loss of a batch."""
         self.batch = batch
-        if self.conditional:
-            # A variance weighs every error in this density, as the confidence does below.
-            return self._checked(self.model.loss(batch), batch)
         self.rendered = self._render(batch)
         task = self.task_loss(self.rendered.mean, batch)
         confidence = self.model.confidence
@@ -120,11 +111,6 @@ class GaussianModule(L.LightningModule):
         else:
             exponent = confidence.exponent(self.model.site.moving(batch.tx, batch.rx))
             loss = weighted(task, exponent, confidence.settings.alpha).mean()
-        return self._checked(task, batch, loss)
-
-    def _checked(self, task: Tensor, batch: Batch, loss: Tensor | None = None) -> Tensor:
-        """The loss, or the mean of its samples' (B,), logged and known to be finite."""
-        loss = task.mean() if loss is None else loss
         if not torch.isfinite(loss):
             bad = ~torch.isfinite(task)
             raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
@@ -145,33 +131,20 @@ class GaussianModule(L.LightningModule):
     @property
     def count(self) -> int:
         """Number of Gaussians."""
-        return self.model.count if self.conditional else len(self.model.gaussians)
-
-    def prepare_validation(self, data: Any) -> None:
-        """Closed-form weights of the training rows with the parameters as they are."""
-        if self.conditional:
-            self.model.condition(data.measurements, data.fold.train)
-
-    def on_validation_epoch_start(self) -> None:
-        """See `prepare_validation`."""
-        self.prepare_validation(self.trainer.datamodule)  # type: ignore[attr-defined]
+        return len(self.model.gaussians)
 
     def error(self, batch: Batch) -> Tensor:
         """Squared error of each row (B,): per entry, of powers in decibels."""
-        return squared_error(self._mean(batch), batch, str(self.site.kind))
+        return squared_error(self._render(batch).mean, batch, str(self.site.kind))
 
     @property
     def site(self) -> Any:
         """What the data declare."""
         return self.model.site
 
-    def _mean(self, batch: Batch) -> Tensor:
-        result = self.model(batch.tx, batch.rx) if self.conditional else self._render(batch)
-        return result.mean
-
     def validation_step(self, batch: Batch, step: int) -> None:
         """Log validation figures."""
-        mean = self._mean(batch)
+        mean = self._render(batch).mean
         if batch.mask is not None:
             mean = torch.where(batch.mask, mean, batch.target)
         size = len(batch)
@@ -189,7 +162,7 @@ class GaussianModule(L.LightningModule):
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:
         """Targets (B, ...) in stored units, spectra within [0, 1]."""
-        mean = self._mean(batch)
+        mean = self._render(batch).mean
         return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
 
     def test_step(self, batch: Batch, step: int) -> None:
@@ -205,16 +178,13 @@ class GaussianModule(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """One Adam group per tensor, rates as pure functions of the step."""
-        if self.conditional:
-            return conditional_optimizer(self.model)
         optimizer = optimizer_for(self.model, self.rates)
         scheduler = scheduler_for(optimizer, self.rates, self.total_steps, self.pace)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:
         """Make room for the number of Gaussians before their tensors arrive."""
-        if not self.conditional:
-            edit.resize(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
+        edit.resize(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
         return super().load_state_dict(state_dict, *rest, **named)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -224,7 +194,7 @@ class GaussianModule(L.LightningModule):
 
     def _offender(self) -> str | None:
         """The first parameter that is not finite, with the id of its Gaussian; None when all are."""
-        rows = {} if self.conditional else edit.row_parameters(self.model, len(self.model.gaussians))
+        rows = edit.row_parameters(self.model, len(self.model.gaussians))
         for name, parameter in self.model.named_parameters():
             bad = ~torch.isfinite(parameter)
             if not bad.any():

@@ -10,7 +10,6 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
 from gsparc.data.limits import Checked, internal, number, setting, whole
-from gsparc.training.conditional import ConditionalField
 from gsparc.training.pace import Pace
 
 RATE = number(0)
@@ -71,24 +70,6 @@ def optimizer_for(model: nn.Module, settings: OptimizerSettings) -> Adam:
         if parameter.requires_grad
     ]
     return Adam(groups, eps=settings.eps, fused=True)
-
-
-def conditional_optimizer(field: ConditionalField) -> Adam:
-    """Adam with constant rates, a tensor per group: `rates` of a field by the last part of the name."""
-    groups = []
-    for name, parameter in field.named_parameters():
-        own = [part for part in _owner(field, name).rates.items() if part[0] in name.split(".")]
-        groups.append({"params": [parameter], "lr": own[0][1] if own else field.RATE, "name": name})
-    return Adam(groups)
-
-
-def _owner(field: ConditionalField, name: str) -> ConditionalField:
-    """The innermost field that a parameter belongs to."""
-    owner, module = field, field
-    for part in name.split(".")[:-1]:
-        module = getattr(module, part)
-        owner = module if isinstance(module, ConditionalField) else owner
-    return owner
 
 
 def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -> float:

@@ -15,7 +15,7 @@ def module():
     with torch.no_grad():
         field.opacity_logits.copy_(torch.tensor([3.0, 0.0, -9.0, 5.0]))
     model = SimpleNamespace(gaussians=field)
-    return SimpleNamespace(model=model, total_steps=60, global_step=0, conditional=False, solved=False)
+    return SimpleNamespace(model=model, total_steps=60, global_step=0, solved=False)
 
 
 def trainer(module, step: int) -> SimpleNamespace:

@@ -90,7 +90,7 @@ def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
     model, trainer = fresh(count)
     optimizer = trainer.optimizers[0]
     module = SimpleNamespace(
-        model=model, total_steps=99, global_step=0, conditional=False, solved=False,
+        model=model, total_steps=99, global_step=0, solved=False,
         schedule_step=lambda interval: trainer.global_step,
     )  # fmt: skip
     draw = torch.Generator().manual_seed(seed)

@@ -160,10 +160,17 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     assert all(line.startswith(("effects.", "the residual is all there is")) for line in before)
     init = "+".join(part for part in first.partition("init=")[2].split(",")[:1])
     assert ("by rendering" in first) == (fitted.method.field is None) and init
-    assert "callbacks" in first and " steps" in first
+    assert ("callbacks" in first) == (" steps" in first) == ("by rendering" in first)
     last = fitted.lines[-1]
     assert last.startswith("cost: ")
     assert f" of {fitted.report.seconds:.1f} s without weight" in last
+
+
+def test_steps_that_closed_forms_do_not_take_are_named():
+    fitted = fit("powers", "model.steps=7")
+    assert "model.steps=7 is not used: closed-form weights take no steps" in fitted.lines
+    assert fitted.method.facts()["model/steps"] == 0
+    assert not any("is not used" in line for line in default("powers").lines)
 
 
 @pytest.mark.parametrize("name", KINDS)

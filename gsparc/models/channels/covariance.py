@@ -95,7 +95,7 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class Values(Shape):
-    """The terms, and what is learned by gradient.
+    """The terms and their numbers.
 
     Attributes:
         power: (P,) float64, see `Shape.names`; relative to each group's scale.

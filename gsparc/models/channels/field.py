@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.channels.columns import Group, Slot, gather, query_ends, run_factors_of, static_place
 from gsparc.models.channels.common import Common
 from gsparc.models.channels.covariance import (
-    Shape,
     Values,
     diffuse_of,
     directional,
@@ -36,6 +35,7 @@ from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
 CHECKED = 64  # rows that this is tried at
+NUMBERS = ("power", "envelope", "gain", "offset", "towards", "planes")  # of `Values`
 
 
 @dataclass(frozen=True)
@@ -82,29 +82,15 @@ class ChannelField(ConditionalField):
 
     Args:
         site: kind csi, of a known carrier; one end static, or several stations.
-        values: the terms, and where learning starts.
+        values: the terms and their numbers.
         channel: (A, K) of the targets.
-
-    Attributes:
-        log_power: (P,) of `Shape.names`, relative to each group's scale.
-        log_envelope, log_gain: lengths [log m].
-        offset: (3,) of static ends [m].
-        towards, planes: (J,), (W, 4) see `Values`.
     """
 
     kind = "diffuse"
     reads_rows = True
 
     def __init__(self, site: Site, values: Values, channel: tuple[int, int]) -> None:
-        super().__init__()
-        self.site, self.shape, self.channel = site, Shape(**values.state()), channel
-        self.log_power = nn.Parameter(values.power.log())
-        self.log_envelope = nn.Parameter(values.envelope.log())
-        self.log_gain = nn.Parameter(values.gain.log())
-        self.offset = nn.Parameter(values.offset.clone())
-        # An empty parameter would have no slope.
-        self.towards = nn.Parameter(values.towards.clone()) if len(values.towards) else values.towards
-        self.planes = nn.Parameter(values.planes.clone()) if len(values.planes) else values.planes
+        self.site, self.values, self.channel = site, values, channel
         self.weights: tuple[Weights, ...] = ()
         self.stations: dict[int, list[Weights]] = {}
         self.common: Common | None = None
@@ -112,34 +98,19 @@ class ChannelField(ConditionalField):
         self.runs = RunFactors.none()
 
     @property
-    def values(self) -> Values:
-        """The parameters as they are, differentiable."""
-        return Values(
-            **self.shape.state(), power=self.log_power.exp(), envelope=self.log_envelope.exp(),
-            gain=self.log_gain.exp(), offset=self.offset, towards=self.towards, planes=self.planes,
-        )  # fmt: skip
-
-    @property
-    def _constants(self) -> Values:
-        """The parameters as they are, as constants."""
-        values = self.values
-        learned = ("power", "envelope", "gain", "offset", "towards", "planes")
-        return replace(values, **{name: getattr(values, name).detach() for name in learned})
-
-    @property
     def apart(self) -> bool:
         """Whether antennas and tones have covariances of their own."""
-        return self.shape.direct or self.count > 0
+        return self.values.direct or self.count > 0
 
     @property
     def count(self) -> int:
         """Images."""
-        return self.shape.count
+        return self.values.count
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `mirrors`, `drift`."""
-        shape = self.shape
+        shape = self.values
         on = {
             "residual": True,
             "directions": len(shape.angles) > 0,
@@ -152,38 +123,8 @@ class ChannelField(ConditionalField):
 
     def objects(self) -> SiteObjects:
         """The mirror planes that static ends share."""
-        planes = self.planes.detach().numpy()
+        planes = self.values.planes.numpy()
         return SiteObjects.of(planes=planes if len(planes) else None)
-
-    def loss(self, batch: Batch) -> Tensor:
-        """See `ConditionalField`; needs `condition` first, for the scales.
-
-        Raises:
-            ValueError: not conditioned yet.
-        """
-        moving, _, turned, nearest = query_ends(self.site, batch.tx, batch.rx)
-        station = self._numbers(batch.station, nearest)
-        target = batch.target.cpu().to(torch.complex128) / self.runs.of(batch.run)[:, None, None]
-        values = self.values
-        total, entries = torch.zeros(len(moving), dtype=torch.float64), torch.zeros(len(moving))
-        for known in self._conditioned():
-            slot = known.group.slot
-            here = torch.nonzero(station == slot.station).flatten()
-            if batch.mask is not None and len(here):
-                here = here[_entries(batch.mask.cpu(), here, slot).all(1)]
-            if not len(here):
-                continue
-            order = batch.index[here].double().cpu()
-            run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
-            places = slot.places(moving[here], turned[here])
-            group = Group(slot, here, places, _entries(target, here, slot), run, order)
-            error, variance = Conditioned.of(_covariances((group,), values)[0], group.target).left_out()
-            variance = known.scale * variance
-            density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
-            outputs = group.target.shape[1]
-            total = total.index_add(0, here, density * outputs / 2)
-            entries = entries.index_add(0, here, torch.full((len(here),), float(outputs)))
-        return total / entries.clamp_min(1)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`; factors of runs are estimated by likelihood where there are several.
@@ -197,9 +138,7 @@ class ChannelField(ConditionalField):
             )
         self.rows = np.asarray(rows)
         runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
-        groups = gather(data, self.rows, self.apart)
-        with torch.no_grad():
-            self._solve(groups, runs, None)
+        self._solve(gather(data, self.rows, self.apart), runs, None)
 
     def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
         """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
@@ -218,12 +157,10 @@ class ChannelField(ConditionalField):
         for known in weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
         heard = [(known.group, known.given.weights, known.scale) for known in weights]
-        self.common = Common.of(self._constants, heard) if len(self.stations) > 1 else None
+        self.common = Common.of(values, heard) if len(self.stations) > 1 else None
 
-    def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
+    def __call__(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
         """See `ConditionalField`; in the phase and level of the largest run.
-
-        Differentiable in the places, not in the parameters, which the weights depend on as well.
 
         Args:
             tx, rx: see `ConditionalField`.
@@ -262,7 +199,7 @@ class ChannelField(ConditionalField):
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
-        values, size = self._constants, math.prod(self.channel)
+        values, size = self.values, math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
         share = torch.zeros_like(mean) if self.count else mean
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
@@ -321,7 +258,7 @@ class ChannelField(ConditionalField):
     ) -> None:
         """Write what ends have in common for queries `here` of a static end at `place` (3,)."""
         assert self.common is not None
-        size, values = math.prod(self.channel), self._constants
+        size, values = math.prod(self.channel), self.values
         for template in next(iter(self.stations.values())):
             slot = template.group.slot
             slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
@@ -340,17 +277,16 @@ class ChannelField(ConditionalField):
         values = self.values
         mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
         variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
-        with torch.no_grad():
-            for known in self._conditioned():
-                group, outputs = known.group, known.group.target.shape[1]
-                other = disturbance(values, group).to(torch.complex128)
-                residual, error = known.given.left_out_signal(other)
-                assert error is not None
-                predicted = group.target - residual
-                group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
-                level = known.scale * outputs * self.runs.factors[group.run].abs().square()
-                variance.index_add_(0, group.rows, error * level)
-                entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
+        for known in self._conditioned():
+            group, outputs = known.group, known.group.target.shape[1]
+            other = disturbance(values, group).to(torch.complex128)
+            residual, error = known.given.left_out_signal(other)
+            assert error is not None
+            predicted = group.target - residual
+            group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
+            level = known.scale * outputs * self.runs.factors[group.run].abs().square()
+            variance.index_add_(0, group.rows, error * level)
+            entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
         return LeftOutRows(self.rows, mean, (variance / entries.clamp_min(1)).float())
 
     def _conditioned(self) -> tuple[Weights, ...]:
@@ -363,10 +299,9 @@ class ChannelField(ConditionalField):
     def state(self) -> dict[str, Any]:
         """See `ConditionalField`; factors are computed again by `restored`."""
         groups = [each.group for each in self._conditioned()]
-        values = {name: value.detach() for name, value in self.named_parameters()}
         return {
-            "shape": self.shape.state(),
-            "values": values,
+            "shape": self.values.state(),
+            "values": {name: getattr(self.values, name) for name in NUMBERS},
             "channel": list(self.channel),
             "rows": torch.from_numpy(self.rows),
             **self.runs.state(),
@@ -383,19 +318,15 @@ class ChannelField(ConditionalField):
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
-    shape, values = dict(state["shape"]), state["values"]
+    shape, values = dict(state["shape"]), dict(state["values"])
     shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
-    learned = {name: values[name] for name in ("offset", "towards", "planes") if name in values}
-    logs = {name: values[f"log_{name}"].exp() for name in ("power", "envelope", "gain")}
+    for name in [name for name in values if name.startswith("log_")]:  # of earlier files
+        values[name.removeprefix("log_")] = values.pop(name).exp()
     antennas, tones = (int(n) for n in state["channel"])
-    field = ChannelField(site, Values(**shape, **learned, **logs), (antennas, tones))
-    with torch.no_grad():
-        for name, parameter in field.named_parameters():
-            parameter.copy_(values[name])
+    field = ChannelField(site, Values(**shape, **values), (antennas, tones))
     field.rows, runs = state["rows"].numpy(), RunFactors.read(state)
     groups = tuple(Group(**{**each, "slot": _read(each["slot"])}) for each in state["groups"])
-    with torch.no_grad():
-        field._solve(groups, runs.runs, runs.factors)
+    field._solve(groups, runs.runs, runs.factors)
     return field
 
 
@@ -415,8 +346,3 @@ def _read(state: dict[str, Any]) -> Slot:
     end = state["end"] if len(state["end"]) else torch.full((3,), torch.nan, dtype=torch.float64)
     entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
     return Slot(**{**state, **entries, "end": end})
-
-
-def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:
-    """Entries (n, D) of a slot, of `rows` of (B, A, K)."""
-    return whole[rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(rows), -1)

@@ -139,8 +139,6 @@ def initialise(
     channel = (int(data.target.shape[1]), int(data.target.shape[2]))
     field = ChannelField(data.site, best.values, channel)
     field.condition(data, rows)
-    # Steps on a few rows of each end would find less than the likelihood of all of them has.
-    field.requires_grad_(ends_of(search.every) == 1)
     return field, (*notes, *more)
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.ops import Pose
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior, learns
+from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 
 
 class Mixture(ConditionalField):
@@ -34,8 +34,7 @@ class Mixture(ConditionalField):
         residual: ConditionalField | None = None,
         share: float = 0.0,
     ) -> None:
-        super().__init__()
-        self.members = nn.ModuleList(members)
+        self.members = list(members)
         self.weights = tuple(float(weight) for weight in weights)
         self.residual, self.share = residual, float(share)
         if len(members) == 1:
@@ -43,7 +42,7 @@ class Mixture(ConditionalField):
 
     def parts(self) -> Iterator[tuple[float, ConditionalField]]:
         """Fields that are no mixtures, with their weights in the mean."""
-        for weight, one in zip(self.weights, self._fields(), strict=True):
+        for weight, one in zip(self.weights, self.members, strict=True):
             if isinstance(one, Mixture):
                 yield from ((weight * more, part) for more, part in one.parts())
             else:
@@ -52,41 +51,33 @@ class Mixture(ConditionalField):
     @property
     def count(self) -> int:
         """Gaussians of all members."""
-        return sum(member.count for member in self._fields())
+        return sum(member.count for member in self.members)
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Terms of any member, and the residual."""
         more = () if self.residual is None else ("residual",)
-        return tuple(dict.fromkeys([*(term for one in self._fields() for term in one.terms), *more]))
+        return tuple(dict.fromkeys([*(term for one in self.members for term in one.terms), *more]))
 
     def objects(self) -> SiteObjects:
         """Those of the heaviest member that found any."""
-        result = [self._fields()[i].objects() for i in np.argsort(self.weights)[::-1]]
+        result = [self.members[i].objects() for i in np.argsort(self.weights)[::-1]]
         return next((one for one in result if len(one)), result[0])
-
-    def _fields(self) -> list[ConditionalField]:
-        return list(self.members)  # type: ignore[arg-type]
-
-    def loss(self, batch: Batch) -> Tensor:
-        """Weighed losses of those members that have parameters; the residual's follow from its likelihood."""
-        learning = [(w, m) for w, m in zip(self.weights, self._fields(), strict=True) if learns(m)]
-        return torch.stack([weight * member.loss(batch) for weight, member in learning]).sum(0)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """Every member on the same rows, then the process on what they leave."""
-        for member in self._fields():
+        for member in self.members:
             member.condition(data, rows)
         if self.residual is not None:
             left = self._mean_left_out()
             self.residual.condition(residuals(left, data), left.rows)
 
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
         """The mean of all; what they disagree about is added to their variances.
 
         The variance errs high by what the residual explains.
         """
-        result = [member(tx, rx) for member in self._fields()]
+        result = [member(tx, rx) for member in self.members]
         pairs = list(zip(self.weights, result, strict=True))
         mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
         apart = [(one.mean - mean).abs().square().flatten(1).mean(1) for one in result]
@@ -108,7 +99,7 @@ class Mixture(ConditionalField):
         return replace(result, mean=result.mean + self.share * self.residual.left_out().mean)
 
     def _mean_left_out(self) -> LeftOutRows:
-        result = [member.left_out() for member in self._fields()]
+        result = [member.left_out() for member in self.members]
         pairs = list(zip(self.weights, result, strict=True))
         mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
         variance = torch.stack([weight * one.variance for weight, one in pairs]).sum(0)

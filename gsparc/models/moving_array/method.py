@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -89,9 +89,6 @@ class MovingArrayField(Differentiable):
         seed: of the first search; the others have the next ones.
         name: as it appears in tables.
         most_searches: with a budget, at most so many; None: as many as help.
-
-    Attributes:
-        left_powers: per search (n, K) float32, powers that the others' predict of each training row.
     """
 
     effects = "moving_array"
@@ -117,7 +114,6 @@ class MovingArrayField(Differentiable):
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
         self.seed, self.name, self.most_searches = seed, name, most_searches
         self.trends: list[Trend] = []
-        self.left_powers: list[Tensor] = []
         self._budget = TimeBudget()
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -150,7 +146,7 @@ class MovingArrayField(Differentiable):
         self.exponent = self._exponent(targets)
         self.basis = separable(self._blocks(targets), UNRESOLVED)
         spectra = self._spectra(positions, targets)
-        self.trends, self.left_powers, errors = [], [], []
+        self.trends, errors = [], []
         modelled = torch.zeros_like(spectra.values)  # sum over searches of left-out images
         while True:
             start = time.perf_counter()
@@ -184,13 +180,12 @@ class MovingArrayField(Differentiable):
         return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
 
     @torch.no_grad()
-    def condition(self, data: Measurements, rows: np.ndarray, sources: Sequence[Tensor]) -> np.ndarray:
-        """Powers, trends, residual and errors anew, with the kernels of the fit.
+    def condition(self, data: Measurements, rows: np.ndarray) -> np.ndarray:
+        """Powers, trends, residual and errors anew, with the sources and kernels of the fit.
 
         Args:
             data: of the site that was fitted.
             rows: (n,) to learn from.
-            sources: (K, 3) [m] of each search.
 
         Returns:
             Those of the rows where something was heard.
@@ -199,11 +194,10 @@ class MovingArrayField(Differentiable):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
-        spectra, kernels = self._spectra(data.moving[rows], targets), [trend.kernel for trend in self.trends]
-        self.trends, self.left_powers = [], []
+        spectra, before, self.trends = self._spectra(data.moving[rows], targets), self.trends, []
         modelled = torch.zeros_like(spectra.values)
-        for place, kernel in zip(sources, kernels, strict=True):
-            modelled += self._add(spectra, place, self._powers(spectra, place), kernel)
+        for one in before:
+            modelled += self._add(spectra, one.sources, self._powers(spectra, one.sources), one.kernel)
         self._complete(spectra, modelled / len(self.trends), self.residual.kernel, targets)
         return rows
 
@@ -253,8 +247,7 @@ class MovingArrayField(Differentiable):
         """Append the trend of powers (n, K); its left-out images (n, R)."""
         trend, left = fit_trend(sources, kernel, spectra.places, power)
         self.trends.append(trend)
-        self.left_powers.append(torch.from_numpy(left).float())
-        return self._modelled(spectra, sources, self.left_powers[-1])
+        return self._modelled(spectra, sources, torch.from_numpy(left).float())
 
     def _modelled(self, spectra: Spectra, sources: Tensor, power: Tensor) -> Tensor:
         """Images (n, R) of sources of powers (n, K)."""
@@ -281,7 +274,6 @@ class MovingArrayField(Differentiable):
         self.positions, missed = spectra.places, spectra.values - modelled
         self.residual, added = fit_residual(kernel, spectra.places, missed, self.components)
         self._left, self._query = modelled + added, None
-        self.trend_error = max(float(missed.square().mean(0).sum()) / targets[0].size, 1e-12)
         energy = added.square().sum(1) / targets[0].size
         relative, features, errors = [], [], []
         for start, image in zip(range(0, len(targets), BLOCK), self._blocks(targets), strict=True):

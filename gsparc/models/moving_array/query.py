@@ -49,10 +49,9 @@ class Array:
         """Lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
         return self.space.atoms(bearings(sources, receivers, self.rotation))
 
-    def render(self, sources: Tensor, receivers: Tensor, power: Tensor, least: float = 0.0) -> Tensor:
-        """Images (n, H, W) of sources of powers (n, K), pixels of power at least `least`."""
+    def render(self, sources: Tensor, receivers: Tensor, power: Tensor) -> Tensor:
+        """Images (n, H, W) of sources of powers (n, K)."""
         images = self.space.spectrum(mixture(power, self.atoms(sources, receivers)), self._pixels)
-        images = images.clamp_min(least) if least else images
         if self.exponent == 1 or not followed(images):
             return images if self.exponent == 1 else images.sqrt()
         bright = images > 0  # at 0 a root has no slope

@@ -65,8 +65,8 @@ class LearnedField(Method):
         init: where Gaussians come from; `auto` solves the emission in closed form where it can.
         refit: after validation, train again on training and validation rows together.
         keep_best: end with the parameters of the best validation, and end early when none is better.
-        steps: of gradient, at most; None: `trainer.max_steps`; `auto`: none after a start in closed form,
-            which they did not better on held-out rows, else `trainer.max_steps`.
+        steps: of gradient, at most, where it is rendered; None: `trainer.max_steps`; `auto`: none after a
+            start in closed form, which they did not better on held-out rows, else `trainer.max_steps`.
         guesses: settings the source of this configuration does not give, one line each.
     """
 

@@ -94,7 +94,7 @@ def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
 def test_no_wall_is_kept_where_there_is_none():
     data = _data(*_site([], ends=4, count=50, side=0.4, turned=2.0))
     field, _ = initialise(data, np.arange(len(data)), ChannelSettings(mirrors=2, directions=False))
-    assert field.shape.sequences == () and not len(field.objects().planes)
+    assert field.values.sequences == () and not len(field.objects().planes)
 
 
 def test_a_plane_between_an_end_and_the_places_mirrors_nothing():

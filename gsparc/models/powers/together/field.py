@@ -39,7 +39,7 @@ UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
 
 
 class JointPowerField(ConditionalField):
-    """See `ConditionalField`; targets are linear powers (1,). Nothing in it moves with gradients.
+    """See `ConditionalField`; targets are linear powers (1,).
 
     Args:
         site: of powers, with several stations.
@@ -64,7 +64,6 @@ class JointPowerField(ConditionalField):
         inflation: float = 1.0,
         seed: int = 0,
     ) -> None:
-        super().__init__()
         self.site, self.places, self.own, self.seed = site, places, own, seed
         self.heard, self.unheard, self.inflation = heard, unheard, inflation
         self.posterior: Shared | None = None
@@ -95,7 +94,7 @@ class JointPowerField(ConditionalField):
         self.whole = max(float(loud.decibels.var()), self.own.variance)
         self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
 
-    def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
+    def __call__(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
         """See `ConditionalField`; (B, 1) linear powers.
 
         Args:
@@ -121,7 +120,7 @@ class JointPowerField(ConditionalField):
 
     def answer(self, batch: Batch) -> Posterior:
         """See `ConditionalField`; two stations may stand at one place."""
-        return self.forward(batch.tx, batch.rx, batch.station)
+        return self(batch.tx, batch.rx, batch.station)
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
