@@ -133,10 +133,10 @@ UPLINK = ("ridge", "fire", "uplink")
 
 
 def trained(name, data, fold, folder):
-    """Test predictions after a second or two of training."""
-    config = compose(f"model={name}", "budget_s=1.5", *(["model.steps=20"] if name == "fire" else []))
+    """Test predictions after half a second of training."""
+    config = compose(f"model={name}", "budget_s=0.5", *(["model.steps=20"] if name == "fire" else []))
     method = build(config.model)
-    method.fit(data, fold, short(folder, 4, budget_s=1.5))
+    method.fit(data, fold, short(folder, 4, budget_s=0.5))
     return method.answer(data.batch(fold.test)).mean
 
 

@@ -82,7 +82,7 @@ def test_a_probe_gains_what_the_likelihood_rises():
 
 
 def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
-    data = _data(*_site([WALL], ends=5, count=60, side=0.7, turned=2.0))
+    data = _data(*_site([WALL], ends=4, count=50, side=0.7, turned=2.0))
     groups, values = _bare(data)
     parts = compressed(groups, values)
     planes, _ = find_mirrors(parts, parts, values, WAVELENGTH, 1, lambda: False)
@@ -92,7 +92,7 @@ def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
 
 
 def test_no_wall_is_kept_where_there_is_none():
-    data = _data(*_site([], ends=4, count=50, side=0.4, turned=2.0))
+    data = _data(*_site([], ends=4, count=36, side=0.4, turned=2.0))
     field, _ = initialise(data, np.arange(len(data)), ChannelSettings(mirrors=2, directions=False))
     assert field.shape.sequences == () and not len(field.objects().planes)
 

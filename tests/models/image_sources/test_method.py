@@ -44,7 +44,7 @@ def found_share(method, told, within=0.1, order=2):
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     torch.manual_seed(0)
-    told, data, fold = shoebox(200, size=(3.0, 2.5, 2.2), max_order=1)
+    told, data, fold = shoebox(150, size=(3.0, 2.5, 2.2), max_order=1)
     return told, data, fold, *fitted(data, fold, tmp_path_factory.mktemp("run"))
 
 
@@ -147,7 +147,7 @@ def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
 
 def test_a_moving_transmitter_is_a_moving_receiver(tmp_path):
     """Searched at the receiver, which stands still, nothing was found (NMSE 1); gsparc did not even try."""
-    told, data, fold = shoebox(200, size=(3.0, 2.5, 2.2), max_order=1)
+    told, data, fold = shoebox(100, size=(3.0, 2.5, 2.2), max_order=1)
     arrays = as_arrays(told)
     arrays["rx_position"], arrays["tx_position"] = arrays["tx_position"], arrays["rx_position"]
     swapped = from_arrays(arrays)
@@ -172,7 +172,7 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     mask[..., ::4] = True
     known = replace(data, mask=mask)
     assert set(gather(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
-    method, _ = fitted(known, fold, tmp_path, search_rows=200)
+    method, _ = fitted(known, fold, tmp_path)
     prediction = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
 

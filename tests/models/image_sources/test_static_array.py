@@ -160,7 +160,7 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
 
 def test_rotated_array_and_tones(tmp_path):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    data, fold = _uplink(100, antennas=2, tones=CARRIER + 5e6 * np.arange(3), rotation=turn)
+    data, fold = _uplink(60, antennas=2, tones=CARRIER + 5e6 * np.arange(3), rotation=turn)
     method, _ = fitted(data, fold, tmp_path)
     assert error(method, data, fold.test) < 0.02
     rows = np.arange(len(data))[:, None, None]

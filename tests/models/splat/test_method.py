@@ -23,11 +23,11 @@ def learned(file, *more: str) -> LearnedField:
     return build(compose(*brief(file, *more)).model)
 
 
-def fitted(file, run_dir, *more: str, steps: int = 15):
+def fitted(file, run_dir, *more: str, steps: int = 15, every: int | None = None):
     data = load_data({"name": "own", "file": str(file)})
     fold = split_for({"name": "random"}, data).folds[0]
     method = learned(file, *more)
-    method.fit(data, fold, short(run_dir, steps, every=5, validate_every=10))
+    method.fit(data, fold, short(run_dir, steps, every=every, validate_every=10))
     return method, data, fold
 
 
@@ -123,7 +123,7 @@ def test_an_edit_after_a_prediction_is_seen_by_the_next(tmp_path):
 def test_a_run_on_a_single_tone_can_be_resumed(tmp_path, cut):
     """`loaded state dict has a different number of parameter groups`: its delays are not learned."""
     file = channels(tmp_path / "own.npz", shape="S")
-    method, data, fold = fitted(file, tmp_path)
+    method, data, fold = fitted(file, tmp_path, every=5)
     resumed = learned(file)
     context = short(tmp_path / "on", 15, every=5, validate_every=10, resume=tmp_path / cut)
     resumed.fit(data, fold, context)
