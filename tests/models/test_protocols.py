@@ -129,11 +129,21 @@ def test_a_method_is_what_the_table_says(name):
 
 
 @pytest.mark.parametrize("name", VARIANCE)
-def test_predictions_have_a_variance(name):
+def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, tmp_path):
+    """Its state alone says all, without the settings."""
     method = fitted(name)[0]
-    variance = method.predict(*ends(method, places(method).float())).variance
+    query = ends(method, places(method).float())
+    said = method.predict(*query)
+    variance = said.variance
     assert variance is not None and variance.shape == (5,)
     assert variance.dtype == torch.float32 and (variance > 0).all()
+    torch.save(method.state(), tmp_path / "state.pt")
+    again = method_class(name)()
+    again.restore(method.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    told = again.predict(*query)
+    for part in ("mean", "confidence", "variance"):
+        torch.testing.assert_close(getattr(told, part), getattr(said, part))
+    assert again.size() == method.size()
 
 
 def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):

@@ -91,16 +91,6 @@ def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted
     assert torch.isfinite(there.mean).all() and there.mean.min() >= 0 and there.mean.max() <= 1
 
 
-def test_a_restored_model_predicts_the_same(data, fold, fitted, tmp_path):
-    batch = data.batch(fold.test)
-    torch.save(fitted.state(), tmp_path / "state.pt")
-    again = MovingArrayField()
-    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    one, two = (m.predict(batch.tx, batch.rx) for m in (fitted, again))
-    torch.testing.assert_close(one.mean, two.mean)
-    torch.testing.assert_close(one.confidence, two.confidence)
-
-
 def test_several_searches_are_averaged(data, fold, split, tmp_path):
     once, twice = (MovingArrayField(search=QUICK, components=64, searches=count) for count in (1, 2))
     notes = [method.fit(data, fold, FitContext(tmp_path)).notes[0] for method in (once, twice)]
