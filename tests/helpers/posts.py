@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
 
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5], [20, 20, 5]])
 
@@ -38,8 +36,3 @@ def heard(
     if "csi" not in more:
         arrays["rssi_db"] = rssi_db(distances(count, posts))
     return from_arrays(arrays)
-
-
-def fold_of(data: Measurements, **split: Any) -> Fold:
-    """The first fold of a split, `random` unless said."""
-    return split_for({"name": "random", **split}, data).folds[0]

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from posts import POSTS, fold_of, heard
+from posts import POSTS, heard
+from scenes import fold_of
 
 from gsparc.models import checkpoint, parts
 from gsparc.models.baselines.nearest import Nearest

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from posts import POSTS, distances, fold_of, free_space, heard, walked
+from posts import POSTS, distances, free_space, heard, walked
 from releases import REAL
+from scenes import fold_of
 
 import gsparc
 from gsparc.data.load import split_for

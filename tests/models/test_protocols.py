@@ -16,10 +16,11 @@ import torch
 from campaigns import RENDERED, channels, compose, powers, spectra
 from contexts import short
 from rooms import directed, shoebox
+from scenes import fold_of
 
 from gsparc.data.load import load
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import method as protocols
 from gsparc.models.channels import complex_gp
@@ -95,7 +96,7 @@ def unfitted(name: str) -> Method:
 def fitted(name: str) -> tuple[Method, Measurements, Fold]:
     with TemporaryDirectory() as folder:
         data, method = data_of(name, Path(folder)), unfitted(name)
-        fold = make_split(data.moving, SplitSettings()).folds[0]
+        fold = fold_of(data)
         method.fit(data, fold, short(Path(folder), 10, budget_s=3.0 if method.takes_budget else None))
     return method, data, fold
 

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from posts import POSTS, distances, fold_of, heard
+from posts import POSTS, distances, heard
+from scenes import fold_of
 
 from gsparc.data.splits import SplitSettings
 from gsparc.models import stations
