@@ -248,7 +248,7 @@ def test_scatterers_are_found_and_told_from_images(tmp_path):
     arrays = as_arrays(told)
     arrays["csi"] = arrays["csi"] + 0.5 * waves[:, None, None] * WAVELENGTH / (4 * np.pi)
     data = from_arrays(arrays)
-    method, _ = fitted(data, fold, tmp_path, clutter=False)
+    method, _ = fitted(data, fold, tmp_path, clutter=False, search_rows=220, margin=4.0)
     scene = method.members[0].scene
     places = (scene.sources + method.frame.middle).numpy() + data.site.origin
     scattered = scatterers(scene.sources, box_of(method.members[0].rows, scene.transmitter)).numpy()
