@@ -118,7 +118,12 @@ def panels(
 
 
 def logarithmic(axes: Any, fine: bool | None = None) -> None:
-    """Horizontal axis in decades; plain numbers also between them if `fine`, None: where decades are few."""
+    """Horizontal axis in decades; plain numbers also between them if `fine`, None: where decades are few.
+
+    Linear where nothing is above zero.
+    """
+    if not np.isfinite(axes.dataLim.minposx):
+        return
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     fine = high < 1000 * low if fine is None else fine

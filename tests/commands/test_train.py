@@ -441,9 +441,10 @@ def test_the_objective_is_for_searches_alone(tmp_path, way):
     given = ["dataset=own", f"dataset.file={tmp_path / 'own.npz'}", "model=mean", "baselines=[]"]
     answer = knock(main, "train.py", [*way, *given, *folder, "logger=none", "threads=1", "split.seed=0"])
     assert answer.status == 0 and not [line for line in answer.err if line.startswith("error")], answer
-    written = list((tmp_path / "run").rglob("summary.json"))
+    written = list((tmp_path / "run").glob("*/summary.json" if way else "summary.json"))
     assert len(written) == (2 if way else 1)
     assert all(json.loads(file.read_text())["test/rmse_db"] is None for file in written)
+    assert not way or (tmp_path / "run" / "sweep.png").exists()  # of no figure at all: no logarithm
 
 
 # -- the command in a process of its own ------------------------------------------------------------------

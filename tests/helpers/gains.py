@@ -32,6 +32,6 @@ def phased(scene: Scene, phase: torch.Tensor, quadrature: float = 0.2) -> Scene:
 
 
 def fitted(data: Measurements, fold: Fold, folder: Path, **settings: Any) -> tuple[ImageSourceGP, FitReport]:
-    """One search over at most 220 rows in a box of 4 m, unless said, and its report."""
-    method = ImageSourceGP(**{"searches": 1, "search_rows": 220, "margin": 4.0, **settings})
+    """One search over at most 100 rows in a box of 2.5 m, unless said, and its report."""
+    method = ImageSourceGP(**{"searches": 1, "search_rows": 100, "margin": 2.5, **settings})
     return method, method.fit(data, fold, FitContext(folder))

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from campaigns import spectra
 from shoeboxes import as_arrays, scatter
 
+from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays, load_own
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace
 
 
-def fold_of(data: Measurements) -> Fold:
-    return make_split(data.moving, SplitSettings()).folds[0]
+def fold_of(data: Measurements, **split: Any) -> Fold:
+    """The first fold of a split, `random` unless said."""
+    return split_for({"name": "random", **split}, data).folds[0]
 
 
 def lobes(path, moving: str = "tx") -> tuple[Measurements, Fold]:

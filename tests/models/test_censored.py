@@ -22,7 +22,7 @@ STATION = np.array([500.0, 500.0, 20.0])
 SHADOWING_DB, LENGTH_M, NOISE_DB = 7.0, 80.0, 1.5
 
 
-def town(count: int = 500, seed: int = 0) -> tuple[Measurements, np.ndarray, np.ndarray]:
+def town(count: int = 350, seed: int = 0) -> tuple[Measurements, np.ndarray, np.ndarray]:
     """A kilometre of streets, half of it below the sensitivity; true powers [dB], and which were heard."""
     rng = np.random.default_rng(seed)
     places = np.c_[rng.uniform(0, 1000, (count, 2)), np.full(count, 1.5)]

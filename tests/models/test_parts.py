@@ -7,15 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from posts import POSTS, heard
+from scenes import fold_of
 
-from gsparc.data.own import from_arrays
-from gsparc.data.splits import SplitSettings, make_split
 from gsparc.models import checkpoint, parts
 from gsparc.models.baselines.nearest import Nearest
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.training.context import FitContext
-
-POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
 
 
 class Resumable(Nearest):
@@ -34,10 +32,8 @@ class Resumable(Nearest):
 
 @pytest.fixture()
 def town():
-    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
-    far = np.linalg.norm(walk[:, None] - POSTS, axis=-1)
-    data = from_arrays({"tx_position": walk, "station_position": POSTS, "rssi_db": -20 * np.log10(far)})
-    return data, make_split(data.moving, SplitSettings(), place=data.place, station=data.station).folds[0]
+    data = heard(posts=POSTS[:3])
+    return data, fold_of(data)
 
 
 def fitted(town, folder, stop_at=0, **more):

@@ -16,10 +16,11 @@ import torch
 from campaigns import RENDERED, channels, compose, powers, spectra
 from contexts import short
 from rooms import directed, shoebox
+from scenes import fold_of
 
 from gsparc.data.load import load
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import method as protocols
 from gsparc.models.channels import complex_gp
@@ -95,7 +96,7 @@ def unfitted(name: str) -> Method:
 def fitted(name: str) -> tuple[Method, Measurements, Fold]:
     with TemporaryDirectory() as folder:
         data, method = data_of(name, Path(folder)), unfitted(name)
-        fold = make_split(data.moving, SplitSettings()).folds[0]
+        fold = fold_of(data)
         method.fit(data, fold, short(Path(folder), 10, budget_s=3.0 if method.takes_budget else None))
     return method, data, fold
 
@@ -129,11 +130,21 @@ def test_a_method_is_what_the_table_says(name):
 
 
 @pytest.mark.parametrize("name", VARIANCE)
-def test_predictions_have_a_variance(name):
+def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, tmp_path):
+    """Its state alone says all, without the settings."""
     method = fitted(name)[0]
-    variance = method.predict(*ends(method, places(method).float())).variance
+    query = ends(method, places(method).float())
+    said = method.predict(*query)
+    variance = said.variance
     assert variance is not None and variance.shape == (5,)
     assert variance.dtype == torch.float32 and (variance > 0).all()
+    torch.save(method.state(), tmp_path / "state.pt")
+    again = method_class(name)()
+    again.restore(method.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    told = again.predict(*query)
+    for part in ("mean", "confidence", "variance"):
+        torch.testing.assert_close(getattr(told, part), getattr(said, part))
+    assert again.size() == method.size()
 
 
 def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):

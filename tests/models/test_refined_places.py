@@ -10,11 +10,12 @@ import pytest
 import torch
 from kinds import KINDS
 from releases import real
+from scenes import fold_of
 
 from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import for_links
 from gsparc.models.refined_places import Linearised, displaced, displacements, refined
@@ -127,7 +128,7 @@ def test_exact_places_stay_though_errors_are_claimed():
 @pytest.mark.parametrize("kind", ["powers", "channels of an array", "powers of several stations"])
 def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
-    fold = make_split(data.moving, SplitSettings("random"), None, np.zeros(0, int), data.place).folds[0]
+    fold = fold_of(data)
     method = for_links(lambda: Gsparc(position_std=0.05), data)
     report = method.fit(data, fold, BRIEF)
     assert any("errors of places explain" in note or "is not used" in note for note in report.notes)
@@ -135,7 +136,7 @@ def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
 
 def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):
     data = KINDS["images"](tmp_path)
-    fold = make_split(data.moving, SplitSettings("random"), None, np.zeros(0, int), data.place).folds[0]
+    fold = fold_of(data)
     with caplog.at_level(logging.WARNING):
         Gsparc(position_std=0.05, steps=0).fit(data, fold, BRIEF)
     assert "position_std is not used" in caplog.text

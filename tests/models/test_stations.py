@@ -7,30 +7,26 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from posts import POSTS, distances, heard
+from scenes import fold_of
 
-from gsparc.data.own import from_arrays
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.splits import SplitSettings
 from gsparc.models import stations
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
-POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5], [20, 20, 5]])
 
-
-def heard(count: int = 40):
-    """Powers at four stations of one law, with noise."""
-    rng = np.random.default_rng(0)
-    walk = rng.uniform([0, 0, 1], [20, 20, 2], (count, 3))
-    far = np.linalg.norm(walk[:, None] - POSTS, axis=-1)
-    powers = -30 * np.log10(far) + rng.normal(size=far.shape)
-    data = from_arrays({"tx_position": walk, "station_position": POSTS, "rssi_db": powers})
-    return data, make_split(data.moving, SplitSettings(), place=data.place, station=data.station).folds[0]
+def of_one_law():
+    """Powers at four stations, with noise, and their fold."""
+    noise = np.random.default_rng(0).normal(size=(40, 4))
+    data = heard(40, rssi_db=lambda far: -30 * np.log10(far) + noise)
+    return data, fold_of(data)
 
 
 def test_powers_of_one_law_are_learned_together():
-    how, why = stations.best(*heard(), FitContext(budget_s=6))
+    how, why = stations.best(*of_one_law(), FitContext(budget_s=6))
     assert how == "together" and "dB together" in why and "folds)" in why
 
 
@@ -42,34 +38,29 @@ def test_powers_are_learned_as_rows_left_out_want_it(monkeypatch, wrong_db, best
         return lambda *given: (SimpleNamespace(answer=answer), None)
 
     monkeypatch.setattr(stations, "INITIALISERS", {name: initialiser(name) for name in wrong_db})
-    how, why = stations.best(*heard(), FitContext(budget_s=60))
+    how, why = stations.best(*of_one_law(), FitContext(budget_s=60))
     said = f"{wrong_db['joint_powers']}.00 dB together, {wrong_db['powers']}.00 dB each"
     assert how == best and said in why and "3 folds" in why
 
 
 def test_rows_beyond_one_factor_are_learned_by_station(monkeypatch):
     monkeypatch.setattr(stations, "ONE_FACTOR", 50)
-    how, why = stations.best(*heard(), FitContext())
+    how, why = stations.best(*of_one_law(), FitContext())
     assert how == "each" and why.endswith("rows are more than one factor holds (50)")
 
 
 def test_stations_that_nobody_heard_are_answered_by_what_all_share():
-    data, _ = heard()
-    split = SplitSettings("stations", leave_out=1)
-    fold = make_split(data.moving, split, place=data.place, station=data.station).folds[0]
+    data, split = of_one_law()[0], SplitSettings("stations", leave_out=1)
+    fold = fold_of(data, name="stations", leave_out=1)
     assert stations.best(data, fold, FitContext(split=split))[0] == "together"
 
 
 def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkeypatch, caplog):
     """Over 30 minutes, where one of all took 29 s and had half the error; plain methods stay as they were."""
     caplog.set_level("INFO", "gsparc")
-    walk = np.random.default_rng(0).uniform(0, 3, (30, 3))
-    far = np.linalg.norm(walk[:, None] - POSTS, axis=-1)
-    channels = np.exp(-2j * np.pi * 9.2e8 / 3e8 * far)
-    data = from_arrays(
-        {"tx_position": walk, "station_position": POSTS, "csi": channels, "frequency_hz": np.array(9.2e8)}
-    )
-    fold = make_split(data.moving, SplitSettings(), place=data.place, station=data.station).folds[0]
+    channels = np.exp(-2j * np.pi * 9.2e8 / 3e8 * distances(30))
+    data = heard(30, csi=channels, frequency_hz=np.array(9.2e8))
+    fold = fold_of(data)
     fits = []
     monkeypatch.setattr(Gsparc, "fit", lambda self, *given: fits.append(given) or 1 / 0)
     with pytest.raises(ZeroDivisionError):

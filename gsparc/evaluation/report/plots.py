@@ -124,7 +124,7 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else heading_of(name))
         if name == TIMES:
             logarithmic(axes, fine=True)
-        if name in ("mse", "error_power"):
+        if name in ("mse", "error_power") and np.isfinite(axes.dataLim.minposx):
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap
     line[0].set_ylabel("share")
@@ -287,7 +287,7 @@ def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
 
 def _accuracy_axis(axes: Axes, name: str) -> None:
     axes.set_ylabel(heading_of(name))
-    if lower_is_better(name):
+    if lower_is_better(name) and np.isfinite(axes.dataLim.minposy):
         axes.set_yscale("log")
 
 

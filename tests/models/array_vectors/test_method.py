@@ -17,7 +17,6 @@ from gsparc.evaluation.scores import score
 from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
-from gsparc.models import checkpoint, loading
 from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.cross_validation import tune
 from gsparc.models.array_vectors.vector_gp import aligned_by, mirror_elements, refine_alignment, twin
@@ -127,7 +126,7 @@ def test_fit_without_a_run_folder_writes_nothing(known_campaign, tmp_path, monke
     assert not list(tmp_path.iterdir())
 
 
-def test_beats_neighbours_is_stored_and_restored(known_campaign, small, tmp_path):
+def test_it_beats_neighbours(known_campaign, small, tmp_path):
     data, folds = known_campaign[0], (_fold(160),)
     split, (method, report, folder) = Split("known", folds, indices_hash(folds)), small
     assert report.seconds > 0 and (folder / "array_recovery.csv").exists()
@@ -135,12 +134,6 @@ def test_beats_neighbours_is_stored_and_restored(known_campaign, small, tmp_path
     nearest.fit(data, split.folds[0], FitContext(tmp_path))
     ours, theirs = (score([m], data, split) for m in (method, nearest))
     assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
-    checkpoint.save(tmp_path / "model.ckpt", method)
-    again, _ = loading.load(tmp_path / "model.ckpt")
-    batch = data.batch(split.folds[0].test)
-    one, other = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
-    assert torch.equal(one.mean, other.mean) and torch.equal(one.variance, other.variance)
-    assert again.size() == 64
 
 
 def test_confidence_falls_and_error_grows_with_distance(known_campaign, small):

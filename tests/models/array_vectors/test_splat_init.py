@@ -14,7 +14,6 @@ from known_arrays import spectra
 from gsparc.data.files import platform_cache
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import seen_by_array
-from gsparc.models import checkpoint
 from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.cross_validation import tune
 from gsparc.models.array_vectors.vector_cache import recovered
@@ -101,16 +100,6 @@ def test_the_frozen_field_is_the_rasterized_one_and_has_gradients(trained):
     for parameter in (model.gaussians.means, model.gaussians.opacity_logits, model.emission.weight2):
         assert torch.isfinite(parameter.grad).all() and parameter.grad.abs().sum() > 0
     model.zero_grad()
-
-
-def test_it_is_stored_and_read_back(trained, tmp_path):
-    method, data, fold = trained
-    checkpoint.save(tmp_path / "model.ckpt", method)
-    again = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model)
-    again.restore(data.site, checkpoint.read(tmp_path / "model.ckpt").state)
-    one, two = (m.predict(*_ends(data, fold.test)) for m in (method, again))
-    for part in ("mean", "confidence", "variance"):
-        assert torch.equal(getattr(one, part), getattr(two, part))
 
 
 def test_steps_are_taken_where_asked_for(known_campaign, tmp_path):

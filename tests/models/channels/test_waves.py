@@ -7,10 +7,10 @@ import pytest
 import torch
 from releases import REAL
 from rooms import WAVELENGTH, nmse, shoebox
-from scenes import answer_error
+from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
 from gsparc.models.channels.columns import bands, gather
 from gsparc.models.channels.complex_gp import ComplexGP
@@ -309,7 +309,7 @@ def test_measured_channels_in_squares():
     from gsparc.data.datasets.techtile import Techtile
 
     data = Techtile(CHANNELS, runs=["EXP006"], stations=[5]).load()
-    fold = make_split(data.moving, SplitSettings(name="blocks", side_m=0.6)).folds[0]
+    fold = fold_of(data, name="blocks", side_m=0.6)
     field, _ = initialise(data, np.concatenate([fold.train, fold.val]), ChannelSettings())
     plain = ComplexGP()
     plain.fit(data, fold, FitContext())

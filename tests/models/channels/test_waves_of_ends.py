@@ -7,10 +7,10 @@ import pytest
 import torch
 from releases import REAL
 from rooms import WAVELENGTH, nmse
-from scenes import answer_error
+from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.covariance import (
     Shape,
@@ -55,11 +55,6 @@ def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), run
     return from_arrays({**arrays, **run, "frequency_hz": np.array([2.4e9])})
 
 
-def _fold(data, **split):
-    settings = SplitSettings(**{"name": "random", **split})
-    return make_split(data.moving, settings, place=data.place).folds[0]
-
-
 def _tied(data, rows):
     middle = torch.from_numpy(data.moving).mean(0)
     angles = sphere(16)[:8]
@@ -101,10 +96,10 @@ def test_each_end_has_the_covariance_of_its_own_powers():
 
 
 def test_one_field_of_all_ends_is_better_than_plain_processes():
-    data = _ceiling(shift=(0.03, -0.02, 0.0))
-    fold = _fold(data)
+    data = _ceiling(ends=4, count=60, shift=(0.03, -0.02, 0.0))
+    fold = fold_of(data)
     field, notes = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
-    assert len(field.stations) == 6 and any("angles to ends" in note for note in notes)
+    assert len(field.stations) == 4 and any("angles to ends" in note for note in notes)
     plain = for_links(ComplexGP, data)
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.7 * answer_error(plain, data, fold.test)
@@ -145,7 +140,7 @@ def test_phases_that_nothing_tells_leave_little_to_say_of_an_end():
 def test_runs_of_all_ends_differ_by_one_phase():
     runs = np.arange(80) % 2
     data = _ceiling(runs=runs)
-    fold = _fold(data)
+    fold = fold_of(data)
     field, _ = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
     found = field.runs.factors[1] / field.runs.factors[0]
     torch.testing.assert_close(found.abs(), torch.ones(()).double())
@@ -170,7 +165,7 @@ def test_there_and_back_with_angles_to_ends(tmp_path):
 
 
 def test_stations_together_are_asked_for_any_pair():
-    data = _ceiling(ends=4, count=50)
+    data = _ceiling(ends=4, count=36)
     rows = np.flatnonzero(data.station < 3)
     method = for_links(Gsparc, data)
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
@@ -205,7 +200,7 @@ def test_measured_ceiling_in_squares():
     from gsparc.data.datasets.techtile import Techtile
 
     data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
-    fold = _fold(data, name="blocks", side_m=0.6)
+    fold = fold_of(data, name="blocks", side_m=0.6)
     field, _ = initialise(data, np.concatenate([fold.train, fold.val]), ChannelSettings())
     plain = for_links(ComplexGP, data)
     plain.fit(data, fold, FitContext())
@@ -216,7 +211,7 @@ def test_measured_ceiling_in_squares():
 def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
     """Rows of a later station carry its number, of which a site of one end knew nothing."""
     data = _ceiling(ends=2, count=30)
-    fold = _fold(data)
+    fold = fold_of(data)
     method = for_links(lambda: Gsparc(EffectSettings(phase=False)), data)
     method.fit(data, fold, FitContext(stations="each"))
     batch = data.batch(fold.test)

@@ -143,10 +143,6 @@ def test_one_alone_is_taken_where_a_mixture_does_not_pay_clearly(deviations, com
     assert weights.argmax() == (errors**2).mean(0).argmin()
 
 
-def test_of_one_unit_nothing_tells_whether_a_mixture_pays():
-    assert sorted(choose(gram_of(drawn([1.0, 1.0])), np.zeros(400))) == [0.0, 1.0]
-
-
 def test_small_weights_are_left_out():
     weights = choose(gram_of(drawn([1.0, 1.0, 6.0], 4000)), np.arange(4000))
     assert weights[2] == 0 and weights.sum() == pytest.approx(1)

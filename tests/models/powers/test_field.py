@@ -19,11 +19,7 @@ from gsparc.models import fields
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.haste import haste
 from gsparc.models.image_sources.known.images import counted
-from gsparc.models.powers.field import (
-    PowerField,
-    initialise,
-    restored,
-)
+from gsparc.models.powers.field import PowerField, initialise, restored
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest

@@ -5,21 +5,24 @@ from __future__ import annotations
 import copy
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from boxes import room_of_spectra
-from campaigns import brief, channels, compose
+from campaigns import brief, channels, compose, spectra
 
-from gsparc.commands.train import train
+from gsparc.commands.train import Objects, train
 from gsparc.data.load import load
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import reduced
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.splat import reduce as field_reduce
@@ -27,32 +30,69 @@ from gsparc.models.splat.array import ArrayField
 from gsparc.training.context import FitContext
 
 
-def answer(method, data, rows):
-    batch = data.batch(rows)
-    return method.predict(batch.tx, batch.rx)
+class Case(NamedTuple):
+    """A fitted method, what it learned from, and what each of its parts contributes."""
+
+    method: Any
+    data: Measurements
+    fold: Fold
+    measured: dict[str, Any]
+
+    @classmethod
+    def of(cls, method: Method, data: Measurements, fold: Fold) -> Case:
+        return cls(method, data, fold, reduced.contributions(method, data, fold.train))
+
+    @classmethod
+    def fit(cls, method: Method, data: Measurements, share: int = 4) -> Case:
+        """Tested on every `share`-th row."""
+        rows = np.arange(len(data))
+        fold = Fold(rows[rows % share > 0], rows[:0], rows[::share])
+        method.fit(data, fold, FitContext())
+        return cls.of(method, data, fold)
+
+    @classmethod
+    def trained(cls, found: Objects) -> Case:
+        return cls.of(found.methods[0], found.data, found.split.folds[0])
+
+    def less(self, measured: dict[str, Any] | None = None, **settings: Any) -> Any:
+        return reduced.reduced(self.method, settings, measured or self.measured)
+
+    def answer(self, method: Method | None = None, rows: np.ndarray | None = None) -> Prediction:
+        batch = self.data.batch(self.fold.test if rows is None else rows)
+        return (method or self.method).predict(batch.tx, batch.rx)
+
+    def away(self, other: Method) -> float:
+        """Relative squared distance of its answers and another's."""
+        a, b = self.answer().mean, self.answer(other).mean
+        return float((a - b).abs().square().sum() / a.abs().square().sum())
 
 
-def away(method, other, data, rows) -> float:
-    """Relative squared distance of two methods' answers."""
-    a, b = answer(method, data, rows).mean, answer(other, data, rows).mean
-    return float((a - b).abs().square().sum() / a.abs().square().sum())
+@pytest.fixture(scope="module")
+def field(tmp_path_factory) -> Case:
+    """Forty Gaussians on forty spectra of 16 x 32 pixels, the receiver static."""
+    folder = tmp_path_factory.mktemp("tradeoff")
+    return Case.trained(train(compose(*brief(spectra(folder / "own.npz"))), folder / "run")[1])
+
+
+@pytest.fixture(scope="module")
+def process(field) -> Case:
+    method = GaussianProcess()
+    method.fit(field.data, field.fold, FitContext())
+    return Case(method, field.data, field.fold, {})
 
 
 def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(field):
-    method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    before = answer(method, data, fold.test).mean.clone()
-    measured = reduced.contributions(method, data, fold.train)
-    assert measured["contribution"].shape == (40,) and (measured["contribution"] >= 0).all()
-    assert away(method, reduced.reduced(method, {"keep": 1.0}, measured), data, fold.test) < 1e-3
-    half, few = (reduced.reduced(method, {"keep": share}, measured) for share in (0.5, 0.1))
-    assert half.size() == 20 and few.size() == 4 and method.size() == 40
-    assert away(method, half, data, fold.test) < 0.2 < away(method, few, data, fold.test)
-    assert torch.equal(answer(method, data, fold.test).mean, before)
+    before, measured = field.answer().mean.clone(), field.measured["contribution"]
+    assert measured.shape == (40,) and (measured >= 0).all()
+    assert field.away(field.less(keep=1.0)) < 1e-3
+    half, few = (field.less(keep=share) for share in (0.5, 0.1))
+    assert half.size() == 20 and few.size() == 4 and field.method.size() == 40
+    assert field.away(half) < 0.2 < field.away(few)
+    assert torch.equal(field.answer().mean, before)
 
 
 def test_the_order_of_keeping_is_spread_over_the_sky(field):
-    method, fold = field.methods[0], field.split.folds[0]
-    measured = reduced.contributions(method, field.data, fold.train)
+    method, measured = field.method, field.measured
     order = field_reduce.spread(method.fitted(), measured)
     assert sorted(order.tolist()) == list(range(40)) and order[0] == measured["contribution"].argmax()
     seen = torch.nn.functional.normalize(method.fitted().gaussians.means - measured["receiver"][0], dim=1)
@@ -64,184 +104,129 @@ def test_the_order_of_keeping_is_spread_over_the_sky(field):
     assert nearest(order[:8]) > 1.3 * nearest(torch.arange(8))
 
 
-@pytest.mark.parametrize(
-    ("settings", "near"),
-    [
-        ({"stride": 2}, 0.1),
-        ({"projection": "equirect"}, 0.5),
-    ],
-)
+@pytest.mark.parametrize(("settings", "near"), [({"stride": 2}, 0.1), ({"projection": "equirect"}, 0.5)])
 def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
-    method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    lean = reduced.reduced(method, settings, reduced.contributions(method, data, fold.train))
-    found = answer(lean, data, fold.test).mean
-    assert found.shape == data.batch(fold.test).target.shape
-    assert away(method, lean, data, fold.test) < near
+    lean = field.less(**settings)
+    assert field.answer(lean).mean.shape == field.data.batch(field.fold.test).target.shape
+    assert field.away(lean) < near
 
 
 def test_confidence_that_is_spared_is_not_computed(field):
-    method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    lean = reduced.reduced(method, {"confidence": False}, reduced.contributions(method, data, fold.train))
-    assert answer(lean, data, fold.test).confidence is None
-    assert answer(method, data, fold.test).confidence is not None
-    assert away(method, lean, data, fold.test) == 0
+    lean = field.less(confidence=False)
+    assert field.answer(lean).confidence is None and field.answer().confidence is not None
+    assert field.away(lean) == 0
 
 
 @pytest.fixture(scope="module")
-def through_array(tmp_path_factory):
+def through_array(tmp_path_factory) -> Case:
     data = load({"name": "rfid_sim", "count": 48, "root": str(tmp_path_factory.mktemp("sim")), "seed": 0})
-    method = ArrayField(FieldSettings(count=64))
-    rows = np.arange(48)
-    fold = Fold(rows[rows % 4 > 0], rows[:0], rows[::4])
-    method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
-    return method, data, fold
+    return Case.fit(ArrayField(FieldSettings(count=64)), data)
 
 
 def test_fewer_places_say_what_all_of_them_said(through_array):
-    method, data, fold = through_array
-    assert reduced.knobs(method) == ("keep", "stride", "confidence")
-    measured = reduced.contributions(method, data, fold.train)
-    ways = [reduced.reduced(method, {"keep": share}, measured) for share in (1.0, 0.75, 0.1)]
+    case = through_array
+    assert reduced.knobs(case.method) == ("keep", "stride", "confidence")
+    ways = [case.less(keep=share) for share in (1.0, 0.75, 0.1)]
     assert [way.fitted().emission.encoding.width for way in ways] == [36, 27, 4]
-    assert method.fitted().emission.encoding.width == 36
-    error = [away(method, way, data, fold.test) for way in ways]
+    assert case.method.fitted().emission.encoding.width == 36
+    error = [case.away(way) for way in ways]
     assert error[0] < 1e-5 < error[1] < error[2]
-    unsure = [float(answer(way, data, fold.train).confidence.mean()) for way in ways]
+    unsure = [float(case.answer(way, case.fold.train).confidence.mean()) for way in ways]
     assert unsure[0] > unsure[1] > unsure[2]
 
 
 def test_an_array_spares_pixels_and_its_confidence(through_array):
-    method, data, fold = through_array
-    measured = reduced.contributions(method, data, fold.train)
-    coarse = reduced.reduced(method, {"stride": 3, "confidence": False}, measured)
-    assert away(method, coarse, data, fold.test) < 0.05 and answer(coarse, data, fold.test).confidence is None
-    wide = answer(reduced.reduced(method, {"stride": 2}, measured), data, fold.test)
-    whole = answer(method, data, fold.test)
+    coarse = through_array.less(stride=3, confidence=False)
+    assert through_array.away(coarse) < 0.05 and through_array.answer(coarse).confidence is None
+    wide, whole = through_array.answer(through_array.less(stride=2)), through_array.answer()
     torch.testing.assert_close(wide.mean[:, ::2, ::2], whole.mean[:, ::2, ::2], atol=1e-5, rtol=1e-4)
     assert torch.equal(wide.confidence, whole.confidence) and torch.equal(wide.variance, whole.variance)
 
 
 def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path):
     data = load({"name": "own", "file": str(channels(tmp_path / "own.npz", rows=60, shape="S"))})
-    rows = np.arange(60)
-    fold = Fold(rows[rows % 3 > 0], rows[:0], rows[::3])
-    method = ImageSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4)
-    method.fit(data, fold, FitContext(tmp_path))
-    measured = reduced.contributions(method, data, fold.train)
-    silent = reduced.reduced(method, {"confidence": False}, measured)
-    assert away(method, silent, data, fold.test) < 1e-9 and answer(silent, data, fold.test).variance is None
-    one = reduced.reduced(method, {"searches": 1}, measured)
-    assert len(one.members) == 1 and answer(one, data, fold.test).variance is not None
-    few = reduced.reduced(method, {"keep": 0.3}, measured)
-    assert 1 <= few.size() <= method.size() and torch.isfinite(answer(few, data, fold.test).mean).all()
+    case = Case.fit(ImageSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4), data, 3)
+    silent = case.less(confidence=False)
+    assert case.away(silent) < 1e-9 and case.answer(silent).variance is None
+    one = case.less(searches=1)
+    assert len(one.members) == 1 and case.answer(one).variance is not None
+    few = case.less(keep=0.3)
+    assert 1 <= few.size() <= case.method.size() and torch.isfinite(case.answer(few).mean).all()
 
 
-def test_a_gaussian_process_spares_components_pixels_and_its_variance(field):
-    data, fold = field.data, field.split.folds[0]
-    method = GaussianProcess()
-    method.fit(data, fold, FitContext(Path()))
-    whole = reduced.reduced(method, {"confidence": False}, {})
-    assert away(method, whole, data, fold.test) < 1e-8 and answer(whole, data, fold.test).variance is None
-    assert reduced.reduced(method, {"confidence": True}, {}) is method
-    few = reduced.reduced(method, {"keep": 0.2, "stride": 2}, {})
-    assert few.size() < len(method.axes) and 0 < away(method, few, data, fold.test) < 0.3
+def test_a_gaussian_process_spares_components_pixels_and_its_variance(process):
+    whole = process.less(confidence=False)
+    assert process.away(whole) < 1e-8 and process.answer(whole).variance is None
+    assert process.less(confidence=True) is process.method
+    few = process.less(keep=0.2, stride=2)
+    assert few.size() < len(process.method.axes) and 0 < process.away(few) < 0.3
 
 
 @pytest.fixture(scope="module")
-def crossings(tmp_path_factory):
-    data = room_of_spectra()
-    rows = np.arange(len(data.target))
-    fold = Fold(rows[rows % 4 > 0], rows[:0], rows[::4])
-    method = MovingArrayField(
-        SearchSettings(sources=17, rows=40, candidates=2000, steps=20), components=64, seed=0
-    )
-    method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
-    return method, data, fold
+def crossings() -> Case:
+    search = SearchSettings(sources=17, rows=40, candidates=2000, steps=20)
+    return Case.fit(MovingArrayField(search, components=64, seed=0), room_of_spectra())
 
 
-def test_one_search_is_not_swept_as_two(crossings):
-    method, trends = crossings[0], crossings[0].trends
+def test_one_search_is_not_swept_as_two(crossings, monkeypatch):
+    method, trends = crossings.method, crossings.method.trends
     assert ("searches" in reduced.knobs(method)) == (len(trends) > 1)
-    try:
-        method.trends = trends[:1] * 2
-        assert "searches" in reduced.knobs(method)
-        method.trends = trends[:1]
-        assert "searches" not in reduced.knobs(method)
-    finally:
-        method.trends = trends
+    for count in (1, 2):
+        monkeypatch.setattr(method, "trends", trends[:1] * count)
+        assert ("searches" in reduced.knobs(method)) == (count > 1)
 
 
 def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
-    method, data, fold = crossings
-    measured = reduced.contributions(method, data, fold.train)
-    assert reduced.reduced(method, {"confidence": True}, measured) is method
-    silent = reduced.reduced(method, {"confidence": False}, measured)
-    assert away(method, silent, data, fold.test) < 1e-8 and answer(silent, data, fold.test).variance is None
-    error = [
-        away(method, reduced.reduced(method, settings, measured), data, fold.test)
-        for settings in ({"keep": 0.5}, {"keep": 0.05})
-    ]
+    assert crossings.less(confidence=True) is crossings.method
+    silent = crossings.less(confidence=False)
+    assert crossings.away(silent) < 1e-8 and crossings.answer(silent).variance is None
+    error = [crossings.away(crossings.less(keep=share)) for share in (0.5, 0.05)]
     assert 0 < error[0] < error[1] < 0.3
-    coarse = reduced.reduced(method, {"stride": 2}, measured)
-    assert answer(coarse, data, fold.test).mean.shape == data.batch(fold.test).target.shape
-    assert 0 < away(method, coarse, data, fold.test) < 0.05
+    coarse = crossings.less(stride=2)
+    assert crossings.answer(coarse).mean.shape == crossings.answer().mean.shape
+    assert 0 < crossings.away(coarse) < 0.05
 
 
-def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
+def test_strides_that_do_not_divide_the_columns_are_left_out(process, caplog):
     """The command's own default strides ended it on grids of 7 x 13."""
-    method = GaussianProcess()
-    method.fit(field.data, field.split.folds[0], FitContext(Path()))
-    columns = field.data.site.grid.width
+    columns = process.data.site.grid.width
     assert columns % 2 == 0 and columns % 3
-    assert list(reduced.combinations(method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
+    assert list(reduced.combinations(process.method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
     assert f"stride=3: does not divide the {columns} columns" in caplog.text
 
 
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
-    method.fit(field.data, field.split.folds[0], FitContext(Path()))
+    method.fit(field.data, field.fold, FitContext(Path()))
     assert list(reduced.combinations(method, {"keep": [1.0, 0.5]}, {"projection": ["equirect"]})) == [{}]
     assert reduced.reduced(method, {"keep": 0.5}, {}) is method
 
 
 def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
-    found = train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1]
-    method, data, fold = found.methods[0], found.data, found.split.folds[0]
-    measured = reduced.contributions(method, data, fold.train)
-    strongest = reduced.reduced(method, {"keep": 0.5}, measured)
-    weakest = reduced.reduced(method, {"keep": 0.5}, {"contribution": -measured["contribution"]})
+    case = Case.trained(train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1])
+    strongest = case.less(keep=0.5)
+    weakest = case.less({"contribution": -case.measured["contribution"]}, keep=0.5)
     assert strongest.size() == weakest.size() == 20
-    assert away(method, strongest, data, fold.test) < away(method, weakest, data, fold.test)
-    assert away(method, reduced.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
+    assert case.away(strongest) < case.away(weakest)
+    assert case.away(case.less(stride=2)) < 0.2
 
 
 def test_what_a_process_beside_adds_stays(field):
-    data, fold = field.data, field.split.folds[0]
-    method = copy.copy(field.methods[0])
-    measured = reduced.contributions(method, data, fold.train)
-    plain = answer(reduced.reduced(method, {"stride": 2}, measured), data, fold.test).mean
+    both = field._replace(method=copy.copy(field.method))
+    plain = both.answer(both.less(stride=2)).mean
     beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(plain)))
-    method._average = (beside, 0.25)
-    added = answer(reduced.reduced(method, {"stride": 2}, measured), data, fold.test).mean
-    assert torch.allclose(0.75 * plain + 0.25, added)
+    both.method._average = (beside, 0.25)
+    assert torch.allclose(0.75 * plain + 0.25, both.answer(both.less(stride=2)).mean)
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_a_process_beside_spares_pixels_with_the_field(field, stride):
-    data, fold = field.data, field.split.folds[0]
-    method = copy.copy(field.methods[0])
-    measured = reduced.contributions(method, data, fold.train)
-    process = GaussianProcess()
-    process.fit(data, fold, FitContext())
-    method._average, method._average_mean = (process, 0.5), None
-    alone = reduced.reduced(field.methods[0], {"stride": stride}, measured)
-    spared = {"confidence": False, "stride": stride}
-    wanted = 0.5 * answer(alone, data, fold.test).mean
-    wanted += 0.5 * answer(process.reduced(spared, {}), data, fold.test).mean
-    lean = reduced.reduced(method, {"stride": stride, "confidence": True}, measured)
-    assert torch.allclose(answer(lean, data, fold.test).mean, wanted, atol=1e-4)
-    whole = answer(process, data, fold.test).mean
-    own = answer(field.methods[0], data, fold.test)
-    both = answer(method, data, fold.test)
-    assert torch.allclose(both.mean, 0.5 * own.mean + 0.5 * whole, atol=1e-4)  # its variance is not computed
-    assert torch.equal(both.confidence, own.confidence)
+def test_a_process_beside_spares_pixels_with_the_field(field, process, stride):
+    both = field._replace(method=copy.copy(field.method))
+    both.method._average, both.method._average_mean = (process.method, 0.5), None
+    spared = process.answer(process.less(confidence=False, stride=stride)).mean
+    wanted = 0.5 * field.answer(field.less(stride=stride)).mean + 0.5 * spared
+    found = both.answer(both.less(stride=stride, confidence=True)).mean
+    assert torch.allclose(found, wanted, atol=1e-4)
+    whole, own = both.answer(), field.answer()
+    assert torch.allclose(whole.mean, 0.5 * own.mean + 0.5 * process.answer().mean, atol=1e-4)
+    assert torch.equal(whole.confidence, own.confidence)  # its variance is not computed

@@ -34,13 +34,13 @@ def test_what_auto_becomes(campaign, kind, static_end, hidden, want):
     site = campaign(kind, static_end=static_end).site
     choices, notes = resolve(open_settings(hidden), "auto", site)
     assert choices == want
+    done = settled(open_settings(hidden), choices)
+    found = (done.emission.encoding.kind, done.emission.activation, done.emission.init_bias)
+    assert found == (want.encoding, want.activation, want.init_bias) and done.field.placement != "auto"
     assert [n.split("=")[0] for n in notes][:3] == ["encoding.kind", "init", "activation"]
     assert all("auto -> " in note and ": " in note for note in notes)
-
-
-def test_reasons_are_said(campaign):
-    _, notes = resolve(open_settings(), "auto", campaign("spectrum", static_end="tx").site)
-    assert any(note.startswith("init=auto -> uniform: the receiver moves") for note in notes)
+    if (kind, static_end) == ("spectrum", "tx"):
+        assert any(note.startswith("init=auto -> uniform: the receiver moves") for note in notes)
 
 
 def test_what_is_said_stays_and_needs_no_words(campaign):
@@ -57,15 +57,3 @@ def test_what_is_said_stays_and_needs_no_words(campaign):
 def test_the_logarithm_of_distance_brings_its_sigmoid(campaign):
     choices, _ = resolve(open_settings(4, log_distance=True), "auto", campaign("rssi").site)
     assert choices.activation == "sigmoid" and choices.init_bias == 0
-
-
-def test_nothing_is_left_open(campaign):
-    choices, _ = resolve(open_settings(), "auto", campaign("csi").site)
-    done = settled(open_settings(), choices)
-    left = [
-        done.field.placement,
-        done.emission.encoding.kind,
-        done.emission.activation,
-        done.emission.init_bias,
-    ]
-    assert "auto" not in left

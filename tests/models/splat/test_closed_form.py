@@ -18,7 +18,8 @@ RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 ROWS = np.arange(40)
 
 
-def started(data, emission=KERNEL, count: int = 150, on: bool = False) -> GaussianModel:
+def starting(data, emission=KERNEL, count: int = 150, on: bool = False) -> tuple:
+    """A model after its start, and what the start left out."""
     torch.manual_seed(0)
     process = learn_process(data, ROWS, 1024, 0)
     settings = ModelSettings(
@@ -27,8 +28,11 @@ def started(data, emission=KERNEL, count: int = 150, on: bool = False) -> Gaussi
         attenuation=AttenuationSettings(inverse_distance=on),
     )
     model = GaussianModel(settings, data.site, RECEIVER, prior=process.prior)
-    warm_start(model, data, ROWS, RECEIVER, process)
-    return model
+    return model, warm_start(model, data, ROWS, RECEIVER, process)
+
+
+def started(data, *given, **more) -> GaussianModel:
+    return starting(data, *given, **more)[0]
 
 
 def error(model, data, rows) -> float:
@@ -111,13 +115,7 @@ def test_what_is_unknown_far_away_and_near_the_rows(smooth):
 
 def test_rows_without_their_neighbours_are_as_a_fit_without_them(smooth):
     """The kernel stays: what is left out is the rows alone."""
-    process = learn_process(smooth, ROWS, 1024, 0)
-    settings = ModelSettings(
-        field=FieldSettings(count=150, placement="sphere"), emission=KERNEL,
-        attenuation=AttenuationSettings(inverse_distance=False),
-    )  # fmt: skip
-    model = GaussianModel(settings, smooth.site, RECEIVER, prior=process.prior)
-    left = warm_start(model, smooth, ROWS, RECEIVER, process)
+    model, left = starting(smooth)
     assert left is not None and len(left.centres) == len(ROWS)
     errors = ((left.predicted - left.images[left.centres]) ** 2).mean(-1)
     nearest = np.nanmean(errors[0])

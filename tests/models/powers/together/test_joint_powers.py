@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 from releases import real
+from scenes import fold_of
 
 import gsparc
 from gsparc.data.datasets.ble import BLE
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc, plan
@@ -156,11 +157,11 @@ def test_settings_become_likelier():
 def learned():
     """A field of 60 of 90 places."""
     data = town()
-    fold = make_split(data.moving, SplitSettings(val_fraction=0), place=data.place, station=data.station)
-    rows = fold.folds[0].train
+    fold = fold_of(data, val_fraction=0)
+    rows = fold.train
     field, notes = initialise(data, rows)
     field.condition(data, rows)
-    return data, fold.folds[0], field, notes
+    return data, fold, field, notes
 
 
 def test_what_all_hear_alike_is_found(learned):
@@ -252,7 +253,7 @@ def test_what_it_refuses():
 
 def test_gsparc_learns_stations_together(tmp_path):
     data = town()
-    fold = make_split(data.moving, SplitSettings(), place=data.place, station=data.station).folds[0]
+    fold = fold_of(data)
     method = for_links(Gsparc, data)
     report = method.fit(data, fold, FitContext(tmp_path, stations="together"))
     assert any("6 stations in one model" in note for note in report.notes)
@@ -289,9 +290,7 @@ def test_stations_at_one_place_are_told_apart_by_their_numbers():
 
 def test_halls_gain_over_a_process_of_each_sensor():
     data = BLE(file=str(real("real/ble-hall-1.npz"))).load()
-    fold = make_split(
-        data.moving, SplitSettings(name="blocks", side_m=3.0), place=data.place, station=data.station
-    ).folds[0]
+    fold = fold_of(data, name="blocks", side_m=3.0)
     errors = []
     for make, stations in ((Gsparc, "together"), (method_class("gp"), "each")):
         method = for_links(make, data)
