@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import hydra
 import pytest
 from campaigns import brief, compose, spectra
+from doors import knock
 from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import gsparc.conf
+from gsparc.commands.train import main
 from gsparc.models.method import Method
 from gsparc.models.registry import METHODS, build
 from gsparc.training.fit import DEFAULTS
 
 CONF = Path(gsparc.conf.__path__[0])
-ROOT = Path(__file__).parents[2]
-GROUPS = (
-    "dataset",
-    "split",
-    "trainer",
-    "callbacks",
-    "logger",
-    "paper",
-    "experiment",
-)  # of train.yaml
+GROUPS = ("dataset", "split", "trainer", "callbacks", "logger", "paper", "experiment")  # of train.yaml
 CHOICES = sorted(f"{group}={file.stem}" for group in GROUPS for file in (CONF / group).glob("*.yaml"))
 CHOICES += [f"model={name}" for name in METHODS]
 NEEDED = {
@@ -103,18 +94,11 @@ def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
 @pytest.mark.slow
 def test_a_sweep_over_hidden_units_has_a_directory_per_job(tmp_path):
     """`-m model.emission.hidden=0,8`: 0 starts in closed form, 8 cannot; both are said and both train."""
-    file = spectra(tmp_path / "own.npz")
-    command = [
-        sys.executable,
-        "train.py",
-        "-m",
-        "model.emission.hidden=0,8",
-        *brief(file, "trainer.max_steps=4"),
-    ]
-    done = subprocess.run(
-        [*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"], cwd=ROOT, capture_output=True, text=True
+    given = brief(
+        spectra(tmp_path / "own.npz"), "trainer.max_steps=4", f"hydra.sweep.dir={tmp_path / 'sweep'}"
     )
-    assert done.returncode == 0, done.stderr
+    done = knock(main, "train.py", ["-m", "model.emission.hidden=0,8", *given])
+    assert done.status == 0, done
     folders = sorted(p.parent.name for p in (tmp_path / "sweep").glob("*/summary.json"))
     assert len(folders) == 2 and "hidden-0" in folders[0] and "hidden-8" in folders[1]
     logs = [(tmp_path / "sweep" / folder / "training.log") for folder in folders]

@@ -81,6 +81,7 @@ def brief(file: Path, *more: str) -> list[str]:
         "dataset.batch_size=8",
         "trainer.val_check_interval=10",
         "callbacks.pictures.every=1000",
+        "callbacks.pictures.count=1",  # matplotlib took most of a training's time
         "baselines=[mean]",
         "logger=none",
         "threads=1",
