@@ -31,13 +31,26 @@ NEEDED = {
 }
 
 
+def composed(monkeypatch, *overrides: str):
+    """What `train.py` would see, with the run's directory."""
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        config = hydra.compose("train", overrides=list(overrides), return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", config)  # what ${hydra:...} asks
+    return config
+
+
 @pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_composes_and_builds(choice):
-    config = compose(choice, *NEEDED.get(choice, []))
+def test_every_choice_composes_and_builds(choice, monkeypatch):
+    """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
+    group, _, name = choice.partition("=")
+    own = ["dataset=own", "dataset.file=x.npz"] if group == "model" else []
+    config = composed(monkeypatch, choice, *NEEDED.get(choice, own))
     assert isinstance(build(config.model), Method)
     for node in (config.callbacks or {}).values():
         instantiate(node)
     instantiate(config.trainer, accelerator="cpu", devices=1)  # there may be no other here
+    if own:  # microseconds: no two share one
+        assert re.fullmatch(rf"outputs/own/{name}/[\d_-]+-\d{{6}}", config.hydra.run.dir)
 
 
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
@@ -72,23 +85,8 @@ def test_the_paper_leaves_nothing_to_auto():
     assert len(config.model.guesses) > 5
 
 
-def run_directory(monkeypatch, *overrides: str) -> str:
-    """Where `train.py` would write."""
-    with initialize_config_module("gsparc.conf", version_base="1.3"):
-        config = hydra.compose("train", overrides=list(overrides), return_hydra_config=True)
-    monkeypatch.setattr(HydraConfig.instance(), "cfg", config)  # what ${hydra:...} asks
-    return config.hydra.run.dir
-
-
-@pytest.mark.parametrize("model", METHODS)
-def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
-    """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
-    named = run_directory(monkeypatch, f"model={model}", "dataset=own")
-    assert re.fullmatch(rf"outputs/own/{model}/[\d_-]+-\d{{6}}", named)  # microseconds: no two share one
-
-
 def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
-    assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
+    assert "/gsparc-paper/" in composed(monkeypatch, "paper=gsparc").hydra.run.dir
 
 
 @pytest.mark.slow

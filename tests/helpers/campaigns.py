@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from shoeboxes import scatter
@@ -60,6 +61,13 @@ def compose(*overrides: str, config: str = "train"):
     GlobalHydra.instance().clear()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         return hydra_compose(config, overrides=["hydra.run.dir=.", *overrides])
+
+
+def runs_in(patch, folder: Path) -> None:
+    """Let what is left of a run go to a folder, as Hydra would."""
+    from hydra.core.hydra_config import HydraConfig
+
+    patch.setattr(HydraConfig, "get", lambda: SimpleNamespace(runtime=SimpleNamespace(output_dir=folder)))
 
 
 RENDERED = tuple(
