@@ -70,7 +70,7 @@ def test_jobs_on_ray_return_what_jobs_here_do_and_are_not_done_again(tmp_path):
     spectra(tmp_path / "own.npz")
     settings = ("dataset=own", f"dataset.file='{tmp_path / 'own.npz'}'", "model=mean,nearest", "threads=1")
     found = []
-    for launcher, folder in (("basic", "here"), ("ray", "there"), ("ray", "there")):
+    for launcher, folder in (("basic", "here"), ("ray", "there"), ("basic", "there")):
         where = (f"hydra.sweep.dir={tmp_path / folder}", f"hydra/launcher={launcher}")
         given = ["-m", *settings, "baselines=[]", "logger=none", *where]
         if launcher == "basic":
