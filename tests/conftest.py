@@ -15,8 +15,17 @@ from threadpoolctl import threadpool_limits
 from gsparc.data import executor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
+from gsparc.evaluation import pictures
 
 threadpool_limits(1, "blas")  # as every command has it
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_spectrum_is_drawn():
+    """Beside its prediction at the end of a training: four took most of a short training's time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pictures, "SPECTRA", 1)
+        yield
 
 
 @pytest.fixture(scope="session")

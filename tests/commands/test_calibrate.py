@@ -198,15 +198,6 @@ def _trained(folder, *more: str, run: str = "run"):
     return train(compose(*(s for s in settings if not s.startswith("model."))), folder / run)[1]
 
 
-def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
-    """With another split a threshold was chosen on rows whose errors the model had been fitted to."""
-    objects = _trained(tmp_path)
-    path = str(objects.checkpoints[0])
-    assert len(collect([path], {}, {})[0]) == len(objects.split.folds[0].test)
-    with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
-        collect([path], {}, {"name": "corner"})
-
-
 def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_path) -> None:
     """`last.ckpt` and `refit/last.ckpt` took any split for their own: 38 dB where 29 were true."""
     file = spectra(tmp_path / "own.npz")
@@ -255,12 +246,16 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
         collect([path], elsewhere, {})
 
 
-def test_a_split_file_that_is_gone_calibrates_nothing(tmp_path) -> None:
-    _trained(tmp_path)
+def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
+    """With another split, or one whose file is gone, a threshold was chosen on rows that were fitted to."""
+    objects = _trained(tmp_path)
+    path, rows = str(objects.checkpoints[0]), len(objects.split.folds[0].test)
+    assert len(collect([path], {}, {})[0]) == rows
+    with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
+        collect([path], {}, {"name": "corner"})
     split = tmp_path / "run" / "split.json"
-    objects = _trained(tmp_path, "split=file", f"split.path={split}", run="other")
-    path = str(objects.checkpoints[0])
-    assert len(collect([path], {}, {})[0]) == len(objects.split.folds[0].test)
+    path = str(_trained(tmp_path, "split=file", f"split.path={split}", run="other").checkpoints[0])
+    assert len(collect([path], {}, {})[0]) == rows
     other = split.rename(tmp_path / "kept.json")
     assert collect([path], {}, {"path": str(other)})[1]["split/foreign"] is None  # by its hash
     with pytest.raises(ValueError, match="another split; these test rows may have been TRAINED on"):

@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import hydra
 import pytest
 from campaigns import brief, compose, spectra
+from doors import knock
 from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import gsparc.conf
+from gsparc.commands.train import main
 from gsparc.models.method import Method
 from gsparc.models.registry import METHODS, build
 from gsparc.training.fit import DEFAULTS
 
 CONF = Path(gsparc.conf.__path__[0])
-ROOT = Path(__file__).parents[2]
-GROUPS = (
-    "dataset",
-    "split",
-    "trainer",
-    "callbacks",
-    "logger",
-    "paper",
-    "experiment",
-)  # of train.yaml
+GROUPS = ("dataset", "split", "trainer", "callbacks", "logger", "paper", "experiment")  # of train.yaml
 CHOICES = sorted(f"{group}={file.stem}" for group in GROUPS for file in (CONF / group).glob("*.yaml"))
 CHOICES += [f"model={name}" for name in METHODS]
 NEEDED = {
@@ -40,13 +31,26 @@ NEEDED = {
 }
 
 
+def composed(monkeypatch, *overrides: str):
+    """What `train.py` would see, with the run's directory."""
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        config = hydra.compose("train", overrides=list(overrides), return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", config)  # what ${hydra:...} asks
+    return config
+
+
 @pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_composes_and_builds(choice):
-    config = compose(choice, *NEEDED.get(choice, []))
+def test_every_choice_composes_and_builds(choice, monkeypatch):
+    """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
+    group, _, name = choice.partition("=")
+    own = ["dataset=own", "dataset.file=x.npz"] if group == "model" else []
+    config = composed(monkeypatch, choice, *NEEDED.get(choice, own))
     assert isinstance(build(config.model), Method)
     for node in (config.callbacks or {}).values():
         instantiate(node)
     instantiate(config.trainer, accelerator="cpu", devices=1)  # there may be no other here
+    if own:  # microseconds: no two share one
+        assert re.fullmatch(rf"outputs/own/{name}/[\d_-]+-\d{{6}}", config.hydra.run.dir)
 
 
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
@@ -81,40 +85,18 @@ def test_the_paper_leaves_nothing_to_auto():
     assert len(config.model.guesses) > 5
 
 
-def run_directory(monkeypatch, *overrides: str) -> str:
-    """Where `train.py` would write."""
-    with initialize_config_module("gsparc.conf", version_base="1.3"):
-        config = hydra.compose("train", overrides=list(overrides), return_hydra_config=True)
-    monkeypatch.setattr(HydraConfig.instance(), "cfg", config)  # what ${hydra:...} asks
-    return config.hydra.run.dir
-
-
-@pytest.mark.parametrize("model", METHODS)
-def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
-    """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
-    named = run_directory(monkeypatch, f"model={model}", "dataset=own")
-    assert re.fullmatch(rf"outputs/own/{model}/[\d_-]+-\d{{6}}", named)  # microseconds: no two share one
-
-
 def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
-    assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
+    assert "/gsparc-paper/" in composed(monkeypatch, "paper=gsparc").hydra.run.dir
 
 
 @pytest.mark.slow
 def test_a_sweep_over_hidden_units_has_a_directory_per_job(tmp_path):
     """`-m model.emission.hidden=0,8`: 0 starts in closed form, 8 cannot; both are said and both train."""
-    file = spectra(tmp_path / "own.npz")
-    command = [
-        sys.executable,
-        "train.py",
-        "-m",
-        "model.emission.hidden=0,8",
-        *brief(file, "trainer.max_steps=4"),
-    ]
-    done = subprocess.run(
-        [*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"], cwd=ROOT, capture_output=True, text=True
+    given = brief(
+        spectra(tmp_path / "own.npz"), "trainer.max_steps=4", f"hydra.sweep.dir={tmp_path / 'sweep'}"
     )
-    assert done.returncode == 0, done.stderr
+    done = knock(main, "train.py", ["-m", "model.emission.hidden=0,8", *given])
+    assert done.status == 0, done
     folders = sorted(p.parent.name for p in (tmp_path / "sweep").glob("*/summary.json"))
     assert len(folders) == 2 and "hidden-0" in folders[0] and "hidden-8" in folders[1]
     logs = [(tmp_path / "sweep" / folder / "training.log") for folder in folders]

@@ -85,14 +85,14 @@ def test_nobody_is_located_in_a_wall(trained, tmp_path):
     Image.fromarray(plan).save(tmp_path / "plan.png")
     low, high = (site := checkpoint.read(trained).site).moving_box[:, :2] + site.origin[:2]
     points = f"plan_points=[[0,40,{low[0]},{low[1]}],[100,40,{high[0]},{low[1]}]]"
-    given = f"ckpt={trained}", "calibrate=0", f"plan='{tmp_path}/plan.png'", points
+    given = f"ckpt={trained}", "calibrate=0", "rows=8", f"plan='{tmp_path}/plan.png'", points
     _, rows = located(tmp_path / "run", *given)
     wall = 0.5 * (low + high)[0] + 0.3
     assert (column(rows, "x") <= wall).all() and (column(rows, "x_true") > wall).any()
 
 
 def test_a_track_of_a_trained_model(trained, tmp_path):
-    facts, rows = located(tmp_path, f"ckpt={trained}", "calibrate=0", "track=true", "against=[]")
+    facts, rows = located(tmp_path, f"ckpt={trained}", "calibrate=0", "rows=8", "track=true", "against=[]")
     assert facts["locate/track"] == 1 and len(rows) == facts["locate/snapshots"]
     assert facts["locate/alone/median_m"] > 0
 

@@ -76,21 +76,26 @@ def powers():
     return fitted()
 
 
-def test_json_and_raw_bodies_hold_what_the_model_answers(powers):
+@pytest.fixture(scope="module")
+def served(powers):
+    with Served(powers) as running:
+        yield running
+
+
+def test_json_and_raw_bodies_hold_what_the_model_answers(powers, served):
     places = np.random.default_rng(1).uniform(0, 10, (7, 3)).astype(np.float32)
     expected = powers.rssi(rx=places.astype(np.float64))
-    with Served(powers) as served:
-        status, body, _ = served.post(as_json(places))
-        assert status == 200 and json.loads(body)["shape"] == [7, 1]
-        np.testing.assert_allclose(json.loads(body)["values"], expected, rtol=1e-5)
-        status, body, headers = served.post(places.tobytes(), RAW)
-        assert status == 200 and headers["x-shape"] == "7,1"
-        np.testing.assert_allclose(np.frombuffer(body, "<f4"), expected[:, 0], rtol=1e-5)
-        client = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
-        client.request("GET", "/healthz")
-        assert json.loads(client.getresponse().read()) == {
-            "status": "ok", "kind": "rssi", "model": "gp", "end": "rx"
-        }  # fmt: skip
+    status, body, _ = served.post(as_json(places))
+    assert status == 200 and json.loads(body)["shape"] == [7, 1]
+    np.testing.assert_allclose(json.loads(body)["values"], expected, rtol=1e-5)
+    status, body, headers = served.post(places.tobytes(), RAW)
+    assert status == 200 and headers["x-shape"] == "7,1"
+    np.testing.assert_allclose(np.frombuffer(body, "<f4"), expected[:, 0], rtol=1e-5)
+    client = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
+    client.request("GET", "/healthz")
+    assert json.loads(client.getresponse().read()) == {
+        "status": "ok", "kind": "rssi", "model": "gp", "end": "rx"
+    }  # fmt: skip
 
 
 def test_channels_are_pairs():
@@ -138,11 +143,10 @@ def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch)
         (b"0" * 100_000, RAW, 413),
     ],
 )
-def test_malformed_requests_are_refused_and_the_next_is_answered(powers, body, kind, status):
-    with Served(powers) as served:
-        found = served.post(body, kind)
-        assert found[0] == status and "\n" not in json.loads(found[1])["detail"]
-        assert served.post(as_json([[1, 2, 1]]))[0] == 200
+def test_malformed_requests_are_refused_and_the_next_is_answered(served, body, kind, status):
+    found = served.post(body, kind)
+    assert found[0] == status and "\n" not in json.loads(found[1])["detail"]
+    assert served.post(as_json([[1, 2, 1]]))[0] == 200
 
 
 def test_one_bad_request_of_a_batch_spoils_no_other(powers):

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-from types import SimpleNamespace
 
 import pytest
-from campaigns import compose, spectra
-from hydra.core.hydra_config import HydraConfig
+from campaigns import compose, runs_in, spectra
 
 from gsparc.commands.study import study_of, task
 from gsparc.models.terms import EffectSettings
@@ -27,9 +25,7 @@ LINES = {
 
 @pytest.mark.parametrize("kind", LINES)
 def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        HydraConfig, "get", lambda: SimpleNamespace(runtime=SimpleNamespace(output_dir=tmp_path))
-    )
+    runs_in(monkeypatch, tmp_path)
     more, conditions, key = LINES[kind]
     config = compose(
         "dataset=own", f"dataset.file='{spectra(tmp_path / 'own.npz')}'", f"kind={kind}", "threads=1",

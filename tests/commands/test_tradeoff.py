@@ -10,8 +10,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from campaigns import compose
-from hydra.core.hydra_config import HydraConfig
+from campaigns import compose, runs_in
 from towns import town_model
 
 import gsparc
@@ -37,9 +36,7 @@ def swept(field, tmp_path_factory):
         "baselines=[mean]", f"peers=['{field.checkpoints[0]}']", f"cache='{folder}/cache'", config="tradeoff",
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            HydraConfig, "get", lambda: type("C", (), {"runtime": type("R", (), {"output_dir": folder})})
-        )
+        runs_in(patch, folder)
         said: list[tuple] = []
         patch.setattr(tracking, "table", lambda loggers, *table: said.append((len(loggers), *table)))
         config.logger = {"any": {"_target_": "lightning.pytorch.loggers.logger.DummyLogger"}}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from shoeboxes import scatter
@@ -62,6 +63,13 @@ def compose(*overrides: str, config: str = "train"):
         return hydra_compose(config, overrides=["hydra.run.dir=.", *overrides])
 
 
+def runs_in(patch, folder: Path) -> None:
+    """Let what is left of a run go to a folder, as Hydra would."""
+    from hydra.core.hydra_config import HydraConfig
+
+    patch.setattr(HydraConfig, "get", lambda: SimpleNamespace(runtime=SimpleNamespace(output_dir=folder)))
+
+
 RENDERED = tuple(
     f"model.effects.{name}={str(name == 'image').lower()}"
     for name in ("image", "array", "moving_array", "phase", "power", "residual")
@@ -81,6 +89,7 @@ def brief(file: Path, *more: str) -> list[str]:
         "dataset.batch_size=8",
         "trainer.val_check_interval=10",
         "callbacks.pictures.every=1000",
+        "callbacks.pictures.count=1",  # matplotlib took most of a training's time
         "baselines=[mean]",
         "logger=none",
         "threads=1",

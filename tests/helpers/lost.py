@@ -1,4 +1,4 @@
-"""A job that is killed once, named in a configuration by jobs that a launcher starts."""
+"""Ends of a training at a step: a job killed once among many, an interrupt; named in a configuration."""
 
 from __future__ import annotations
 
@@ -30,3 +30,14 @@ class KillOnce(L.Callback):
             except FileExistsError:
                 return
             os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Interrupt(L.Callback):
+    """Ctrl-C at a step."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_train_batch_start(self, trainer: L.Trainer, *unused: Any) -> None:
+        if trainer.global_step == self.step:
+            signal.raise_signal(signal.SIGINT)

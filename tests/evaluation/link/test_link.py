@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from importlib.util import find_spec
 from types import SimpleNamespace
 
@@ -36,6 +37,11 @@ def _noise_repeats():
         from sionna.phy import config
 
         config.seed = 0
+
+
+def drawn():
+    """`draw(*shape)`: complex normal numbers, the same in every test."""
+    return partial(torch.randn, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.fixture(scope="module")
@@ -79,18 +85,18 @@ def test_grid_is_sionna_s_order() -> None:
 
 
 def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
-    generator = torch.Generator().manual_seed(0)
-    true = torch.randn(200, 16, 4, dtype=torch.complex64, generator=generator)
+    draw = drawn()
+    true = draw(200, 16, 4)
     assert torch.allclose(gain(true, true).mean(), torch.tensor(16.0), rtol=0.01)
     assert loss_db(true, true * (2 - 1j)).abs().max() < 1e-4
-    noise = torch.randn(200, 16, 4, dtype=torch.complex64, generator=generator)
+    noise = draw(200, 16, 4)
     # Half of the beam's power is of no use: |h + e|^2 = 2 |h|^2.
     assert abs(float(loss_db(true, true + noise).mean()) - 3.0) < 0.3
 
 
 def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
     """A prediction of exactly 0, or one silent test channel, ended the command: -inf is no figure."""
-    true = torch.randn(4, 2, 3, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    true = drawn()(4, 2, 3)
     silent = true.clone()
     silent[1] = 0
     nothing = beam_facts(true, torch.zeros_like(true), np.ones(4, bool))
@@ -174,8 +180,8 @@ def test_a_coarse_look_may_be_all_there_is() -> None:
 @needs_sionna
 @pytest.mark.slow
 def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
-    generator = torch.Generator().manual_seed(0)
-    true = torch.randn(40, 26, dtype=torch.complex64, generator=generator)
+    draw = drawn()
+    true = draw(40, 26)
     known = Band(true, true, torch.zeros(40))
     loop = Adaptation()
     found = loop.rates(known, 0.03)
@@ -191,9 +197,9 @@ def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
 @needs_sionna
 @pytest.mark.slow
 def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
-    generator = torch.Generator().manual_seed(0)
-    true = torch.randn(200, 1, dtype=torch.complex64, generator=generator).expand(200, 26)
-    error = torch.randn(200, 1, dtype=torch.complex64, generator=generator).expand(200, 26) * 0.2
+    draw = drawn()
+    true = draw(200, 1).expand(200, 26)
+    error = draw(200, 1).expand(200, 26) * 0.2
     band = Band(true, true + error, torch.full((200,), 0.04))
     loop = Adaptation()
     bold, careful = (loop.rates(band, 0.01, care, "expected") for care in (0.0, 1.0))
@@ -204,10 +210,10 @@ def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
 @needs_sionna
 @pytest.mark.slow
 def test_pusch_knows_who_knows_more() -> None:
-    generator = torch.Generator().manual_seed(0)
+    draw = drawn()
     torch.manual_seed(0)
-    true = torch.randn(16, 1, dtype=torch.complex64, generator=generator).expand(16, 48).contiguous()
-    error = torch.randn(16, 48, dtype=torch.complex64, generator=generator) * 0.6
+    true = draw(16, 1).expand(16, 48).contiguous()
+    error = draw(16, 48) * 0.6
     known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
     pusch = Pusch("qpsk", 4, 30, known, iterations=8)
     assert np.isclose(pusch.pilot_share, 2 / 14)
@@ -223,9 +229,9 @@ def test_pusch_knows_who_knows_more() -> None:
 @needs_sionna
 @pytest.mark.slow
 def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
-    generator = torch.Generator().manual_seed(0)
+    draw = drawn()
     torch.manual_seed(0)
-    true, error = torch.randn(2, 16, 1, dtype=torch.complex64, generator=generator).expand(2, 16, 48)
+    true, error = draw(2, 16, 1).expand(2, 16, 48)
     share = 0.2
     guess, doubt = true + share**0.5 * true.abs() * error, share * true[:, 0].abs().square()
     known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
@@ -236,7 +242,7 @@ def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
     assert wrong["perfect"] - 0.02 <= wrong["predicted_pilots"] <= wrong["lmmse"] + 0.02
     # Without any doubt the pilots are not listened to, with all of it the prediction is not.
     sure, deaf = (pusch.receivers[name]._channel_estimator for name in ("predicted_pilots", "lmmse"))
-    y = torch.randn(4, 1, 1, 14, 48, dtype=torch.complex64, generator=generator)
+    y = draw(4, 1, 1, 14, 48)
     pusch._prior = guess[:4], torch.zeros(4)
     assert torch.allclose(sure(y, torch.tensor(0.1))[0][:, 0, 0, 0, 0, 0], guess[:4], atol=1e-2)
     pusch._prior = torch.zeros(4, 48), torch.ones(4)
@@ -267,9 +273,6 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
 def _split():
     from gsparc.data.splits import Split, indices_hash
 
-    rows = np.arange(120)
     one = fold()
-    whole = type(one)(
-        one.train[:40], one.val, rows[40:80].tolist() and np.concatenate([rows[40:80], one.test])
-    )
+    whole = type(one)(one.train[:40], one.val, np.concatenate([np.arange(40, 80), one.test]))
     return Split("toy", (whole,), indices_hash((whole,)))

@@ -6,8 +6,7 @@ import re
 from xml.etree import ElementTree
 
 import pytest
-from campaigns import compose
-from hydra.core.hydra_config import HydraConfig
+from campaigns import compose, runs_in
 from matplotlib.colors import to_hex
 
 from gsparc.commands.listing import COMMANDS
@@ -27,10 +26,9 @@ FETCHED = re.compile(
 @pytest.fixture(scope="module")
 def written(three_for_all, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
-    place = type("C", (), {"runtime": type("R", (), {"output_dir": out})})
     config = compose(*arguments([str(path) for path in three_for_all]), config="report")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(HydraConfig, "get", lambda: place)
+        runs_in(patch, out)
         return task(config), out
 
 

@@ -89,7 +89,7 @@ def test_a_sweep_with_a_failed_job_ends_with_status_1(three, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
     file = spectra(tmp_path / "own.npz")
-    settings = brief(file, "trainer.max_steps=4", "seed=0,1", "model.field.count=40,-1")
+    settings = brief(file, "trainer.max_steps=4", "model.field.count=40,-1")
     command = [sys.executable, "train.py", "-m", *[s for s in settings if s != "model.field.count=40"]]
     sweep = tmp_path / "sweep"
     done = subprocess.run(
@@ -97,7 +97,7 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 1, done.stderr
-    assert done.stderr.count("failed, others go on") == 2 and "2 jobs failed" in done.stdout
+    assert done.stderr.count("failed, others go on") == 1 and "1 jobs failed" in done.stdout
     timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
-    assert len(timed) == 2 and all("count-40" in name for name in timed)
+    assert len(timed) == 1 and "count-40" in timed[0]
     assert (sweep / "sweep.csv").read_text().count("\n") == 2
