@@ -6,8 +6,10 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -460,6 +462,22 @@ def test_an_interrupt_leaves_a_checkpoint_that_goes_on(spectra_file, tmp_path):
     facts, _ = train(compose(*brief(spectra_file, *rare, *more)), tmp_path / "on")
     assert np.isfinite(facts["test/psnr_db"])
     assert checkpoint.read(tmp_path / "on" / "model.ckpt").method == "gsparc"
+
+
+@pytest.mark.slow
+def test_an_interrupted_process_ends_with_130_and_one_line(spectra_file, tmp_path):
+    run, often = tmp_path / "run", "callbacks.checkpoint.every_n_train_steps=10"
+    words = brief(spectra_file, "trainer.max_steps=100000", often, f"hydra.run.dir={run}")
+    process = subprocess.Popen(
+        [sys.executable, "train.py", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    until = time.monotonic() + 120
+    while not (run / "last.ckpt").exists() and time.monotonic() < until:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and f"go on with ckpt_path={run / 'last.ckpt'}" in err
+    assert "Traceback" not in err
 
 
 @pytest.mark.slow
