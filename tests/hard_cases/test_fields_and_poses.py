@@ -25,9 +25,9 @@ FACTOR = 16
 
 
 def holds(fast: int, many: int, **drawn):
-    """Of `fast` drawn examples in `make test`, a third of `many` in `make test-slow`, all in `make rare`."""
+    """Of `fast` drawn examples in `make test`, a fifth of `many` in `make test-slow`, all in `make rare`."""
     slow, rare = pytest.mark.slow, pytest.mark.rare
-    few, some = pytest.param(fast, id="few"), pytest.param(many // 3, marks=slow, id="some")
+    few, some = pytest.param(fast, id="few"), pytest.param(many // 5, marks=slow, id="some")
     efforts = [few, some, pytest.param(many, marks=(slow, rare), id="many")]
     quiet = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large]
     plain = {"deadline": None, "database": None, "derandomize": True, "suppress_health_check": quiet}

@@ -11,7 +11,7 @@ from rasters import Scene, assert_equals_float64, origin
 
 from gsparc.ops import Cutoff, SphereGrid
 
-GRID = SphereGrid(6, 8, 0.1, -0.2, 0.05, 0.05)
+GRID = SphereGrid(3, 4, 0.1, -0.2, 0.1, 0.1)
 
 
 def wall(opacity: float, n: int = 30_000) -> Scene:

@@ -80,7 +80,7 @@ def brief(file: Path, *more: str) -> list[str]:
         "trainer.max_steps=20",
         "dataset.batch_size=8",
         "trainer.val_check_interval=10",
-        "callbacks.pictures.every=1000",
+        "~callbacks.pictures",
         "baselines=[mean]",
         "logger=none",
         "threads=1",

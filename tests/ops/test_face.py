@@ -37,15 +37,6 @@ def test_absent_backends_say_why():
 
 
 @BACKENDS
-def test_stages_are_the_whole(backend):
-    scene, pose = random_scene(), poses(3)
-    plan = make_plan(*scene.model, pose, GRID, backend=backend)
-    apart = composite(plan, *scene.model, scene.features)
-    whole = rasterize(*scene.model, scene.features, pose, GRID, backend=backend)
-    assert torch.equal(apart.image, whole.image) and torch.equal(apart.radii, whole.radii)
-
-
-@BACKENDS
 def test_shared_features_many_poses(backend):
     scene, pose = random_scene(samples=1), poses(3)
     one, each = (

@@ -57,7 +57,7 @@ def test_cut_short(tmp_path, share, suffix):
 
 
 @pytest.mark.parametrize(
-    "count", [pytest.param(5, id="few"), pytest.param(80, id="many", marks=pytest.mark.slow)]
+    "count", [pytest.param(5, id="few"), pytest.param(40, id="many", marks=pytest.mark.slow)]
 )
 def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
     good = users_file(tmp_path / "good.h5").read_bytes()
