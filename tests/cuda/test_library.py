@@ -1,7 +1,5 @@
 """Finding and building the library: nothing happens at import, and absence is explained in one line."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import shutil

@@ -3,8 +3,6 @@
 `pytest tests/hard_cases --table docs/hard-cases.md` writes the table; see tests/helpers/ledger.py.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -4,8 +4,6 @@
 four antennas, and a band at four antennas with hardly any noise, where a Cholesky factor failed.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from functools import cache
 from pathlib import Path

@@ -5,8 +5,6 @@ away trains to the same figures and predicts the same at the same places. Positi
 so that the shift itself does not round; then nothing may differ. Tolerance: none.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from campaigns import brief, compose, spectra

@@ -6,8 +6,6 @@ the input by one unit of float32's rounding. Thousands of examples stayed below 
 a threshold that one such unit crosses it are left out of the comparison and of the gradients; all are finite.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ is whole; going on always works; the end is bit-identical to an uninterrupted ru
 a file that is written in place is cut short by the kill.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import zipfile

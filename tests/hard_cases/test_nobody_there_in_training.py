@@ -5,8 +5,6 @@ every Gaussian ends with the floor; a run whose Gaussians are all behind the hor
 without any, finish with finite figures. Naive: pruning by threshold alone leaves none.
 """
 
-from __future__ import annotations
-
 import lightning.pytorch as L
 import numpy as np
 import pytest

@@ -5,8 +5,6 @@ Gaussian, leaves batch and parameters on disk, and keeps the last good checkpoin
 The rasterizer's door refuses what is not finite or would overflow inside. Exact: refused, or finite.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -5,8 +5,6 @@ tests of the kernels run on it unchanged: memory beside a tensor or a plan, over
 numbers that the integer cannot hold end the run. Able to fail: a plan whose order leaves the tensors does.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -4,8 +4,6 @@ Remedy: a predictor is not changed by a question, plans own their buffers, and w
 `make soak` takes 30 minutes, the slow tests 25 seconds.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import sys

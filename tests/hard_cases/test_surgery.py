@@ -4,8 +4,6 @@ Remedy: one place edits them all (gsparc/field/edit.py). Shown: after any sequen
 finite, untouched rows are bit-identical in everything, ids are permanent and unique. Tolerance: none.
 """
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

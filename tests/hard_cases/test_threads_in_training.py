@@ -4,8 +4,6 @@ Remedy: our operators have a fixed order of summation (test_threads.py); torch's
 run that must repeat pins its threads (`threads=1`). Shown: a pinned run repeats bit for bit.
 """
 
-from __future__ import annotations
-
 import torch
 from campaigns import brief, compose, spectra
 

@@ -1,7 +1,5 @@
 """Files of a user's own measurements, small enough to train on in a second."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 Equivalent to starting the command and killing it, except that 50 kills do not cost 50 imports of torch.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """A job that is killed once, named in a configuration by jobs that a launcher starts."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

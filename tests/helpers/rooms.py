@@ -1,7 +1,5 @@
 """Rooms of the image-source simulator whose every source is known, as measurements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

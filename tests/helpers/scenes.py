@@ -1,7 +1,5 @@
 """Small scenes in which one idea must work and another cannot."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from campaigns import spectra

@@ -4,15 +4,7 @@ import pytest
 import torch
 from rasters import GRIDS, poses, random_scene
 
-from gsparc.ops import (
-    BackendUnavailable,
-    SphereGrid,
-    StalePlan,
-    composite,
-    freeze,
-    make_plan,
-    rasterize,
-)
+from gsparc.ops import BackendUnavailable, SphereGrid, StalePlan, composite, freeze, make_plan, rasterize
 from gsparc.ops.geometry import WIDEST_GRID
 
 GRID = GRIDS["hemisphere"]

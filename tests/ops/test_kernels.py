@@ -42,12 +42,7 @@ def test_equals_reference(dtype, projection, grid, count, hides):
 @PROJECTIONS
 @pytest.mark.parametrize(
     "optics",
-    [
-        {"compensate": False},
-        {"low_pass": 0.0},
-        {"cutoff": Cutoff(0.01, 1e-4, relative=True)},
-        {"near": 1.5},
-    ],
+    [{"compensate": False}, {"low_pass": 0.0}, {"cutoff": Cutoff(0.01, 1e-4, relative=True)}, {"near": 1.5}],
     ids=["uncompensated", "sharp", "relative", "fading"],
 )
 def test_switches_equal_reference(projection, optics):

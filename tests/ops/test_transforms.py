@@ -1,7 +1,5 @@
 """Forward mode, second derivatives and `torch.func` over the rasterizer: right, or refused in words."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

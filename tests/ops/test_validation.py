@@ -1,7 +1,5 @@
 """What no picture can be made of is refused in one line, on every backend that runs here."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Covariances are factored and solved in gsparc/processes alone; each operation has one definition there."""
 
-from __future__ import annotations
-
 import ast
 from collections import defaultdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Steps that do not pay are not taken: the best validation is kept, and training ends when none is better."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """A budget of seconds is kept, and every schedule ends with it."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import lightning.pytorch as L

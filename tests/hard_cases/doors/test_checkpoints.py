@@ -5,8 +5,6 @@ would leave a mark; no mark may appear. Naive: `pickle.load` and `torch.load(wei
 """
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import builtins
 import io
 import os

@@ -4,8 +4,6 @@ Remedy: gsparc/data/raw.py; text of variable length is first read by a program o
 bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
 """
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys
