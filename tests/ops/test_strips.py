@@ -23,7 +23,8 @@ CASES = {
         lambda: random_scene(n=40, seed=13, size=2.0), origin(), SphereGrid.hemisphere(6, 600)),
     # Up to 64 strips pick their footprints; in a taller image each footprint is handed to its strips. More
     # ranks than a chunk.
-    **{f"{height} rows": (lambda: random_scene(n=1100, seed=15), poses(2), SphereGrid.hemisphere(height, 4))
+    **{f"{height} rows": (
+        lambda: random_scene(n=1100, samples=2, seed=15), poses(2), SphereGrid.hemisphere(height, 4))
        for height in (256, 257)},
     **{f"{height} x {width}, which no tile divides": (
         lambda: random_scene(n=30, seed=14), poses(0), SphereGrid(height, width, -0.4, 2.9, 0.11, 0.07))
