@@ -477,7 +477,8 @@ def test_an_interrupt_leaves_a_checkpoint_that_goes_on(spectra_file, tmp_path):
 
 @pytest.mark.slow
 def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(spectra_file, tmp_path):
-    process = start(spectra_file, tmp_path / "run", "logger=wandb")
+    drawn = "+callbacks.drawn._target_=gsparc.callbacks.Pictures"
+    process = start(spectra_file, tmp_path / "run", "logger=wandb", drawn)
     _, err = process.communicate(timeout=240)
     assert process.returncode == 0, err
     (folder,) = (tmp_path / "run" / "wandb").glob("offline-run-*")

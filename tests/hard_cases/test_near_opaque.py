@@ -28,7 +28,8 @@ def wall(opacity: float, n: int = 30_000) -> Scene:
 
 @pytest.mark.parametrize("opacity", [1.0, 0.985, 0.01])
 def test_many_layers(backend, opacity):
-    want = assert_equals_float64(wall(opacity), origin(), GRID, backend)
+    # Uncompensated, or no layer would reach the clamp.
+    want = assert_equals_float64(wall(opacity), origin(), GRID, backend, compensate=False)
     assert want["image"].abs().max() > 0.03
 
 
