@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest
@@ -49,15 +47,9 @@ def test_no_reset_that_the_run_is_too_short_to_recover_from(module, caplog):
     assert "no opacity reset at step 60: 0 steps are too few to recover in" in caplog.text
 
 
-@pytest.mark.parametrize("step", [0, 29, 31, 120])
-def test_only_on_schedule(module, step):
-    before = module.model.gaussians.opacity_logits.detach().clone()
+@pytest.mark.parametrize("step,solved", [(0, False), (29, False), (31, False), (120, False), (30, True)])
+def test_only_on_schedule_and_never_of_opacities_that_emissions_were_solved_for(module, step, solved):
+    before, module.solved = module.model.gaussians.opacity_logits.detach().clone(), solved
     OpacityReset(interval=30, stop=100).on_train_batch_end(trainer(module, step), module)
     assert torch.equal(module.model.gaussians.opacity_logits, before)
-    assert int(module.model.gaussians.version) == 0
-
-
-def test_no_reset_of_opacities_that_emissions_were_solved_for(module):
-    module.solved = True
-    OpacityReset(interval=30, stop=100).on_train_batch_end(trainer(module, 30), module)
     assert int(module.model.gaussians.version) == 0

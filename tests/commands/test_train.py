@@ -482,10 +482,9 @@ def test_an_interrupted_process_ends_with_130_and_one_line(spectra_file, tmp_pat
 
 @pytest.mark.slow
 def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(spectra_file, tmp_path):
-    command = [sys.executable, "train.py", *brief(spectra_file, "logger=wandb")]
-    done = subprocess.run(
-        [*command, f"hydra.run.dir={tmp_path / 'run'}"], cwd=ROOT, capture_output=True, text=True
-    )
+    drawn = "+callbacks.drawn._target_=gsparc.callbacks.Pictures"
+    words = brief(spectra_file, "logger=wandb", drawn, f"hydra.run.dir={tmp_path / 'run'}")
+    done = subprocess.run([sys.executable, "train.py", *words], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
     (stored,) = folder.glob("*.wandb")

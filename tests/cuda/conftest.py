@@ -1,7 +1,5 @@
 """Where the CUDA kernels of a test run: on the host shim, or on a GPU."""
 
-from __future__ import annotations
-
 import pytest
 from shim import serving
 

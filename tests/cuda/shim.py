@@ -3,8 +3,6 @@
 `shim` executes the CUDA sources on this CPU; `gpu` copies each call's tensors to the GPU and back.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """On a GPU: tensors that live there, streams, captured graphs, repeatability, and the model."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from rasters import GRIDS, TOLERANCES, assert_close, poses, random_scene, render

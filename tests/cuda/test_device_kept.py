@@ -4,8 +4,6 @@ They hold no data and mix with a CPU's as little as a GPU's do. The rasterizer's
 right shapes, differentiable in the features alone.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Finding and building the library: nothing happens at import, and absence is explained in one line."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import shutil
@@ -67,32 +65,35 @@ def test_no_device_or_the_wrong_driver(monkeypatch, nothing_loaded, said):
     assert said.splitlines()[0] in explained(monkeypatch)
 
 
-def test_no_compiler(monkeypatch, nothing_loaded, tmp_path):
+@pytest.fixture
+def device(monkeypatch, nothing_loaded, tmp_path):
+    """There seems to be a GPU, and no library in the cache."""
     monkeypatch.setattr(cuda_library, "missing_device", lambda: None)
     monkeypatch.setattr(cuda_library, "architectures", lambda: ["90"])
-    monkeypatch.setattr(cuda_library, "compiler", lambda: None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def test_no_compiler(monkeypatch, device):
+    monkeypatch.setattr(cuda_library, "compiler", lambda: None)
     assert "there is no nvcc to build them" in explained(monkeypatch)
 
 
-def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(monkeypatch, nothing_loaded, tmp_path):
-    nvcc = tmp_path / "nvcc"
-    nvcc.write_text("#!/bin/sh\necho 'x.cu(3): error: no such thing' >&2\nexit 1\n")
-    nvcc.chmod(0o755)
-    monkeypatch.setattr(cuda_library, "missing_device", lambda: None)
-    monkeypatch.setattr(cuda_library, "architectures", lambda: ["90"])
-    monkeypatch.setattr(cuda_library, "compiler", lambda: str(nvcc))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(monkeypatch, device, tmp_path):
+    nvcc = script(tmp_path / "nvcc", "echo 'x.cu(3): error: no such thing' >&2\nexit 1\n")
+    monkeypatch.setattr(cuda_library, "compiler", lambda: nvcc)
     assert "no such thing" in explained(monkeypatch)
     assert not list((tmp_path / "gsparc").iterdir())
 
 
-def nvcc_of(folder: Path, *knows: str) -> str:
-    """A compiler that knows some architectures, as `--list-gpu-arch` prints them."""
-    path = folder / "nvcc"
-    path.write_text("#!/bin/sh\n" + "".join(f"echo {name}\n" for name in knows))
+def script(path: Path, lines: str) -> str:
+    path.write_text(f"#!/bin/sh\n{lines}")
     path.chmod(0o755)
     return str(path)
+
+
+def nvcc_of(folder: Path, *knows: str) -> str:
+    """A compiler that knows some architectures, as `--list-gpu-arch` prints them."""
+    return script(folder / "nvcc", "".join(f"echo {name}\n" for name in knows))
 
 
 def test_a_gpu_newer_than_the_compiler_gets_code_that_the_driver_translates(tmp_path):
@@ -112,9 +113,7 @@ def test_every_gpu_of_the_machine_is_built_for(monkeypatch):
     assert cuda_library.library_path("75", "90").name.startswith("cuda-75-90-")
 
 
-def test_a_driver_older_than_the_toolkit_is_said_when_the_library_is_loaded(
-    monkeypatch, nothing_loaded, tmp_path
-):
+def test_a_driver_older_than_the_toolkit_is_said_when_the_library_is_loaded(monkeypatch, device):
     class Old(cuda_library.Library):
         def __init__(self, path: Path) -> None:
             pass
@@ -123,11 +122,8 @@ def test_a_driver_older_than_the_toolkit_is_said_when_the_library_is_loaded(
             call.built_for, call.driver = 13000, 12080
             raise RuntimeError("CUDA driver version is insufficient for CUDA runtime version")
 
-    monkeypatch.setattr(cuda_library, "missing_device", lambda: None)
-    monkeypatch.setattr(cuda_library, "architectures", lambda: ["90"])
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(cuda_library, "Library", Old)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     kept = cuda_library.library_path("90")
     kept.parent.mkdir()
     kept.touch()

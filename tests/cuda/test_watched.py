@@ -5,8 +5,6 @@ two of them share without a barrier between, whatever the order they happened to
 nothing.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,11 +1,7 @@
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior
 
@@ -67,16 +63,11 @@ def test_an_unknown_kind_is_refused():
         PositionEncoding(EncodingSettings("fuorier"), BOX)  # type: ignore[arg-type]
 
 
-@settings(max_examples=30, deadline=None)
-@given(
-    kind=st.sampled_from(["raw", "fourier", "kernel"]),
-    size=st.sampled_from([0.0, 1e-9, 1e-3, 1.0, 1e4]),
-    count=st.integers(0, 3),
-)
-def test_any_box_gives_finite_features_of_order_one(kind, size, count):
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("kind", ["raw", "fourier", "kernel"])
+def test_any_box_gives_finite_features_of_order_one(kind, size):
     """Also the box of a single position, whose extent is 0."""
-    box = BOX.double() * size
-    encode = PositionEncoding(EncodingSettings(kind), box, prior())
-    got = encode((BOX[0] + (BOX[1] - BOX[0]) * torch.rand(count, 3)) * size)
-    assert got.shape == (count, encode.width) and torch.isfinite(got).all()
-    assert (got.abs() <= 2).all()
+    encode = PositionEncoding(EncodingSettings(kind), BOX.double() * size, prior())
+    for count in (0, 1, 30):
+        got = encode(positions(count) * size)
+        assert got.shape == (count, encode.width) and (got.abs() <= 2).all()

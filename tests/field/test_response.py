@@ -1,7 +1,5 @@
 """From emissions to measurements: factored channels, splat then A; end to end."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """One world trained with defaults beside every plain method that trains on it, and judged."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

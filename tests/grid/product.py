@@ -1,7 +1,5 @@
 """What else the product must do with a trained world: every part answers, and alike."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ python tests/grid/sweep.py RESULTS.jsonl            # the covering set: every pa
 python tests/grid/sweep.py RESULTS.jsonl --seed 7   # 100 combinations drawn by a seed
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -4,8 +4,6 @@
 counts when it is a gross one, after five fresh seeds.
 """
 
-from __future__ import annotations
-
 import pytest
 from judging import repeated, run
 from product import PARTS

@@ -3,8 +3,6 @@
 Nothing of gsparc is used, so that a mistake of ours is not in both.
 """
 
-from __future__ import annotations
-
 import itertools
 import zlib
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Remedy: d = sqrt(|x - mu|^2 + d_min^2) / d_ref. Shown: finite at d = 0, forward 
 the Gaussian there; far away the slope of the plain law within (d_min / d)^2.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -5,8 +5,6 @@ power. Shown: g from -1e4 to 1e4, finite loss and gradient, in float32 and with 
 Tolerance against float64 inside the clamp: 1e-6 relative to 1 + C.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 

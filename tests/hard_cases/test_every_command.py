@@ -5,8 +5,6 @@ thread that computes asks whether it shall go on (gsparc/processes/worker.py). T
 of files, which fails like a full one in the middle of writing. Naive: tests/hard_cases/test_full_disk.py.
 """
 
-from __future__ import annotations
-
 import re
 import signal
 import time

@@ -1,7 +1,5 @@
 """The list of hard cases, and that each has its file, its remedy and a test that its naive formula fails."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -9,7 +9,7 @@ import resource
 
 import pytest
 import torch
-from rasters import assert_equals_float64, one, origin, random_scene, render
+from rasters import PROJECTIONS, assert_equals_float64, one, origin, random_scene, render
 
 from gsparc.ops import SphereGrid, _native, composite, make_plan, operators
 
@@ -17,7 +17,7 @@ GRID = SphereGrid.hemisphere()
 SMALL = SphereGrid.full_sphere(20, 40)
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 @pytest.mark.parametrize("sigma", [4.0, 40.0, 4e3])
 def test_a_giant_equals_float64(backend, projection, sigma):
     scene = one([1.0, 0.0, 1.0], sigma=sigma, opacity=0.5)

@@ -5,8 +5,6 @@ away trains to the same figures and predicts the same at the same places. Positi
 so that the shift itself does not round; then nothing may differ. Tolerance: none.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from campaigns import brief, compose, spectra
@@ -18,7 +16,7 @@ FAR = 1e5
 
 
 @pytest.mark.parametrize("moving", ["tx", "rx"])
-def test_a_translated_campaign_predicts_the_same(tmp_path, moving):
+def test_a_translated_campaign_predicts_the_same(tmp_path, undrawn, moving):
     predictors, figures = [], []
     for name, origin in (("near", 0.0), ("far", FAR)):
         file = spectra(tmp_path / f"{name}.npz", moving=moving, origin=origin)

@@ -4,8 +4,6 @@ Remedy: second moments are taken about the target's mean and the variance is flo
 1e-7 apart in float32, against float64 within 1e-5, gradients finite.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -5,8 +5,6 @@ file (gsparc/models/checkpoint.py, gsparc/data/raw.py). Shown with a limit on th
 fails like a full disk does: in the middle of writing. Naive: writing in place loses the good one first.
 """
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 

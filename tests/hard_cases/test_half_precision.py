@@ -6,8 +6,6 @@ refused by the rasterizer. Shown: a run under bfloat16 autocast is finite and en
 error.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

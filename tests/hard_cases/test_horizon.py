@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from rasters import assert_equals_float64, one, origin, render
+from rasters import PROJECTIONS, assert_equals_float64, one, origin, render
 
 from gsparc.ops import Cutoff, SphereGrid
 
@@ -27,7 +27,7 @@ def share_above(elevation: float) -> float:
     return 0.5 * math.erfc(-(elevation + GRID.elevation_step / 2) / (math.sqrt(2) * spread))
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 def test_share_follows_the_integral(backend, projection):
     heights = torch.linspace(-0.35, 0.35, 29).tolist()
     sums = []
@@ -45,7 +45,7 @@ def test_share_follows_the_integral(backend, projection):
     assert max(abs(a - b) for a, b in pairwise(sums)) < 0.085 * whole
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 @pytest.mark.parametrize("elevation", [-0.3, -0.1, 0.0, 0.1])
 def test_equals_float64(backend, projection, elevation):
     scene = one([math.cos(elevation), 0.1, math.sin(elevation)], distance=FAR, sigma=SIGMA, opacity=0.5)

@@ -6,8 +6,6 @@ is whole; going on always works; the end is bit-identical to an uninterrupted ru
 a file that is written in place is cut short by the kill.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import zipfile
@@ -61,7 +59,7 @@ def test_training_killed_again_and_again(undisturbed, tmp_path, chain):
     whole, settings, seconds = undisturbed
     for folder, share in sooner(tmp_path):
         kills = 0
-        for moment in moments(5, share * seconds, seed=chain):
+        for moment in moments(5 if chain else 3, share * seconds, seed=chain):
             if not killed(training, str(folder), [*settings, *last_checkpoint(folder)], after_s=moment):
                 break
             kills += 1
@@ -89,7 +87,7 @@ def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
     for folder, share in sooner(tmp_path):
         out = folder / "box.h5"
         kills = 0
-        for moment in moments(5, share * seconds, seed=100 + chain):
+        for moment in moments(5 if chain else 3, share * seconds, seed=100 + chain):
             if out.exists() or not killed(simulation, str(out), ROWS, after_s=moment):
                 break  # once the file is there another run is refused
             kills += 1

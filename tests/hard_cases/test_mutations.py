@@ -5,8 +5,6 @@ Remedy: checksums of archives (gsparc/models/checkpoint.py), of arrays and of ev
 read like a sound one.
 """
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

@@ -5,18 +5,21 @@ to back with the forward's own recurrence (csrc/backward.h). Shown: 30,000 layer
 within 1e-9 in float64 and 1e-4 in float32.
 """
 
+import math
+
 import pytest
 import torch
 from rasters import Scene, assert_equals_float64, origin
 
 from gsparc.ops import Cutoff, SphereGrid
 
-GRID = SphereGrid(6, 8, 0.1, -0.2, 0.05, 0.05)
+GRID = SphereGrid(3, 4, 0.1, -0.2, 0.1, 0.1)
 
 
 def wall(opacity: float, n: int = 30_000) -> Scene:
     draw = torch.Generator().manual_seed(4)
     means = torch.cat([torch.linspace(2, 8, n)[:, None], 0.3 * torch.randn(n, 2, generator=draw)], 1)
+    means[0] = torch.tensor([1.5, 0.0, 1.5 * math.tan(0.1)])  # nearest, at a pixel's centre: it is clamped
     return Scene(
         means=means.double(),
         quats=torch.tensor([[1.0, 0, 0, 0]]).double().repeat(n, 1),
@@ -28,7 +31,7 @@ def wall(opacity: float, n: int = 30_000) -> Scene:
 
 @pytest.mark.parametrize("opacity", [1.0, 0.985, 0.01])
 def test_many_layers(backend, opacity):
-    want = assert_equals_float64(wall(opacity), origin(), GRID, backend)
+    want = assert_equals_float64(wall(opacity), origin(), GRID, backend, compensate=False)
     assert want["image"].abs().max() > 0.03
 
 

@@ -7,7 +7,7 @@ Tolerance 2e-3 on the image: directions rounded to float32 move a needle 0.55 px
 
 import pytest
 import torch
-from rasters import Scene, assert_equals_float64, origin, render
+from rasters import PROJECTIONS, Scene, assert_equals_float64, origin, render
 
 from gsparc.ops import SphereGrid
 
@@ -33,7 +33,7 @@ def extreme(kind: str, aspect: float) -> Scene:
     )
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 @pytest.mark.parametrize("kind", ["needle", "pancake"])
 @pytest.mark.parametrize("aspect", [1e2, 1e4, 1e6])
 def test_float32_equals_float64(backend, projection, kind, aspect):

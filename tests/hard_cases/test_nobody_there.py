@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rasters import assert_equals_float64, origin, poses, random_scene, render
+from rasters import PROJECTIONS, assert_equals_float64, origin, poses, random_scene, render
 
 from gsparc.ops import Cutoff, SphereGrid, freeze, make_plan, mean_weights
 
@@ -20,7 +20,7 @@ def assert_nothing_is_seen(got):
     assert all((value == 0).all() for name, value in got.items() if name.startswith("d_"))
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 @pytest.mark.parametrize("hides", [False, True])
 @pytest.mark.parametrize("count", [0, 3])
 def test_no_gaussians(backend, projection, hides, count):
@@ -34,23 +34,24 @@ def test_equals_float64(backend):
     assert_equals_float64(random_scene(n=0), poses(0), GRID, backend)
 
 
-def test_all_below_the_horizon(backend):
+def below_the_horizon():
     scene = random_scene(n=20, size=0.1)
-    under = replace(scene, means=scene.means * 0.1 - torch.tensor([0.0, 0.0, 5.0]).double())
-    assert_nothing_is_seen(render(under, origin(), GRID, backend))
+    return replace(scene, means=scene.means * 0.1 - torch.tensor([0.0, 0.0, 5.0]).double())
+
+
+def test_all_below_the_horizon(backend):
+    assert_nothing_is_seen(render(below_the_horizon(), origin(), GRID, backend))
 
 
 @pytest.mark.parametrize("relative", [False, True])
 def test_all_transparent(backend, relative):
-    scene, cut = random_scene(n=20), Cutoff(relative=relative)
-    assert_nothing_is_seen(
-        render(replace(scene, opacities=0 * scene.opacities), origin(), GRID, backend, cutoff=cut)
-    )
+    scene = replace(random_scene(n=20), opacities=torch.zeros(20).double())
+    assert_nothing_is_seen(render(scene, origin(), GRID, backend, cutoff=Cutoff(relative=relative)))
 
 
 def test_weights_and_frozen_views_of_nothing(backend):
     scene = random_scene(n=0)
-    model = [getattr(scene, k).requires_grad_() for k in ("means", "quats", "scales", "opacities")]
+    model = [leaf.requires_grad_() for leaf in scene.model]
     plan = make_plan(*model, origin(), GRID, backend=backend)
     seen = mean_weights(plan, *model)
     assert seen.mean.shape == (1, 0) == seen.share.shape
@@ -60,13 +61,9 @@ def test_weights_and_frozen_views_of_nothing(backend):
 
 def test_share_of_the_unseen_is_zero_and_harmless(backend):
     """Naive: sum / sum is 0 / 0."""
-    scene = random_scene(n=20)
-    model = [getattr(scene, k).clone() for k in ("means", "quats", "scales", "opacities")]
-    model[0] = model[0] * 0.1 - torch.tensor([0.0, 0.0, 5.0]).double()
-    model[3] = model[3].requires_grad_()
-    plan = make_plan(*model, origin(), GRID, backend=backend)
-    seen = mean_weights(plan, *model)
+    model = below_the_horizon().model
+    model[3].requires_grad_()
+    seen = mean_weights(make_plan(*model, origin(), GRID, backend=backend), *model)
     (seen.share.sum() + seen.mean.sum()).backward()
     assert (seen.share == 0).all() and (model[3].grad == 0).all()
-    naive = torch.zeros(20) / torch.zeros(20)
-    assert naive.isnan().all()
+    assert (torch.zeros(20) / torch.zeros(20)).isnan().all()

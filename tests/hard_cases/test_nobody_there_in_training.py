@@ -5,8 +5,6 @@ every Gaussian ends with the floor; a run whose Gaussians are all behind the hor
 without any, finish with finite figures. Naive: pruning by threshold alone leaves none.
 """
 
-from __future__ import annotations
-
 import lightning.pytorch as L
 import numpy as np
 import pytest
@@ -27,7 +25,7 @@ PRUNE = (
 )
 
 
-def test_pruning_stops_at_the_floor(tmp_path):
+def test_pruning_stops_at_the_floor(tmp_path, undrawn):
     facts, objects = train(compose(*brief(spectra(tmp_path / "own.npz"), *PRUNE)), tmp_path / "run")
     assert facts["model/num_gaussians"] == 5 and np.isfinite(facts["test/psnr_db"])
     opacities = objects.methods[0].fitted().gaussians.opacities

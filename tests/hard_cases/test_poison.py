@@ -5,8 +5,6 @@ Gaussian, leaves batch and parameters on disk, and keeps the last good checkpoin
 The rasterizer's door refuses what is not finite or would overflow inside. Exact: refused, or finite.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
@@ -17,7 +15,7 @@ import pytest
 import torch
 from campaigns import brief, compose, spectra
 from contexts import loaded, short, trained
-from rasters import GRIDS, origin, random_scene, render
+from rasters import GRIDS, PROJECTIONS, origin, random_scene, render
 
 from gsparc.models import checkpoint
 from gsparc.models.registry import build
@@ -113,7 +111,7 @@ def test_what_overflows_inside_is_refused_at_the_rasterizers_door(backend, name,
 
 
 @pytest.mark.parametrize("name,value", [("means", FARTHEST), ("scales", WIDEST), ("quats", 3e38)])
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 def test_what_is_just_let_in_stays_finite(backend, projection, name, value):
     scene = random_scene(n=5).to(torch.float32)
     getattr(scene, name)[3] = value

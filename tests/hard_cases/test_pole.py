@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from rasters import assert_equals_float64, one, origin, render
+from rasters import PROJECTIONS, assert_equals_float64, one, origin, render
 
 from gsparc.ops import SphereGrid
 
@@ -39,7 +39,7 @@ def test_no_jump_at_the_zenith(backend):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 def test_finite_exactly_at_the_poles(backend, dtype, projection):
     for z in (1.0, -1.0):
         scene = one([0.0, 0.0, z], sigma=0.3).to(dtype)
@@ -48,7 +48,7 @@ def test_finite_exactly_at_the_poles(backend, dtype, projection):
         assert got["image"].max() > 0.5
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 @pytest.mark.parametrize("away", [0.0, 1e-6, 1e-3, 0.1])
 def test_equals_float64(backend, projection, away):
     scene = on_meridian(math.pi / 2 - away) if away else one([0.0, 0.0, 1.0], sigma=0.3, opacity=0.5)

@@ -6,8 +6,6 @@ and so are the statistics of the last interval. Seconds, machine and memory diff
 test_kills.py.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

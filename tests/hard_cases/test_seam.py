@@ -10,12 +10,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rasters import assert_equals_float64, one, origin, random_scene, render
+from rasters import PROJECTIONS, assert_equals_float64, one, origin, random_scene, render
 
 from gsparc.ops import Pose, SphereGrid
 
 GRID = SphereGrid.hemisphere(20, 72)
-PROJECTIONS = pytest.mark.parametrize("projection", ["tangent", "equirect"])
 
 
 def turn_about_boresight(columns: int) -> torch.Tensor:

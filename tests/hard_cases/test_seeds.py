@@ -4,8 +4,6 @@ Remedy: those of all hard cases. Shown: every run ends with finite parameters an
 over the seeds is reported. Real data where they are present, else simulated ones in the same layout.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ silent rows, and one that is silent altogether, train and are tested with finite
 one line. Exact. (Metrics alone: tests/evaluation/test_metrics.py.)
 """
 
-from __future__ import annotations
-
 import json
 import math
 

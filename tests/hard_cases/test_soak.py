@@ -1,10 +1,8 @@
 """Soak: threads that load, ask and reject for minutes; answers stay the same and memory stays flat.
 
 Remedy: a predictor is not changed by a question, plans own their buffers, and what is cached is bounded.
-`make soak` takes 30 minutes, the slow tests 40 seconds.
+`make soak` takes 30 minutes, the slow tests 25 seconds.
 """
-
-from __future__ import annotations
 
 import os
 import random
@@ -17,11 +15,10 @@ import numpy as np
 import pytest
 import torch
 from campaigns import RENDERED, channels, compose, powers, spectra
-from contexts import short
+from contexts import loaded, short
 from omegaconf import OmegaConf
 
 import gsparc
-from gsparc.data.load import load, split_for
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.models.registry import build
@@ -44,11 +41,11 @@ def trained(folder: Path) -> dict[str, np.ndarray]:
     """Writes a checkpoint of each model; returns where it is asked, in world coordinates."""
     asked = {}
     for name, make in MODELS.items():
-        data = load({"name": "own", "file": str(make(folder / f"{name}.npz"))})
+        data, fold = loaded(make(folder / f"{name}.npz"))
         more = (*RENDERED, "model.field.count=40") if name == "gsparc" else ()
         config = compose(f"model={name.removesuffix('_power')}", *more)
         method = build(config.model)
-        method.fit(data, split_for({"name": "random"}, data).folds[0], short(folder / name, 10))
+        method.fit(data, fold, short(folder / name, 10))
         settings = OmegaConf.to_container(config.model, resolve=True)
         checkpoint.save(folder / f"{name}.ckpt", method, OmegaConf.to_yaml({"model": settings}))
         asked[name] = data.moving[:12] + data.site.origin
@@ -99,7 +96,7 @@ class Worker(threading.Thread):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from /proc")
 def test_loads_and_queries_from_threads_leave_answers_and_memory_alone(tmp_path, request):
-    minutes = request.config.getoption("--soak-minutes", None) or 40 / 60
+    minutes = request.config.getoption("--soak-minutes", None) or 25 / 60
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     asked = trained(tmp_path)

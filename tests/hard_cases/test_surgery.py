@@ -4,45 +4,30 @@ Remedy: one place edits them all (gsparc/field/edit.py). Shown: after any sequen
 finite, untouched rows are bit-identical in everything, ids are permanent and unique. Tolerance: none.
 """
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 
 import lightning.pytorch as L
-import numpy as np
 import pytest
 import torch
 from campaigns import spectra
 from contexts import trained
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from invented import invent
 from ledger import LEDGER
 
 from gsparc.callbacks import Densify, OpacityReset
-from gsparc.data.schema import Site
 from gsparc.field.edit import row_parameters
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
-from gsparc.ops import Pose, SphereGrid
+from gsparc.ops import Pose
 from gsparc.training.module import NonFiniteLoss
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
-SITE = Site(
-    name="toy",
-    kind="spectrum",
-    static_end="rx",
-    grid=SphereGrid.hemisphere(6, 12),
-    array=None,
-    carrier_hz=None,
-    subcarriers_hz=None,
-    origin=np.zeros(3),
-    box=np.array([[-1.0] * 3, [1.0] * 3]),
-    moving_box=np.array([[-1.0] * 3, [1.0] * 3]),
-    sha256="",
-)
+SITE = invent("spectrum").site
 RECEIVER = Pose.identity(torch.tensor([0.0, 0.0, -2.0]))
 
 
@@ -50,7 +35,7 @@ def fresh(count: int) -> tuple[GaussianModel, SimpleNamespace]:
     torch.manual_seed(0)
     emission = EmissionSettings(EncodingSettings("raw"), hidden=2, activation="sigmoid", init_bias=0.0)
     model = GaussianModel(
-        ModelSettings(field=FieldSettings(count=count, placement="sphere"), emission=emission), SITE, RECEIVER
+        ModelSettings(FieldSettings(count=count, placement="sphere"), emission), SITE, RECEIVER
     )
     optimizer = optimizer_for(model, OptimizerSettings())
     return model, SimpleNamespace(optimizers=[optimizer], global_step=0, loggers=[])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from compute_kernels import assert_threads_agree
-from rasters import poses, random_scene, render
+from rasters import PROJECTIONS, poses, random_scene, render
 
 from gsparc.ops import SphereGrid, freeze, make_plan, mean_weights, rasterize
 
@@ -18,7 +18,7 @@ GRID = SphereGrid.hemisphere()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 @pytest.mark.parametrize("count", [0, 3])
 def test_bit_identical(dtype, projection, count):
     scene = random_scene(n=700, seed=1, hides=True).to(dtype)

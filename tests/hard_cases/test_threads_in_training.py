@@ -4,15 +4,13 @@ Remedy: our operators have a fixed order of summation (test_threads.py); torch's
 run that must repeat pins its threads (`threads=1`). Shown: a pinned run repeats bit for bit.
 """
 
-from __future__ import annotations
-
 import torch
 from campaigns import brief, compose, spectra
 
 from gsparc.commands.train import train
 
 
-def test_a_pinned_run_repeats(tmp_path):
+def test_a_pinned_run_repeats(tmp_path, undrawn):
     file = spectra(tmp_path / "own.npz")
     states = []
     for name in ("one", "two"):

@@ -6,9 +6,8 @@ Shown: permuting Gaussians together with their ids changes nothing, bit for bit;
 
 from dataclasses import replace
 
-import pytest
 import torch
-from rasters import assert_equals_float64, origin, random_scene, render
+from rasters import PROJECTIONS, assert_equals_float64, origin, random_scene, render
 
 from gsparc.ops import SphereGrid
 
@@ -22,7 +21,7 @@ def tied(n: int = 40):
     return replace(scene, means=places, ids=torch.arange(n) * 7 + 3)
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 def test_rows_may_be_permuted(backend, projection):
     scene = tied()
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
@@ -37,7 +36,7 @@ def test_rows_may_be_permuted(backend, projection):
         assert gap == 0 if exact else gap < 1e-9, name
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 def test_equals_float64(backend, projection):
     assert_equals_float64(tied(), origin(), GRID, backend, projection=projection)
 

@@ -6,7 +6,7 @@ Shown: gradients of everything behind are exactly 0, not small.
 
 import pytest
 import torch
-from rasters import Scene, assert_equals_float64, one, origin, render
+from rasters import PROJECTIONS, Scene, assert_equals_float64, one, origin, render
 
 from gsparc.ops import Cutoff, SphereGrid, make_plan, mean_weights
 
@@ -32,7 +32,7 @@ def test_what_lies_behind_gets_exactly_zero(backend, dtype):
     assert (got["d_features"][:, 4:] == 0).all() and (got["transmittance"] > 0).all()
 
 
-@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@PROJECTIONS
 def test_equals_float64(backend, projection):
     assert_equals_float64(tunnel(), origin(), GRID, backend, projection=projection)
 
@@ -40,9 +40,7 @@ def test_equals_float64(backend, projection):
 @pytest.mark.parametrize("opacity", [1e-44, 1e-38, 1e-31, 1e-20, 1e-3])
 def test_share_of_the_faintest_has_no_slope_that_overflows(backend, opacity):
     """1 / sum(alpha) is infinite in float32, and 0 times it was NaN: the share keeps its value only."""
-    scene = one([1.0, 0.0, 0.0]).to(torch.float32)
-    model = [getattr(scene, k).clone().requires_grad_() for k in ("means", "quats", "scales", "opacities")]
-    model[3].data.fill_(opacity)
+    model = [leaf.requires_grad_() for leaf in one([1.0, 0.0, 0.0], opacity=opacity).to(torch.float32).model]
     plan = make_plan(*model, origin(), GRID, cutoff=Cutoff(1e-3, relative=True), backend=backend)
     share = mean_weights(plan, *model).share
     share.sum().backward()

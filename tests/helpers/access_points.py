@@ -1,7 +1,5 @@
 """A hall of access points: levels, silence, floors and walks whose places are known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.locate.fingerprints.rows import Fingerprints

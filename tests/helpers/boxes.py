@@ -1,7 +1,5 @@
 """Spectra that a moving array measures in an exact box, with their truth."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small city, made once a session: the stand-in with few users, and a loader for it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

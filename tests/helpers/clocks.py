@@ -1,7 +1,5 @@
 """A clock that tests wind: seconds pass when a call says so, on however busy a machine."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 TICK_S = 1e-4  # that every look at the clock takes, so that nothing takes no time at all

@@ -1,7 +1,5 @@
 """Kernels beside the rasterizer's with what defines them in PyTorch, and how a kernel is run in every way."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

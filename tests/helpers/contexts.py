@@ -1,7 +1,5 @@
 """Contexts of short trainings: few steps, small batches, the callbacks a test wants."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path

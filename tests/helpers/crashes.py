@@ -3,8 +3,6 @@
 Equivalent to starting the command and killing it, except that 50 kills do not cost 50 imports of torch.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import multiprocessing
@@ -14,6 +12,7 @@ import resource
 import signal
 import time
 from pathlib import Path
+from unittest import mock
 
 from ledger import LEDGER
 from states import different
@@ -37,6 +36,7 @@ DENSIFIED = (
     "callbacks.densify.max_gaussians=200",
     "callbacks.reset.interval=20",
 )
+DRAWING = "gsparc.evaluation.experiment.run.draw_predictions"  # half of the seconds of a short run
 VARYING = ("time/", "machine/", "memory/", "git")
 TIMED = ("train_s", "render_ms", "ratio_to_copy")
 
@@ -50,7 +50,7 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
     from gsparc.evaluation.console import one_line
 
     torch.set_num_threads(1)
-    with Limited(most_bytes):
+    with Limited(most_bytes), mock.patch(DRAWING):
         try:
             train(compose(*overrides), Path(folder))
         except Exception as error:

@@ -1,7 +1,5 @@
 """Distances between numpy places."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

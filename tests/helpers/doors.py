@@ -1,7 +1,5 @@
 """Knocking at a command's door with bad input: what it says, how it ends, what it leaves behind."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

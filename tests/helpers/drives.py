@@ -1,7 +1,5 @@
 """A drive test with GPS as people keep it: a table of rows, one of stations, and places to ask about."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 A field is drawn Gaussian by Gaussian from named kinds, so that a failure shrinks to the kinds that matter.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Image sources: fits, scenes with phases, and posterior gains without batching."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

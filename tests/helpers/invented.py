@@ -1,7 +1,5 @@
 """A small invented dataset of any kind, and its split."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.data.schema import Measurements, Site

@@ -1,7 +1,5 @@
 """One small campaign for everything that a Gaussian field is made of."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

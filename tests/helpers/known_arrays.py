@@ -1,7 +1,5 @@
 """Spectra of an array whose vectors are known: sites, paths, rooms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

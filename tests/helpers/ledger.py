@@ -3,8 +3,6 @@
 `tests/hard_cases/conftest.py` says which test is running and writes the table of docs/hard-cases.md from it.
 """
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 

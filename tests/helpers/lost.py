@@ -1,7 +1,5 @@
 """Ends of a training at a step: a job killed once among many, an interrupt; named in a configuration."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small invented files in the layouts of measured campaigns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

@@ -1,7 +1,5 @@
 """A small LightningModule around a field with hidden layers."""
 
-from __future__ import annotations
-
 import torch
 
 from gsparc.field.confidence import ConfidenceSettings

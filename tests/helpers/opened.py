@@ -1,7 +1,5 @@
 """What a process that is started with arrays got; without heavy imports, which it would repeat."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

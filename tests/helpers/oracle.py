@@ -5,8 +5,6 @@ A Gaussian of covariance S at distance r and direction n is an angular Gaussian 
 basis; `equirect` in azimuth and elevation, linearised at n. Layers are blended front to back.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

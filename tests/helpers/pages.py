@@ -1,7 +1,5 @@
 """The commands that pages and configurations show, and small data of every kind to run them on."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

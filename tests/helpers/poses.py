@@ -1,7 +1,5 @@
 """Where a static receiver sees the transmitters: the test of its pose."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.data.schema import Measurements

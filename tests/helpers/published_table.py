@@ -3,8 +3,6 @@
 Ours are defaults of their classes, the published ones in conf/paper; docstrings say what was left out.
 """
 
-from __future__ import annotations
-
 import re
 from importlib import import_module
 from pathlib import Path

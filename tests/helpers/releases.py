@@ -1,8 +1,6 @@
 """The RFID release's layout, sound and spoilt, and where real data lie."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import io
 import shutil
 from pathlib import Path

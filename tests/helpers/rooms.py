@@ -1,7 +1,5 @@
 """Rooms of the image-source simulator whose every source is known, as measurements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -72,29 +70,6 @@ def furnished(count: int, *, snr_db: float = 30.0, seed: int = 0) -> tuple[Trace
     told = trace(room, np.array([0.4, 2.2, 2.0]), rx, 2.4e9, snr_db=snr_db, seed=seed)
     data = from_arrays(as_arrays(told))
     return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
-
-
-def rough(count: int, *, share: float = 0.3, spacing: float = 0.4) -> tuple[Measurements, Fold]:
-    """A patch of receivers `spacing` wavelengths apart in a room whose walls scatter `share` of the power.
-
-    400 weak scatterers of random phase are spread over the walls: more paths than receivers.
-    """
-    rng, size = np.random.default_rng(0), np.array([3.0, 2.5, 2.2])
-    side = spacing * WAVELENGTH * count**0.5
-    offset = rng.uniform(-0.5, 0.5, (count, 3)) * [side, side, 0.04]
-    rx, tx = np.array([1.6, 1.3, 1.0]) + offset, size * [0.15, 0.27, 0.75]
-    told = trace(Room.uniform(tuple(size), -0.5), tx, rx, 2.4e9, max_order=1, snr_db=30.0)
-    points, axis = rng.uniform(size=(400, 3)) * size, rng.integers(0, 3, 400)
-    points[np.arange(400), axis] = np.where(rng.random(400) < 0.5, 0.0, size[axis])
-    before = np.linalg.norm(points - tx, axis=1)
-    after = np.linalg.norm(rx[:, None] - points[None], axis=-1)
-    turns = (before + after) / WAVELENGTH + rng.random(400)
-    diffuse = (np.exp(-2j * np.pi * turns) / before / after).sum(1)[:, None, None]
-    power = (np.abs(told.csi) ** 2).mean() / (np.abs(diffuse) ** 2).mean()
-    arrays = as_arrays(told)
-    arrays["csi"] = told.csi + np.sqrt(share / (1 - share) * power) * diffuse
-    data = from_arrays(arrays)
-    return data, make_split(data.moving, SplitSettings(seed=0)).folds[0]
 
 
 def nmse(predicted: np.ndarray, true: np.ndarray) -> float:

@@ -3,8 +3,6 @@
 Exit status 99: this machine has no such instruction set.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 

@@ -1,7 +1,5 @@
 """Small scenes in which one idea must work and another cannot."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trainings with densification in several processes."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import signal

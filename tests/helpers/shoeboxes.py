@@ -1,7 +1,5 @@
 """Traced shoebox rooms as arrays of the schema of own measurements, and random places in them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.simulate.shoebox import Room, Trace

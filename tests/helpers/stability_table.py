@@ -1,7 +1,5 @@
 """The tables of docs/hard-cases.md, written from what the tests measured."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

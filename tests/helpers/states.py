@@ -1,7 +1,5 @@
 """States of models and optimizers, compared."""
 
-from __future__ import annotations
-
 import torch
 
 

@@ -1,7 +1,5 @@
 """A town with two stations whose powers are a distance law and shadowing, and a model of it."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp

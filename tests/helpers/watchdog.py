@@ -1,7 +1,5 @@
 """How long, in its own processor time, a fit goes without looking at the clock or at interrupts."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

@@ -3,8 +3,6 @@
 The hard cases do so by themselves (tests/hard_cases/conftest.py).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,4 +1,7 @@
-"""Plan and image in one call, where nothing is trained: the bits and refusals of one after the other."""
+"""Plan and image in one call, where nothing is trained: the bits of one after the other.
+
+The refusals: test_validation.py.
+"""
 
 from dataclasses import replace
 
@@ -89,40 +92,6 @@ def test_gradients_take_the_plan(at_once):
     with torch.no_grad():
         again = rasterize(*model, scene.features, pose, GRIDS["sphere"]).image
     assert torch.equal(again, image) and not again.requires_grad and len(at_once) == 1
-
-
-def poisoned(name, value, pose=None):
-    scene = random_scene(n=5)
-    tensor = getattr(scene, name).clone()
-    tensor.view(-1)[-2] = value
-    return replace(scene, **{name: tensor}), poses(0) if pose is None else pose
-
-
-NAN = float("nan")
-WRONG = {
-    **{name: poisoned(name, NAN) for name in ("means", "quats", "scales", "opacities", "features")},
-    "infinite": poisoned("features", float("inf")),
-    "too opaque": poisoned("opacities", 1.5),
-    "far": poisoned("means", 2e6),
-    "sheared": poisoned("means", 0.5, Pose(torch.zeros(3).double(), 2 * torch.eye(3).double())),
-    "nowhere": poisoned("means", 0.5, Pose(torch.full((3,), NAN).double(), torch.eye(3).double())),
-    "equal ids": (
-        replace(random_scene(n=2).permuted(torch.zeros(2).long()), ids=torch.ones(2).long()),
-        poses(0),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_the_same_refusals(at_once, name):
-    scene, pose = WRONG[name]
-    model, grid = scene.model, GRIDS["sphere"]
-    with pytest.raises(ValueError) as one:
-        rasterize(*model, scene.features, pose, grid, ids=scene.ids)
-    with pytest.raises(ValueError) as two:
-        composite(make_plan(*model, pose, grid, ids=scene.ids), *model, scene.features)
-    assert one.type is two.type and str(one.value) == str(two.value)
-    assert len(at_once) == 1
 
 
 def test_features_whose_sum_overflows_are_finite(at_once):

@@ -4,15 +4,7 @@ import pytest
 import torch
 from rasters import GRIDS, poses, random_scene
 
-from gsparc.ops import (
-    BackendUnavailable,
-    SphereGrid,
-    StalePlan,
-    composite,
-    freeze,
-    make_plan,
-    rasterize,
-)
+from gsparc.ops import BackendUnavailable, SphereGrid, StalePlan, composite, freeze, make_plan, rasterize
 from gsparc.ops.geometry import WIDEST_GRID
 
 GRID = GRIDS["hemisphere"]
@@ -34,15 +26,6 @@ def test_absent_backends_say_why():
         make_plan(*scene.model, poses(0), GRID, backend="cuda")
     with pytest.raises(ValueError, match="backend is"):
         make_plan(*scene.model, poses(0), GRID, backend="tpu")
-
-
-@BACKENDS
-def test_stages_are_the_whole(backend):
-    scene, pose = random_scene(), poses(3)
-    plan = make_plan(*scene.model, pose, GRID, backend=backend)
-    apart = composite(plan, *scene.model, scene.features)
-    whole = rasterize(*scene.model, scene.features, pose, GRID, backend=backend)
-    assert torch.equal(apart.image, whole.image) and torch.equal(apart.radii, whole.radii)
 
 
 @BACKENDS

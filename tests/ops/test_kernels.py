@@ -42,12 +42,7 @@ def test_equals_reference(dtype, projection, grid, count, hides):
 @PROJECTIONS
 @pytest.mark.parametrize(
     "optics",
-    [
-        {"compensate": False},
-        {"low_pass": 0.0},
-        {"cutoff": Cutoff(0.01, 1e-4, relative=True)},
-        {"near": 1.5},
-    ],
+    [{"compensate": False}, {"low_pass": 0.0}, {"cutoff": Cutoff(0.01, 1e-4, relative=True)}, {"near": 1.5}],
     ids=["uncompensated", "sharp", "relative", "fading"],
 )
 def test_switches_equal_reference(projection, optics):
@@ -64,10 +59,7 @@ def test_weights_equal_reference(dtype, projection, hides):
     results = {}
     for backend, kind in (("reference", torch.float64), ("cpu", dtype)):
         cast = scene.to(kind)
-        leaves = [
-            getattr(cast, k).detach().clone().requires_grad_()
-            for k in ("means", "quats", "scales", "opacities")
-        ]
+        leaves = [leaf.clone().requires_grad_() for leaf in cast.model]
         hidden = cast.extinctions.detach().clone().requires_grad_() if hides else None
         plan = make_plan(
             *leaves, pose, grid, projection=projection, cutoff=cut, extinctions=hidden, backend=backend
@@ -150,8 +142,10 @@ def test_every_instruction_set(name, dtype, projection):
 def test_flips_at_the_cutoff_are_rare(projection):
     """In float32 a pixel may fall on the other side of a cut-off: few do, and none by more than the cut."""
     scene, pose, grid = random_scene(n=150, seed=5), poses(0), SphereGrid.hemisphere()
-    want = render(scene, pose, grid, "reference", projection=projection)["image"]
-    got = render(scene.to(torch.float32), pose, grid, projection=projection)["image"].double()
+    got, want = (
+        rasterize(*s.model, s.features, pose, grid, backend=backend, projection=projection).image.double()
+        for s, backend in ((scene.to(torch.float32), "cpu"), (scene, "reference"))
+    )
     gap = (got - want).abs()
     assert (gap > 1e-4).double().mean() < 1e-4
     assert gap.max() < 2 * scene.features.abs().max() / 255
@@ -170,11 +164,11 @@ def test_gradcheck(projection, backend, seed):
     kind = {"projection": projection, "cutoff": cut, "backend": backend}
 
     def picture(m, q, s, o, x, f):
-        raster = rasterize(m, q, s, o, f, poses(2), SphereGrid.full_sphere(4, 8), extinctions=x, **kind)
+        raster = rasterize(m, q, s, o, f, poses(2), SphereGrid.full_sphere(3, 6), extinctions=x, **kind)
         return raster.image, raster.transmittance
 
     def weights(m, q, s, o, x):
-        plan = make_plan(m, q, s, o, poses(2), SphereGrid.full_sphere(4, 8), extinctions=x, **kind)
+        plan = make_plan(m, q, s, o, poses(2), SphereGrid.full_sphere(3, 6), extinctions=x, **kind)
         seen = mean_weights(plan, m, q, s, o, extinctions=x)
         return seen.mean, seen.share
 
@@ -191,15 +185,6 @@ def test_clamped_layers_pass_gradient_to_features_only():
         assert got["d_features"].abs().max() > 0
         for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_means2d"):
             assert (got[name] == 0).all(), name
-
-
-def test_culled_gaussians_get_exactly_zero():
-    scene = random_scene(n=80, seed=6)
-    got = render(scene, poses(0), GRIDS["patch"])
-    hidden = ~got["visible"][0]
-    assert 0 < hidden.sum() < 80
-    for name in ("d_means", "d_quats", "d_scales", "d_opacities"):
-        assert (got[name][hidden] == 0).all() and (got[name][~hidden] != 0).any(), name
 
 
 def test_screen_gradient_is_the_shift_of_the_footprint():

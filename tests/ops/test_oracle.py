@@ -3,8 +3,6 @@
 That gradients are the slopes of these pictures: test_kernels.py::test_gradcheck.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

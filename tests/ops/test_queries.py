@@ -1,7 +1,5 @@
 """Single places answered by the kernels are what plain PyTorch answers."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -19,11 +19,12 @@ def behind_a_wall():
 STEP = torch.pi / 24
 CASES = {
     "dark and lit tiles": (behind_a_wall, poses(0), SphereGrid.hemisphere(15, 60)),
-    "360 tiles across, more than a word has bits": (
-        lambda: random_scene(n=40, seed=13, size=2.0), origin(), SphereGrid.hemisphere(6, 1440)),
+    "150 tiles across, more than two words have bits": (
+        lambda: random_scene(n=40, seed=13, size=2.0), origin(), SphereGrid.hemisphere(6, 600)),
     # Up to 64 strips pick their footprints; in a taller image each footprint is handed to its strips. More
     # ranks than a chunk.
-    **{f"{height} rows": (lambda: random_scene(n=1100, seed=15), poses(3), SphereGrid.hemisphere(height, 8))
+    **{f"{height} rows": (
+        lambda: random_scene(n=1100, samples=2, seed=15), poses(2), SphereGrid.hemisphere(height, 4))
        for height in (256, 257)},
     **{f"{height} x {width}, which no tile divides": (
         lambda: random_scene(n=30, seed=14), poses(0), SphereGrid(height, width, -0.4, 2.9, 0.11, 0.07))

@@ -1,7 +1,5 @@
 """Densities and variances of processes by their formulas, in numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Expectation propagation of "below the level": moments, evidence and its slope."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

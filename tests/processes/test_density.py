@@ -1,7 +1,5 @@
 """Densities of rows left out against refitting, and their slopes against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Factors against torch's own functions: single and batched, real and complex, with and without gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

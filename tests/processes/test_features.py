@@ -1,7 +1,5 @@
 """Features of a process: its posterior, from all rows or from places that stand for them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

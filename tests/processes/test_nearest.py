@@ -1,7 +1,5 @@
 """Powers of very many rows, each place told by the nearest: where that is exact, and what it says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,10 +1,7 @@
 """Covariances are factored and solved in gsparc/processes alone; each operation has one definition there."""
 
-from __future__ import annotations
-
 import ast
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -34,52 +31,35 @@ EXCEPTIONS = {  # who solves a system for itself, and why
 }
 
 
-def calls(path: Path) -> Iterator[tuple[str, str]]:
-    """Every called name with what stands before its dot."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            yield node.func.attr, ast.unparse(node.func.value)
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            yield node.func.id, ""
-
-
-def test_nobody_else_factors_or_solves():
+def test_each_operation_is_in_its_place_alone():
+    """Also residuals over a precision, sweeps of expectation propagation, and systems of nearest rows."""
     where: dict[str, set[str]] = defaultdict(set)
+    defined: dict[str, list[str]] = defaultdict(list)
     for path in sorted((ROOT / "gsparc").rglob("*.py")):
         name = path.relative_to(ROOT).as_posix()
-        for called, of in calls(path):
-            if called in FACTORING | SOLVING:
-                where["factor"].add(name)
-            elif called in GENERAL and of.endswith("linalg"):
-                where["general"].add(name)
-            elif called == "log_ndtr":
-                where["expectation propagation"].add(name)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and node.name in ("left_out_group", "propagate"):
+                defined[node.name].append(name)
+            elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+                right = ast.unparse(node.right).split("[")[0]
+                if right in ("precision", "self.factor.precision", "inverse.diagonal()"):
+                    where["residuals over a precision"].add(name)
+            elif isinstance(node, ast.Call):
+                of, _, called = ast.unparse(node.func).rpartition(".")
+                if called in FACTORING | SOLVING:
+                    where["factor"].add(name)
+                elif called in GENERAL and of.endswith("linalg"):
+                    where["general"].add(name)
+                elif called == "log_ndtr":
+                    where["expectation propagation"].add(name)
+                elif (of, called) == ("", "solved") and "gram" in ast.unparse(node):
+                    where["systems of nearest rows"].add(name)
     assert where["factor"] == {FACTOR}
     assert where["general"] == set(EXCEPTIONS), where["general"] ^ set(EXCEPTIONS)
     silence = {"gsparc/locate/likelihood.py"}  # the probability of a silent row alone, nothing is propagated
     assert where["expectation propagation"] == {"gsparc/processes/censored.py"} | silence
-
-
-def test_each_operation_has_one_definition():
-    """Of residuals over a precision, sweeps of expectation propagation, and systems of nearest rows."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for path in sorted((ROOT / "gsparc").rglob("*.py")):
-        name, text = path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef) and node.name in ("left_out_group", "propagate"):
-                found[node.name].append(name)
-            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
-                right = ast.unparse(node.right)
-                if right.split("[")[0] in ("precision", "self.factor.precision", "inverse.diagonal()"):
-                    found["residuals over a precision"].append(name)
-            if (
-                isinstance(node, ast.Call)
-                and ast.unparse(node.func) == "solved"
-                and "gram" in ast.unparse(node)
-            ):
-                found["systems of nearest rows"].append(name)
-    assert found["left_out_group"] == ["gsparc/processes/left_out.py"]
-    assert found["propagate"] == ["gsparc/processes/censored.py"]
+    assert defined["left_out_group"] == ["gsparc/processes/left_out.py"]
+    assert defined["propagate"] == ["gsparc/processes/censored.py"]
     kept = {"gsparc/processes/left_out.py", "gsparc/processes/censored.py"}  # the cavity is one row left out
-    assert set(found["residuals over a precision"]) <= kept
-    assert found["systems of nearest rows"]
+    assert where["residuals over a precision"] <= kept
+    assert where["systems of nearest rows"]

@@ -1,7 +1,5 @@
 """Posteriors against an independent library, and complex ones against twice as many real numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,17 +1,13 @@
-from __future__ import annotations
-
 import signal
 
 import lightning.pytorch as L
 import pytest
 import torch
-from campaigns import brief, compose, spectra
-from contexts import short
+from campaigns import spectra
+from contexts import trained
 
 from gsparc.callbacks import CostLedger
-from gsparc.data.load import load, split_for
 from gsparc.models import checkpoint
-from gsparc.models.registry import build
 
 
 class Interrupt(L.Callback):
@@ -26,13 +22,9 @@ class Interrupt(L.Callback):
                 signal.raise_signal(signal.SIGINT)
 
 
-def run(tmp_path, *callbacks, resume=None, steps: int = 20):
-    file = spectra(tmp_path / "own.npz")
-    method = build(compose(*brief(file, "model.refit=false")).model)
-    context = short(tmp_path / "run", steps, callbacks=lambda: list(callbacks), every=5, resume=resume)
-    data = load({"name": "own", "file": str(file)})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], context)
-    return method.fitted().state_dict()
+def run(tmp_path, *callbacks, steps: int = 20, **more):
+    file, made = spectra(tmp_path / "own.npz"), {"callbacks": lambda: list(callbacks), "every": 5}
+    return trained(file, tmp_path / "run", steps, **made, **more)[0].fitted().state_dict()
 
 
 def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(tmp_path):
@@ -106,10 +98,7 @@ class Watching(L.Callback):
 @pytest.mark.parametrize("val_every", [4, 7, 10])
 def test_a_learning_curve_has_the_loss_of_its_own_step(tmp_path, val_every):
     watching = Watching()
-    method = build(compose(*brief(spectra(tmp_path / "own.npz"), "model.refit=false")).model)
-    context = short(tmp_path / "run", 21, callbacks=lambda: [watching], validate_every=val_every)
-    data = load({"name": "own", "file": str(tmp_path / "own.npz")})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], context)
+    run(tmp_path, watching, steps=21, validate_every=val_every)
     assert set(watching.logged) == set(range(val_every, 22, val_every))
     for step, loss in watching.logged.items():
         assert loss == pytest.approx(watching.steps[step], rel=1e-6)

@@ -1,14 +1,11 @@
 """Steps that do not pay are not taken: the best validation is kept, and training ends when none is better."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from campaigns import brief, compose, spectra
-from contexts import short
+from contexts import loaded, short
 
-from gsparc.data.load import load, split_for
 from gsparc.models.registry import build
 
 COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
@@ -17,8 +14,7 @@ COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     file = spectra(tmp_path_factory.mktemp("own") / "own.npz", rows=120)  # 10 of them for validation
-    data = load({"name": "own", "file": str(file)})
-    return file, data, split_for({"name": "random"}, data).folds[0]
+    return file, *loaded(file)
 
 
 def fitted(measured, folder, *more, steps=40, **context):

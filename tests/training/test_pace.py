@@ -1,19 +1,15 @@
 """A budget of seconds is kept, and every schedule ends with it."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import lightning.pytorch as L
 import pytest
 from campaigns import brief, compose, spectra
 from clocks import wound
-from contexts import short
+from contexts import loaded, short
 from torch import nn
 
 from gsparc.commands.train import train
-from gsparc.data.load import load as load_data
-from gsparc.data.load import split_for
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
 from gsparc.training.context import FitContext
@@ -119,8 +115,7 @@ def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
 
     monkeypatch.setattr(splatting, "prepare", slow)
     file = spectra(tmp_path / "own.npz")
-    data = load_data({"name": "own", "file": str(file)})
-    fold = split_for({"name": "random"}, data).folds[0]
+    data, fold = loaded(file)
     method = build(compose(*brief(file)).model)
     callbacks = context.pop("callbacks", lambda: [Ticking()])
     return method.fit(data, fold, short(tmp_path, 30, callbacks=callbacks, every=2, **context))

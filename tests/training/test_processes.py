@@ -1,7 +1,5 @@
 """Several processes train what one does; one that is killed ends all, and the run goes on bit for bit."""
 
-from __future__ import annotations
-
 import shutil
 import time
 

@@ -1,7 +1,5 @@
 """Seconds of a fit: which clock counts them, and whether they ended something."""
 
-from __future__ import annotations
-
 import pickle
 import time
 

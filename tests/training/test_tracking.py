@@ -1,7 +1,5 @@
 """Dashboards get pictures and the final table; a logger that shows neither is left alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from PIL import Image

@@ -1,7 +1,5 @@
 """No phase of any fit computes for two seconds without looking at the clock and at interrupts."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from campaigns import channels, compose, powers, spectra

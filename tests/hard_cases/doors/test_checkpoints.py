@@ -5,13 +5,10 @@ would leave a mark; no mark may appear. Naive: `pickle.load` and `torch.load(wei
 """
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import builtins
 import io
 import os
 import pickle
-import random
 import subprocess
 import zipfile
 from collections.abc import Callable
@@ -209,20 +206,6 @@ def test_files_of_other_kinds_and_cut_short(sound, tmp_path, kind):
     path.write_bytes(content[: int(kind * len(content))] if cut else other_files()[kind])
     says = "not a gsparc checkpoint, or cut short" if cut else r"other\.ckpt: "
     assert_refused_everywhere(path, sound[1], tmp_path / "run", says)
-
-
-def test_flipped_bytes_are_refused_or_harmless(sound, tmp_path):
-    content, path = sound[0].read_bytes(), tmp_path / "flipped.ckpt"
-    for seed in range(60):
-        draw, spoilt = random.Random(seed), bytearray(content)
-        for _ in range(4):
-            spoilt[draw.randrange(len(spoilt))] = draw.randrange(256)
-        path.write_bytes(spoilt)
-        try:
-            gsparc.load(path)
-        except CheckpointError as refused:
-            assert "\n" not in str(refused)
-            LEDGER.count("bad inputs")
 
 
 def test_an_ordinary_unpickler_would_run_them(tmp_path):

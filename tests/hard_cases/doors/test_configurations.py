@@ -3,8 +3,6 @@
 Remedy: gsparc/data/limits.py (what a setting may be), gsparc/commands/cli.py (one line, the nearest name).
 """
 
-from __future__ import annotations
-
 import pytest
 from campaigns import spectra
 from doors import assert_refused, knock

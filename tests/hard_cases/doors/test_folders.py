@@ -4,8 +4,6 @@ Remedy: gsparc/data/datasets/rfid.py. Cases of tests/helpers/releases.py and mor
 """
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

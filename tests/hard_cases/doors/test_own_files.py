@@ -3,8 +3,6 @@
 Remedy: gsparc/data/own_checks.py; damage and Python objects: gsparc/data/raw.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
