@@ -11,7 +11,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from pages import FOLDERS, PAGES, PRESENT, ROOT, commands, said
 
-from gsparc.commands.plugins import offer_scenes
+from gsparc.commands.shared.plugins import offer_scenes
 from gsparc.models.registry import METHODS
 from gsparc.simulate.scenes.shipped import shipped
 

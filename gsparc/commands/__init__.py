@@ -1,1 +1,1 @@
-"""One small file or folder per command."""
+"""One small file per command; what they share is in `shared`."""

@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import DictConfig
 from rich.table import Table
 
-from gsparc.commands.output import run_directory
+from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.summary import provenance, shown, table, write_summary
 from gsparc.ops.native import instruction_set

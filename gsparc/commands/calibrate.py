@@ -9,8 +9,8 @@ import numpy as np
 from omegaconf import DictConfig
 from rich.table import Table
 
-from gsparc.commands.output import run_directory, show
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import run_directory, show
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.calibration import (
     NAMES,
     collect,

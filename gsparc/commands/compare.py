@@ -13,9 +13,9 @@ from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsparc.commands.locate import locate
-from gsparc.commands.output import finish, run_directory, show
-from gsparc.commands.run_lock import locked
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import finish, run_directory, show
+from gsparc.commands.shared.run_lock import locked
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.limits import choice
 from gsparc.evaluation.experiment.cells import Budget, Contender, plan, plugged

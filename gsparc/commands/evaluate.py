@@ -8,8 +8,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import finish, run_directory
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split

@@ -10,8 +10,8 @@ import numpy as np
 from omegaconf import DictConfig
 
 import gsparc.ops
-from gsparc.commands.output import finish, run_directory
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import POSITIVE, SettingError, choice, or_null, whole
 from gsparc.data.query_places import read_query_places, read_times

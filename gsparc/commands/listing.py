@@ -41,7 +41,7 @@ class Command:
         module = import_module(self.module or f"gsparc.commands.{self.name}")
         if not self.configured:
             sys.exit(module.main(sys.argv[1:]))
-        from gsparc.commands import cli
+        from gsparc.commands.shared import cli
 
         cli.run(module.task, self.name)
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import finish, run_directory
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.limits import POSITIVE, SHARE, choice, number, or_null, switch, whole
 from gsparc.evaluation.localisation import by_fingerprints, by_model, report
 from gsparc.locate.baselines.table import BASELINES

@@ -6,8 +6,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.commands.output import finish, run_directory
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.maps.field_map import geotiff_wanted, write_geotiff
 from gsparc.maps.floor_plan import plan_of

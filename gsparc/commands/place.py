@@ -6,8 +6,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import coordinates, finish, run_directory
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import coordinates, finish, run_directory
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.maps.pictures import draw_placing
 from gsparc.maps.placing import NewStation, in_words, new_station_error, number, place_next, unheard_refused

@@ -8,8 +8,8 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.map import settings_of, stations_of
-from gsparc.commands.output import coordinates, finish, run_directory
-from gsparc.commands.settings import plain
+from gsparc.commands.shared.output import coordinates, finish, run_directory
+from gsparc.commands.shared.settings import plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.maps.floor_plan import plan_of
 from gsparc.maps.pictures import draw_plan_picture

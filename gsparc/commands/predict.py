@@ -6,8 +6,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import finish, run_directory
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.answers import predict
 from gsparc.prediction.operating_point import load
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.output import run_directory
+from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.report.page import refresh, studies, write
 from gsparc.evaluation.report.runs import columns, find_runs, retime

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 from omegaconf import DictConfig
 
-from gsparc.commands.settings import RunSettings
+from gsparc.commands.shared.settings import RunSettings
 from gsparc.data.errors import DataError
 from gsparc.data.limits import SettingError, number, whole
 from gsparc.evaluation.console import open_console

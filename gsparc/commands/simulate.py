@@ -10,9 +10,9 @@ from typing import Any
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.commands.output import run_directory
-from gsparc.commands.run_lock import locked
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import run_directory
+from gsparc.commands.shared.run_lock import locked
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation import simulated, summary
 from gsparc.evaluation.console import open_console
 from gsparc.simulate.auto import AutoSettings

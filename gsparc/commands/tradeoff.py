@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from gsparc.commands.output import finish, run_directory
-from gsparc.commands.settings import plain
+from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.settings import plain
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff

@@ -10,11 +10,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from gsparc.commands import cli
-from gsparc.commands.continued import once
-from gsparc.commands.output import run_directory, show
-from gsparc.commands.run_lock import locked
-from gsparc.commands.settings import RunSettings
+from gsparc.commands.shared import cli
+from gsparc.commands.shared.continued import once
+from gsparc.commands.shared.output import run_directory, show
+from gsparc.commands.shared.run_lock import locked
+from gsparc.commands.shared.settings import RunSettings
 from gsparc.evaluation.experiment.run import Objects, objective_of, run
 from gsparc.evaluation.metric_formats import score_of
 from gsparc.evaluation.summary import remarks, results_table

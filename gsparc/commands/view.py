@@ -9,8 +9,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import finish, run_directory
-from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.walls import read_walls

@@ -14,8 +14,8 @@ import pytest
 from doors import Answer, knock
 
 from gsparc.__main__ import READER_LEFT, main
-from gsparc.commands.cli import _began_as_interrupt
 from gsparc.commands.listing import COMMANDS
+from gsparc.commands.shared.cli import _began_as_interrupt
 
 
 def gsparc(*words: str) -> Answer:
@@ -126,7 +126,7 @@ def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gsparc.commands.cli.offer", interrupted)
+    monkeypatch.setattr("gsparc.commands.shared.cli.offer", interrupted)
     answer = gsparc("train", "dataset=rfid", "model=gsparc")
     assert (answer.status, answer.err) == (130, ["error: interrupted"])
 

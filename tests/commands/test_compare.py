@@ -14,7 +14,7 @@ from doors import knock
 
 from gsparc.commands import compare as command
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.run_lock import locked
+from gsparc.commands.shared.run_lock import locked
 from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
-from gsparc.commands.plugins import offer
+from gsparc.commands.shared.plugins import offer
 from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold

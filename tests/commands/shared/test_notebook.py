@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import gsparc
-from gsparc.commands import notebook
+from gsparc.commands.shared import notebook
 
 
 def test_a_command_says_what_it_says_in_a_shell(capsys):

@@ -11,8 +11,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.run_lock import in_use, locked
-from gsparc.commands.settings import plain
+from gsparc.commands.shared.run_lock import in_use, locked
+from gsparc.commands.shared.settings import plain
 from gsparc.data.files import whole_file
 from gsparc.evaluation.report.sweep import FAILURE
 from gsparc.evaluation.summary import provenance

@@ -10,10 +10,10 @@ from doors import assert_refused, knock
 from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.run_lock import HOLDER, LOCK, InUse, hold, locked, release
+from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, hold, locked, release
 from gsparc.commands.train import train
 
-HOLDS = "import sys, time; from gsparc.commands.run_lock import hold; from pathlib import Path; "
+HOLDS = "import sys, time; from gsparc.commands.shared.run_lock import hold; from pathlib import Path; "
 HOLDS += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
 
 

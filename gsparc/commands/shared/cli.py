@@ -20,9 +20,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
-from gsparc.commands import job_name  # noqa: F401  # configurations name folders by it
-from gsparc.commands.plugins import offer, offer_scenes
-from gsparc.commands.run_lock import InUse, release
+from gsparc.commands.shared import job_name  # noqa: F401  # configurations name folders by it
+from gsparc.commands.shared.plugins import offer, offer_scenes
+from gsparc.commands.shared.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, one_line
 
 WHILE_LOGGING = 0.01  # [s] until an interrupt that came inside `logging` is tried again

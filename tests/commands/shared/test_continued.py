@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from omegaconf import OmegaConf
 
-from gsparc.commands.cli import _message_of
-from gsparc.commands.continued import once
-from gsparc.commands.run_lock import locked
+from gsparc.commands.shared.cli import _message_of
+from gsparc.commands.shared.continued import once
+from gsparc.commands.shared.run_lock import locked
 from gsparc.evaluation.report.sweep import FAILURE
 
 

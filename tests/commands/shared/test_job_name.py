@@ -7,7 +7,7 @@ import pytest
 from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 
-from gsparc.commands.job_name import MOST, job_name
+from gsparc.commands.shared.job_name import MOST, job_name
 
 MANY = [f"model.effects.an_effect_of_number_{n}=false" for n in range(20)]
 
@@ -27,7 +27,7 @@ def test_many_overrides_begin_the_name_and_no_two_share_it():
 
 @pytest.mark.parametrize("more", [[], MANY], ids=["few", "many"])
 def test_the_command_line_names_folders_by_it(more, monkeypatch):
-    import gsparc.commands.cli  # noqa: F401
+    import gsparc.commands.shared.cli  # noqa: F401
 
     given = ["dataset=own", "dataset.file=x.npz", *(f"+{one}" for one in more)]
     with initialize_config_module("gsparc.conf", version_base="1.3"):

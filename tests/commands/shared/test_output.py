@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from gsparc.commands.output import show
+from gsparc.commands.shared.output import show
 
 
 def test_square_brackets_of_a_path_are_no_style(capsys):
