@@ -92,6 +92,15 @@ def test_line_of_sight_is_friis(room, places):
     np.testing.assert_allclose(paths.direction, towards, atol=1e-4)
 
 
+@pytest.mark.parametrize("polarisation", [False, True])
+def test_a_call_in_which_nothing_is_heard_ended_in_an_error(room, places, polarisation):
+    sight = replace(PLAIN, specular=False, refraction=False, depth=0, polarisation=polarisation)
+    under, heard = places[:1] * [1, 1, -1], places[np.diff(room.trace(places, sight).offsets) > 0]
+    assert room.trace(under, sight).offsets.tolist() == [0, 0]
+    few = RayTracer(conference_room(), TRANSMITTER, CONFERENCE.carrier_hz, replace(QUICK, batch=1))
+    assert few.trace(np.concatenate([under, heard[:1]]), sight).offsets.tolist() == [0, 0, 1]
+
+
 def test_channels_are_the_solver_s(room, places):
     """Carrier phase and all: `paths.cfr` with absolute delays."""
     import mitsuba as mi

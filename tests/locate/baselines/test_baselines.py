@@ -13,7 +13,7 @@ from gsparc.locate.baselines.network import network
 from gsparc.locate.baselines.table import BASELINES
 from gsparc.locate.fingerprints.rows import parted, read_fingerprints
 
-FITS = BASELINES | {"mlp": partial(network, budget_s=1.0)}
+FITS = BASELINES | {"mlp": partial(network, budget_s=3.0)}
 
 
 def hall(count, seed):
