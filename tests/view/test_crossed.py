@@ -30,6 +30,7 @@ BOX = [[[1, -1, -1], [2, 1, 1]]]
     ([0, 0, 1.5], [2, 0, 1.5], [wall(1)], NO_BOXES, 1),  # the diagonal belongs to one of its triangles
     ([0, 0.1, 1.5], [4, 0.1, 1.5], [wall(1), wall(1.2)], NO_BOXES, 1),  # both sides of one
     ([-1, 2, 3], [1, 2, 3], [NOTCHED], NO_BOXES, 0),
+    ([-1, 2, 1.5], [1, 2, 1.5], [NOTCHED], NO_BOXES, 0),  # in the notch two triangles of its fan are hit
     ([-1, 0.5, 2], [1, 0.5, 2], [NOTCHED], NO_BOXES, 1),
     ([0, 0, 0], [4, 0, 0], [], BOX, 1),  # once, whether the line leaves it or not
     ([0, 0, 0], [0.5, 0, 0], [], BOX, 0),
