@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -34,77 +36,69 @@ def test_every_package_is_on_the_map():
 
 
 @PER_PAGE
-def test_links_and_paths_lead_somewhere(page):
+def test_what_a_page_names_is_there(page):
+    """Files that it links, names or shows, headings of other pages, and tests."""
     text = page.read_text(encoding="utf-8")
-    links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
-    missing = [link for link in links if not (page.parent / link).exists()]
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
+    files, anchors = zip(*(link.partition("#")[::2] for link in links), strict=True) if links else ((), ())
+    missing = [file for file in files if not (page.parent / file).exists()]
     rooms = r"(?:gsparc|ops|callbacks|conf|bench|tests|docs)"
     paths = re.findall(rf"`({rooms}/[\w./-]+(?:\.\w+|/))`", text)
     missing += [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]
+    for file, anchor in zip(files, anchors, strict=True):
+        if anchor and anchor not in headings(page.parent / file if file else page):
+            missing.append(f"{file}#{anchor}")
+    for file, name in re.findall(r"`([\w/]*test_\w+\.py)::(\w+)`", text):
+        found = [path for path in (ROOT / "tests").rglob(Path(file).name) if path.as_posix().endswith(file)]
+        if not any(f"def {name}(" in path.read_text(encoding="utf-8") for path in found):
+            missing.append(f"{file}::{name}")
+    # A formatter once wrote `--8 < --`, and the site showed that line in place of the template.
+    shown = [
+        (line, re.fullmatch(r'--8<-- "([^"]+)"', line)) for line in text.splitlines() if line[:3] == "--8"
+    ]
+    missing += [line for line, match in shown if match is None or not (ROOT / match[1]).exists()]
     assert not missing
 
 
-@PER_PAGE
-def test_files_that_are_shown_are_shown(page):
-    """A formatter once wrote `--8 < --`, and the site showed that line in place of the template."""
-    marks = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("--8")]
-    found = [re.fullmatch(r'--8<-- "([^"]+)"', line) for line in marks]
-    assert all(match and (ROOT / match[1]).exists() for match in found), marks
-
-
-@PER_PAGE
-def test_tests_that_are_named_exist(page):
-    for file, name in re.findall(r"`([\w/]*test_\w+\.py)::(\w+)`", page.read_text(encoding="utf-8")):
-        found = [path for path in (ROOT / "tests").rglob(Path(file).name) if path.as_posix().endswith(file)]
-        assert any(f"def {name}(" in path.read_text(encoding="utf-8") for path in found), f"{file}::{name}"
-
-
-@PER_PAGE
-def test_headings_that_are_linked_exist(page):
-    def anchors(path: Path) -> set[str]:
-        titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-        return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
-
-    for link, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", page.read_text(encoding="utf-8")):
-        if "://" not in link:
-            assert anchor in anchors(page.parent / link if link else page), f"{link}#{anchor}"
-
-
-@PER_PAGE
-def test_whoever_installed_a_wheel_stopped_at_a_file_of_the_clone(page):
-    """Most pages of the site said `python train.py`."""
-    if page.parent.name == "docs":
-        assert not re.search(r"python train\.py (?!\.\.\.)", page.read_text(encoding="utf-8"))
+@cache
+def headings(page: Path) -> set[str]:
+    """As links name them; none of a page that is not there."""
+    if not page.exists():
+        return set()
+    titles = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 def test_commands_compose():
     """Commands, settings and choices that the documents name exist."""
-    given = commands()
+    given, alike = commands(), defaultdict(dict)
     assert len(given) > 30
+    for name, *overrides in given:  # those of the same choices at once: they differ in settings alone
+        chosen = {
+            word for word in overrides if word[0] in "~+" or (ROOT / "conf" / word.split("=")[0]).is_dir()
+        }
+        alike[name, frozenset(chosen)] |= dict.fromkeys(overrides)
     offer_scenes()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        for (name, *overrides), line in given.items():
+        for (name, _), overrides in alike.items():
             if "search=optuna" in overrides and find_spec("hydra_plugins.hydra_optuna_sweeper") is None:
                 continue  # an extra that is not installed here
-            assert compose(name, overrides), line
+            assert compose(name, list(overrides)), (name, *overrides)
 
 
 @TODAY
-@pytest.mark.parametrize(
-    "group", ["model", "dataset", "split", "trainer", "callbacks", "experiment", "scene"]
-)
-def test_choices_are_there(page, group):
-    chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", "\n".join(said(page)))
-    offered = {"scene": ("help", *shipped()), "model": METHODS}.get(group, ())
-    written = [name for name in chosen if name not in offered]
-    assert not [name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()]
-
-
-@TODAY
-def test_names_that_are_gone_are_not_used(page):
+def test_choices_and_names_are_of_today(page):
+    """And whoever installed a wheel is not stopped at a file of the clone: most pages said `train.py`."""
     code = "\n".join(said(page))
+    for group in ("model", "dataset", "split", "trainer", "callbacks", "experiment", "scene"):
+        chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", code)
+        offered = {"scene": ("help", *shipped()), "model": METHODS}.get(group, ())
+        written = [name for name in chosen if name not in offered]
+        assert not [name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()], group
     assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]
     assert "python -m gsparc." not in code and "gsparc.commands" not in code, "name the command"
+    if page.parent.name == "docs":
+        assert not re.search(r"python train\.py (?!\.\.\.)", page.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

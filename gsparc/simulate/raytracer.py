@@ -165,7 +165,8 @@ class RayTracer(Engine):
         for count, size in calls(len(receivers), self.sampling.batch):
             filled = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
             solved = self.solutions(filled, effects, seed)
-            part = join([_collect(solution, number) for solution, number in solved])
+            ports = 2 if effects.polarisation else 1
+            part = join([_collect(solution, number, ports) for solution, number in solved])
             parts.append(part.take(np.arange(count)))
             first += count
         return join(parts)
@@ -371,15 +372,18 @@ def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
 
 
-def _collect(solution: Any, receivers: int) -> Paths:
+def _collect(solution: Any, receivers: int, ports: int) -> Paths:
     """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest list."""
     buffer = solution._paths_buffer
     owner = buffer.target_indices.numpy().astype(np.int64)
+    if not len(owner):  # nothing is heard anywhere: the solver has made no gains either
+        nothing = np.zeros((0, ports), np.complex64), np.zeros(0), np.zeros((0, 3), np.float32)
+        return Paths.of(receivers, owner, *nothing, *np.zeros((2, 0), np.uint8))
     gain = np.stack([one[0].numpy() for one in buffer.a], axis=1).astype(np.complex64)
     delay = buffer.tau.numpy().astype(np.float64)
     kinds = buffer.interaction_types.numpy().astype(np.uint8).reshape(len(owner), -1)
     edge = np.zeros(len(owner), dtype=bool)
-    if buffer.diffracting_wedges is not None and len(owner):
+    if buffer.diffracting_wedges is not None:
         wedges = buffer.diffracting_wedges
         edge = wedges.prim0.numpy() == wedges.primn.numpy()
     kinds = np.where(edge[:, None] & (kinds == DIFFRACTION), EDGE, kinds).astype(np.uint8)

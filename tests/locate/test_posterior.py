@@ -58,7 +58,7 @@ def test_peak_is_between_middles_of_cells():
 
 @pytest.mark.slow
 def test_errors_of_recorded_places_widen_an_area():
-    cells = cover(PLACES, 20_000, False)
+    cells = cover(PLACES, 8_000, False)
     sharp = gaussians(cells, [[2.0, 1.0]])
     wide = Posterior(cells, sharp.sharp, 0.3)
     area = cells.size[wide.within(0.9)].sum()

@@ -66,57 +66,48 @@ def refused(said, call, *given, **how):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("said", "how"),
-    [
-        ("x1 must be above", {"area": [3, 0, 1, 2]}),
-        (r"expected \[x0,y0,x1,y1\]", {"area": [1, 2, 3]}),
-        ("no coordinate in metres", {"area": [0, 0, 1e9, 1]}),
-        ("no such file", {"area": "missing.geojson"}),
-        (r"or a \*.geojson file", {"area": "area.txt"}),
-        (r"expected \[x0,y0,x1,y1\] in", {"area": [0, 0, "nan", 1]}),
-        ("nothing says where", {"area": None}),
-        ("above 0", {"step_m": 0}),
-        ("above 0", {"step_m": -1.0}),
-        ("memory", {"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}),
-        ("finite", {"height_m": float("nan")}),
-    ],
-)
+@pytest.mark.parametrize("said, how", [
+    ("x1 must be above", {"area": [3, 0, 1, 2]}),
+    (r"expected \[x0,y0,x1,y1\]", {"area": [1, 2, 3]}),
+    ("no coordinate in metres", {"area": [0, 0, 1e9, 1]}),
+    ("no such file", {"area": "missing.geojson"}),
+    (r"or a \*.geojson file", {"area": "area.txt"}),
+    (r"expected \[x0,y0,x1,y1\] in", {"area": [0, 0, "nan", 1]}),
+    ("nothing says where", {"area": None}),
+    ("above 0", {"step_m": 0}),
+    ("above 0", {"step_m": -1.0}),
+    ("memory", {"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}),
+    ("finite", {"height_m": float("nan")}),
+])  # fmt: skip
 def test_spoilt_grids(said, how):
     refused(said, grid_of, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
 
 
-@pytest.mark.parametrize(
-    ("said", "content"),
-    [
-        ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
-        ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
-        ("pairs of numbers", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
-        ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
-        ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
-        ("no polygon", '{"type": "FeatureCollection", "features": []}'),
-        ("not readable", "not json"),
-        ("not GeoJSON", "[1, 2]"),
-    ],
-)
+@pytest.mark.parametrize("said, content", [
+    ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
+    ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
+    ("pairs of numbers", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
+    ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
+    ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
+    ("no polygon", '{"type": "FeatureCollection", "features": []}'),
+    ("not readable", "not json"),
+    ("not GeoJSON", "[1, 2]"),
+])  # fmt: skip
 def test_spoilt_polygons(tmp_path, said, content):
     path = tmp_path / "a.geojson"
     path.write_text(content)
     refused(said, grid_of, None, str(path), 1.5, 0.5)
 
 
-@pytest.mark.parametrize(
-    ("said", "points", "content"),
-    [
-        ("has no scale", None, None),
-        ("two points", [[0, 0, 0, 0]], None),
-        ("two points", [[0, 0, 1, "x"], [50, 50, 1, 1]], None),
-        ("no scale", [[5, 5, 0, 0], [5, 5, 9, 9]], None),
-        ("one place", [[0, 0, 1, 1], [50, 50, 1, 1]], None),
-        ("not an image", [[0, 0, 0, 0], [9, 9, 9, 9]], "hello"),
-        ("no such file", None, ""),
-    ],
-)
+@pytest.mark.parametrize("said, points, content", [
+    ("has no scale", None, None),
+    ("two points", [[0, 0, 0, 0]], None),
+    ("two points", [[0, 0, 1, "x"], [50, 50, 1, 1]], None),
+    ("no scale", [[5, 5, 0, 0], [5, 5, 9, 9]], None),
+    ("one place", [[0, 0, 1, 1], [50, 50, 1, 1]], None),
+    ("not an image", [[0, 0, 0, 0], [9, 9, 9, 9]], "hello"),
+    ("no such file", None, ""),
+])  # fmt: skip
 def test_spoilt_plans(tmp_path, said, points, content):
     path = image(tmp_path / "p.png")
     if content is not None:
@@ -126,16 +117,13 @@ def test_spoilt_plans(tmp_path, said, points, content):
     refused(said, read_plan, path, points)
 
 
-@pytest.mark.parametrize(
-    ("said", "how"),
-    [
-        ("no station 'nord'", {"stations": ["nord"]}),
-        ("name one", {"stations": []}),
-        ("0 to 1", {"load": 1.5}),
-        ("one per station", {"load": [1, 1, 1]}),
-        ("no station 'south'", {"load": {"south": 1}}),
-        ("stood still", {"other_end": [0, 0, 1]}),
-    ],
-)
+@pytest.mark.parametrize("said, how", [
+    ("no station 'nord'", {"stations": ["nord"]}),
+    ("name one", {"stations": []}),
+    ("0 to 1", {"load": 1.5}),
+    ("one per station", {"load": [1, 1, 1]}),
+    ("no station 'south'", {"load": {"south": 1}}),
+    ("stood still", {"other_end": [0, 0, 1]}),
+])  # fmt: skip
 def test_spoilt_maps(said, how):
     refused(said, map_of, gsparc.load(town_model()), **{"step_m": 5.0, **how})

@@ -46,15 +46,12 @@ def test_two_stations_leave_none_out(together):
     assert new_station_error(method, method_class("distance_law"), data, fold, FitContext()).stations == 0
 
 
-@pytest.mark.parametrize(
-    ("said", "how"),
-    [
-        ("one of coverage, worst", {"goal": "best"}),
-        ("at least 1", {"count": 0}),
-        ("no such file", {"sites": "missing.geojson"}),
-        ("stations=together", {}),
-    ],
-)
+@pytest.mark.parametrize("said, how", [
+    ("one of coverage, worst", {"goal": "best"}),
+    ("at least 1", {"count": 0}),
+    ("no such file", {"sites": "missing.geojson"}),
+    ("stations=together", {}),
+])  # fmt: skip
 def test_spoilt_wishes(together, said, how):
     model = together[2] if how else town_model()  # whose stations are known ones alone
     with pytest.raises(DataError, match=said) as caught:

@@ -93,18 +93,15 @@ def test_a_walk_is_not_longer_than_it_must_be():
     assert Tour.length_of(places[tour.order()], np.zeros(2)) == pytest.approx(11)
 
 
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [
-        ({"count": 0}, "at least 1"),
-        ({"count": 2, "route_m": -1}, "above 0"),
-        ({"count": 2, "start": [1]}, r"\[x,y\]"),
-        ({"count": 2, "least_gain_db": -1}, "at least 0"),
-        ({"count": 2, "length_m": 0}, "above 0"),
-        ({"count": 2, "area": None}, "nothing says where"),
-        ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
-    ],
-)
+@pytest.mark.parametrize("how, said", [
+    ({"count": 0}, "at least 1"),
+    ({"count": 2, "route_m": -1}, "above 0"),
+    ({"count": 2, "start": [1]}, r"\[x,y\]"),
+    ({"count": 2, "least_gain_db": -1}, "at least 0"),
+    ({"count": 2, "length_m": 0}, "above 0"),
+    ({"count": 2, "area": None}, "nothing says where"),
+    ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
+])  # fmt: skip
 def test_spoilt_wishes(how, said):
     with pytest.raises(DataError, match=said):
         plan_next(None, **{"area": [0, 0, 9, 9], **how})

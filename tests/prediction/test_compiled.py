@@ -144,7 +144,7 @@ def test_channels_without_sources_and_stations_are_refused_in_one_line():
 MODELS = {
     "powers, all rows": partial(of_powers, 300),
     "powers, variance of the nearest": partial(of_powers, 1500),
-    "powers, the nearest": partial(of_powers, 1400),
+    "powers, the nearest": partial(of_powers, 700),
     "powers, distilled": partial(of_powers, 80, "idw"),
     "sources": partial(of_sources, 1),
     "sources, many tones": partial(of_sources, 40),
@@ -160,7 +160,7 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 def test_the_library_answers_as_the_model(name, library, example, tmp_path, monkeypatch, request):
     """At random places to 1e-5 of the scale, with variance and unknown share where these are exact."""
-    monkeypatch.setattr(powers, "MOST_ROWS", 1000 if name == "powers, the nearest" else 6000)
+    monkeypatch.setattr(powers, "MOST_ROWS", 500 if name == "powers, the nearest" else 6000)
     torch.set_num_threads(1)
     real = None if MODELS[name] else request.getfixturevalue("real_rfid")
     predictor = MODELS[name]() if MODELS[name] else of_a_real_array(real, tmp_path)
@@ -216,9 +216,8 @@ def test_threads_agree_nothing_is_allocated_and_damage_is_refused(library, tmp_p
     path.write_bytes(blob)
     run = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=300)
     asked = driver(library)
-    assert run([asked, path, "8", "10000000"]).stdout.split() == [
-        "queries", "10000000", "wrong", "0", "allocations", "0"
-    ]  # fmt: skip
+    said = run([asked, path, "8", "10000000"]).stdout  # of a tenth two threads' collision was often missed
+    assert said.split() == ["queries", "10000000", "wrong", "0", "allocations", "0"]
     damaged = files(tmp_path, blob, 1000, False)
     assert run([asked, *damaged]).stdout.split() == ["refused", "1000"]
 

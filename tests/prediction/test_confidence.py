@@ -37,8 +37,7 @@ def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     method, _ = loading.load(file)
     evidence = gather(method, data, fold, fold.test)
     keep(
-        file,
-        Trusted("distance", 0.2, Guarantee(), known_positions(data, fold), position_kernel(data, fold)),
+        file, Trusted("distance", 0.2, Guarantee(), known_positions(data, fold), position_kernel(data, fold))
     )
     world = data.tx[fold.test] + data.site.origin
     for kind, score in evidence.scores.items():
@@ -60,10 +59,7 @@ def test_what_was_never_stored_is_said(site) -> None:
         gsparc.load(file, confidence="distance")
     with pytest.raises(ValueError, match="expected one of learned"):
         gsparc.load(file, confidence="hope")
-    keep(
-        file,
-        Trusted("learned", 0.5, Guarantee(), known_positions(data, fold), position_kernel(data, fold)),
-    )
+    keep(file, Trusted("learned", 0.5, Guarantee(), known_positions(data, fold), position_kernel(data, fold)))
     with pytest.raises(ValueError, match="threshold is one of confidence=learned"):
         gsparc.load(file, confidence="distance").accepts(tx=world)
 

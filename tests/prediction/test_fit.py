@@ -54,15 +54,12 @@ def test_stations_are_learned_as_a_file_has_them():
     assert np.abs(10 * np.log10(near) - powers[:5, 1]).max() < 3
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"rx": PLACES[:5], "rssi": POWERS}, "^gsparc.fit, rx_position: [^;]*found .5, 3.$"),
-        ({"rx": PLACES, "rssi": POWERS, "carier_hz": 1e9}, "carier_hz.*carrier_hz"),
-        ({"rx": PLACES}, "one of"),
-        ({"rx": PLACES, "rssi": POWERS, "model": "gps"}, "did you mean 'gp'"),
-    ],
-)
+@pytest.mark.parametrize("wrong, said", [
+    ({"rx": PLACES[:5], "rssi": POWERS}, "^gsparc.fit, rx_position: [^;]*found .5, 3.$"),
+    ({"rx": PLACES, "rssi": POWERS, "carier_hz": 1e9}, "carier_hz.*carrier_hz"),
+    ({"rx": PLACES}, "one of"),
+    ({"rx": PLACES, "rssi": POWERS, "model": "gps"}, "did you mean 'gp'"),
+])  # fmt: skip
 def test_mistakes_are_said_with_their_array(wrong, said):
     with pytest.raises((DataError, ValueError), match=said):
         gsparc.fit(tx=END, **wrong)

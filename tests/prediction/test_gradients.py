@@ -174,7 +174,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
             patch.setattr(complex_gp, "NEAREST", 20)
         method = for_links(case.make, data)
         fold = make_split(data.moving, SplitSettings(), place=data.place).folds[0]
-        budget = 3.0 if method.takes_budget else None
+        budget = 0.5 if method.takes_budget else None
         method.fit(data, fold, short(Path(folder), 10, budget_s=budget))
     site = type(data.site)(**{**vars(data.site), "origin": data.site.origin + WORLD})
     found = Predictor(method, site)
@@ -246,9 +246,7 @@ def error(found: torch.Tensor, wanted: torch.Tensor) -> float:
     return float((found - wanted).abs().max() / wanted.abs().max().clamp_min(1e-300))
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_gradients_are_those_of_differences(name):
-    predictor, _ = fitted(name)
+def equal_differences(predictor, data):
     at = places(predictor)
     found, wanted = slopes(predictor, at), differences(predictor, at)
     assert "mean" in found
@@ -259,9 +257,7 @@ def test_gradients_are_those_of_differences(name):
         assert wanted[part].abs().max() == 0, part
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_forward_mode_and_transforms_equal_reverse_mode(name):
-    predictor, _ = fitted(name)
+def are_the_same_in_forward_mode_and_transforms(predictor, data):
     at = places(predictor, 2)
     found = slopes(predictor, at)
     along = torch.randn(at.shape, generator=torch.Generator().manual_seed(2), dtype=at.dtype)
@@ -280,10 +276,8 @@ def test_forward_mode_and_transforms_equal_reverse_mode(name):
         assert error(transform(total)(at), found["mean"]) < 1e-9, transform
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_answers_are_those_without_gradients(name):
+def leave_answers_as_they_are(predictor, data):
     """In the caller's precision; float32 loses nothing but its last digits near the world's origin."""
-    predictor, _ = fitted(name)
     at = places(predictor)
     with_gradients, plain = asked(predictor, at, grad=True), asked(predictor, at)
     assert with_gradients.dtype == (torch.complex128 if plain.is_complex() else torch.float64)
@@ -302,9 +296,7 @@ def test_answers_are_those_without_gradients(name):
     assert slope.dtype == torch.float32 and error(slope, wanted) < 1e-3
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_at_a_row_and_at_a_single_place_gradients_are_finite(name):
-    predictor, data = fitted(name)
+def are_finite_at_rows_and_at_one_place(predictor, data):
     rows = data.moving[:2] if data.station is None else data.moving[data.station == 0][:2]
     origin = torch.from_numpy(predictor.site.origin)
     at = torch.from_numpy(np.asarray(rows, np.float64)) + origin.repeat(rows.shape[1] // 3)
@@ -315,6 +307,20 @@ def test_at_a_row_and_at_a_single_place_gradients_are_finite(name):
     assert found.shape == asked(predictor, at, grad=True).shape[1:]
     (slope,) = torch.autograd.grad(torch.real(found).sum(), one)
     assert slope.shape == one.shape and torch.isfinite(slope).all()
+
+
+PROPERTIES = (
+    equal_differences,
+    are_the_same_in_forward_mode_and_transforms,
+    leave_answers_as_they_are,
+    are_finite_at_rows_and_at_one_place,
+)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gradients(name):
+    for hold in PROPERTIES:
+        hold(*fitted(name))
 
 
 @pytest.mark.parametrize("name", REFUSED)

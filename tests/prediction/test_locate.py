@@ -54,15 +54,12 @@ def test_missing_and_silent_stations_are_no_values(tmp_path):
     assert quiet.area > loud.area, "below a level is less than at a level"
 
 
-@pytest.mark.parametrize(
-    ("values", "more", "said"),
-    [
-        (np.zeros((2, 3)), {}, r"values \(2, 3\) torch.float64 are no spectrum"),
-        (np.zeros((1, 9, 36), complex), {}, "are no spectrum"),
-        (np.full((1, 9, 36), np.nan), {}, "in which nothing was heard"),
-        (np.zeros((1, 9, 36)), {"silent": [[True]]}, "silent"),
-    ],
-)
+@pytest.mark.parametrize("values, more, said", [
+    (np.zeros((2, 3)), {}, r"values \(2, 3\) torch.float64 are no spectrum"),
+    (np.zeros((1, 9, 36), complex), {}, "are no spectrum"),
+    (np.full((1, 9, 36), np.nan), {}, "in which nothing was heard"),
+    (np.zeros((1, 9, 36)), {"silent": [[True]]}, "silent"),
+])  # fmt: skip
 def test_values_of_another_kind_are_refused_in_one_line(trained, values, more, said):
     with pytest.raises(ValueError, match=said) as raised:
         gsparc.load(trained).locate(values, **more)

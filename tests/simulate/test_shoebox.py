@@ -59,7 +59,7 @@ def _bounce_by_bounce(room, tx, rx, cell):
 def test_visibility_equals_walking_the_folded_path():
     room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, PILLAR)
     mirrored = images(room, 3)
-    tx, rx = scatter(room, 6, seed=2), scatter(room, 6, seed=3)
+    tx, rx = scatter(room, 4, seed=2), scatter(room, 4, seed=3)
     seen = visible(room, mirrored, tx, rx)
     walked = np.array([[_bounce_by_bounce(room, t, r, c) for c in mirrored.cell]
                        for t, r in zip(tx, rx, strict=True)])  # fmt: skip

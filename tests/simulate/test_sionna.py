@@ -13,7 +13,9 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from campaigns import compose
 
+from gsparc.commands import simulate as commands
 from gsparc.data.load import load
 from gsparc.simulate import llvm, raytracer
 from gsparc.simulate.auto import AutoSettings
@@ -88,6 +90,15 @@ def test_line_of_sight_is_friis(room, places):
     np.testing.assert_allclose(paths.delay, distance / 299_792_458.0, rtol=1e-5)
     towards = (TRANSMITTER - places)[seen == 1] / distance[:, None]
     np.testing.assert_allclose(paths.direction, towards, atol=1e-4)
+
+
+@pytest.mark.parametrize("polarisation", [False, True])
+def test_a_call_in_which_nothing_is_heard_ended_in_an_error(room, places, polarisation):
+    sight = replace(PLAIN, specular=False, refraction=False, depth=0, polarisation=polarisation)
+    under, heard = places[:1] * [1, 1, -1], places[np.diff(room.trace(places, sight).offsets) > 0]
+    assert room.trace(under, sight).offsets.tolist() == [0, 0]
+    few = RayTracer(conference_room(), TRANSMITTER, CONFERENCE.carrier_hz, replace(QUICK, batch=1))
+    assert few.trace(np.concatenate([under, heard[:1]]), sight).offsets.tolist() == [0, 0, 1]
 
 
 def test_channels_are_the_solver_s(room, places):
@@ -277,16 +288,16 @@ def test_auto_in_the_conference_room(tmp_path):
     assert spectra.site.convergence_error == pytest.approx(outcome.convergence.spectrum_nmse)
 
 
-def test_killed_run_is_resumed(tmp_path):
+def test_killed_run_is_resumed(tmp_path, monkeypatch, caplog):
     """SIGKILL between shards of two transmitters: nothing finished is lost, every pair is made once."""
     out = tmp_path / "room.h5"
-    command = [
-        sys.executable, "-m", "gsparc", "simulate", "scene=conference_room", "scene.num_receivers=30",
-        "scene.transmitter_m=null",
+    given = [
+        "scene=conference_room", "effects=los", "scene.num_receivers=30", "scene.transmitter_m=null",
         "scene.transmitters=[{name: a, position_m: [3.1, 6.2, 3.7]}, {name: b, position_m: [11, 3, 3.5]}]",
-        "sampling.samples=5000", "shard=10", "check=0", "spectrum.height=18", "spectrum.width=36",
-        f"out={out}", f"hydra.run.dir={tmp_path / 'run'}",
+        "sampling.samples=5000", "shard=2", "check=0", "spectrum.height=18", "spectrum.width=36",
+        f"out={out}",
     ]  # fmt: skip
+    command = [sys.executable, "-m", "gsparc", "simulate", *given, f"hydra.run.dir={tmp_path / 'run'}"]
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     parts, limit = tmp_path / "room.h5.parts", time.monotonic() + 240
     while len(list(parts.glob("shard_*.npz"))) < 3:
@@ -296,10 +307,12 @@ def test_killed_run_is_resumed(tmp_path):
     running.wait()
     assert not out.exists()
     before = {p.name: (p.stat().st_mtime_ns, p.stat().st_ino) for p in parts.glob("shard_*.npz")}
-    again = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
-    assert f"{len(before)} of 6 shards are there already" in again.stdout + again.stderr or len(before) == 6
+    monkeypatch.setattr(commands, "run_directory", lambda: tmp_path)
+    with caplog.at_level("INFO"):
+        commands.task(compose(*given, config="simulate"))
+    assert f"{len(before)} of 30 shards are there already" in caplog.text
     with h5py.File(out) as file:
         rows = np.column_stack([file["station"][()], file["rx_position"][()]])
         assert len(np.unique(rows, axis=0)) == 60 and len(file["spectrum"]) == 60
-    facts = json.loads((tmp_path / "run" / "summary.json").read_text())
+    facts = json.loads((tmp_path / "summary.json").read_text())
     assert facts["dataset/receivers"] == 30 and facts["dataset/rows"] == 60

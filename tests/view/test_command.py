@@ -44,17 +44,14 @@ def test_without_viser_one_line_says_what_to_install(here, monkeypatch, more):
         view(here, here / "missing.ckpt", *more)
 
 
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        (["save=scene.obj"], "expected a name that ends with .html, .png, .ply"),
-        (["port=70000"], "a number from 0 to 65535"),
-        (["save=a.png", "station=nowhere"], "there are east, west"),
-        (["save=a.png", "at=[1,2]"], "three finite numbers"),
-        (["save=a.png", "map=missing.npz"], "expected map.npz of gsparc map"),
-        (["save=a.ply"], "holds no Gaussians to write"),
-    ],
-)
+@pytest.mark.parametrize("more, said", [
+    (["save=scene.obj"], "expected a name that ends with .html, .png, .ply"),
+    (["port=70000"], "a number from 0 to 65535"),
+    (["save=a.png", "station=nowhere"], "there are east, west"),
+    (["save=a.png", "at=[1,2]"], "three finite numbers"),
+    (["save=a.png", "map=missing.npz"], "expected map.npz of gsparc map"),
+    (["save=a.ply"], "holds no Gaussians to write"),
+])  # fmt: skip
 def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, said):
     monkeypatch.chdir(here)
     with pytest.raises(DataError, match=said):

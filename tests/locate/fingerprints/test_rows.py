@@ -36,22 +36,19 @@ def test_archive_is_read(tmp_path):
     assert flat.position.shape == (4, 3) and not flat.position[:, 2].any()
 
 
-@pytest.mark.parametrize(
-    ("other", "said"),
-    [
-        ({"position": None}, "position: missing"),
-        ({"position": np.zeros((3, 3))}, "position: expected shape"),
-        ({"position": np.full((4, 3), NAN)}, "finite coordinates"),
-        ({"position": np.zeros((4, 4))}, "2 or 3 coordinates"),
-        ({"rss_dbm": np.full((4, 2), NAN)}, "no row heard an access point"),
-        ({"rss_dbm": np.full((4, 2), 100.0)}, "found 100 in row 0, column 0"),
-        ({"rss_dbm": np.full((4, 2), np.inf)}, "found inf"),
-        ({"floor": np.zeros(3, np.int64)}, "floor: expected 4 whole numbers"),
-        ({"floor": np.zeros(4)}, "floor: expected 4 whole numbers, found float64"),
-        ({"access_point": np.array(["a", "a"])}, "expected each once"),
-        ({"test": np.array(["no"] * 4)}, "test: expected True and False"),  # was a KeyError
-    ],
-)
+@pytest.mark.parametrize("other, said", [
+    ({"position": None}, "position: missing"),
+    ({"position": np.zeros((3, 3))}, "position: expected shape"),
+    ({"position": np.full((4, 3), NAN)}, "finite coordinates"),
+    ({"position": np.zeros((4, 4))}, "2 or 3 coordinates"),
+    ({"rss_dbm": np.full((4, 2), NAN)}, "no row heard an access point"),
+    ({"rss_dbm": np.full((4, 2), 100.0)}, "found 100 in row 0, column 0"),
+    ({"rss_dbm": np.full((4, 2), np.inf)}, "found inf"),
+    ({"floor": np.zeros(3, np.int64)}, "floor: expected 4 whole numbers"),
+    ({"floor": np.zeros(4)}, "floor: expected 4 whole numbers, found float64"),
+    ({"access_point": np.array(["a", "a"])}, "expected each once"),
+    ({"test": np.array(["no"] * 4)}, "test: expected True and False"),  # was a KeyError
+])  # fmt: skip
 def test_bad_archives_are_refused_in_one_line(tmp_path, other, said):
     with pytest.raises(DataError, match=said) as error:
         read_fingerprints(written(tmp_path / "a.npz", **other))
