@@ -156,27 +156,6 @@ def suited_threads(method: Method, places: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """Training rows predicted from all others.
-
-    Attributes:
-        rows: (n,) rows of the measurements, ascending where each occurs once.
-        residual: (n, R) complex, what was measured less what the others predict, stored units.
-    """
-
-    rows: np.ndarray
-    residual: Tensor
-
-
-@runtime_checkable
-class LeaveOneOut(Protocol):
-    """Predicts its training rows, each without itself (Rasmussen and Williams 2006, eq. 5.12)."""
-
-    def leave_one_out(self) -> LeftOut:
-        """Residuals of the rows it was fitted on."""
-
-
 @runtime_checkable
 class Reconditions(Protocol):
     """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""

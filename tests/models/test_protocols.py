@@ -23,7 +23,6 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import method as protocols
-from gsparc.models.channels import complex_gp
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Reducible, suited_threads
 from gsparc.models.moving_array.method import MovingArrayField
@@ -31,7 +30,6 @@ from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.registry import METHODS, build, method_class
 from gsparc.models.splat.array import ArrayField
 from gsparc.ops import Pose
-from gsparc.training.context import FitContext
 
 DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink"), ""),
@@ -39,9 +37,9 @@ DECLARED = {
     "calibrated_raytracer": "",
     "distance_law": "",
     "gp": "Reducible",
-    "complex_gp": "LeaveOneOut",
-    "directional_gp": "LeaveOneOut HasPaths",
-    "image_source_gp": "LeaveOneOut HasPaths Reducible",
+    "complex_gp": "",
+    "directional_gp": "HasPaths",
+    "image_source_gp": "HasPaths Reducible",
     "array": "Reducible",
     "moving_array": "Reducible",
     "gsparc": "HasPaths Reducible",
@@ -145,25 +143,6 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
     for part in ("mean", "confidence", "variance"):
         torch.testing.assert_close(getattr(told, part), getattr(said, part))
     assert again.size() == method.size()
-
-
-def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):
-    _, data, fold = shoebox(24)
-    known = np.concatenate([fold.train, fold.val])
-    none = known[:0]
-
-    def fit(rows: np.ndarray) -> complex_gp.ComplexGP:
-        method = complex_gp.ComplexGP()
-        method.fit(data, Fold(rows, none, none), FitContext())
-        return method
-
-    monkeypatch.setattr(complex_gp, "LENGTHS", (1.0,))  # a row less must not choose another kernel
-    monkeypatch.setattr(complex_gp, "NOISES", (1e-2,))
-    residual = fit(known).leave_one_out().residual
-    for number in (0, len(known) // 2, len(known) - 1):
-        batch = data.batch(known[[number]])
-        missed = batch.target - fit(np.delete(known, number)).predict(batch.tx, batch.rx).mean
-        torch.testing.assert_close(residual[number].to(missed.dtype), missed.flatten(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from gsparc.data.links.stations import numbered
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.image_sources.run_factors import RunFactors, run_factors
-from gsparc.models.method import LeftOut, Method, Prediction
+from gsparc.models.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
@@ -174,16 +174,6 @@ class ComplexGP(Method):
     def answer(self, batch: Batch) -> Prediction:
         """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
         return self.runs.restored(self.predict(batch.tx, batch.rx), batch.run)
-
-    def leave_one_out(self) -> LeftOut:
-        """See `LeaveOneOut`; rows are those of the fit, counted from 0; of visits to a place, the first."""
-        posterior = self._fitted()
-        if isinstance(posterior, Exact):
-            residual, _ = posterior.residual()
-        else:
-            assert isinstance(posterior, Nearest)
-            residual = (posterior.rest - posterior.left_out()[0]).to(torch.complex128)
-        return LeftOut(self.first.numpy(), self.turned[:, None] * residual)
 
     def _moving(self, tx: Tensor, rx: Pose) -> Tensor:
         """Places (B, 3) float64 [m] of the moving end, (B, 6) of both."""

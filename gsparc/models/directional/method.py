@@ -31,11 +31,12 @@ from gsparc.models.image_sources.rows import Rows, gather
 from gsparc.models.image_sources.scene import steering
 from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.models.in_double import in_double
-from gsparc.models.method import LeftOut, Prediction
+from gsparc.models.method import Prediction
 from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
 from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out_group
+from gsparc.training.conditional import LeftOutRows
 from gsparc.training.context import FitContext, FitReport
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.
@@ -316,8 +317,8 @@ class DirectionalGP(FramedMethod):
         power = (powers * probability).sum(1)
         return gains.clamp_min(0) + visibility_variance + self.kernel.noise, power + self.kernel.noise
 
-    def leave_one_out(self) -> LeftOut:
-        """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`.
+    def left_out(self) -> LeftOutRows:
+        """Receivers, each predicted from all others.
 
         A receiver's own visibility of the sources is left out, too.
         """

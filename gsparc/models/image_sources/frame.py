@@ -12,9 +12,10 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.image_sources.rows import Rows, query_elements, static_array
-from gsparc.models.method import LeftOut, Method, Prediction
+from gsparc.models.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
+from gsparc.training.conditional import LeftOutRows
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
 
@@ -98,10 +99,11 @@ class FramedMethod(Method):
         unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
         return gain, delay, unit, self.frame.carrier_hz
 
-    def _left_out(self, rows: Rows, predicted: Tensor) -> LeftOut:
-        """See `LeaveOneOut`; of normalised predictions (n, R) of the rows."""
+    def _left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
+        """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
         scale = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
-        return LeftOut(rows.receiver.numpy(), (rows.target - predicted) * scale)
+        unknown = torch.full((len(predicted),), float("nan"))
+        return LeftOutRows(rows.receiver.numpy(), (predicted * scale)[:, :, None], unknown)
 
     def _frame_state(self, rows: Rows) -> dict[str, Any]:
         """Antennas, frame and rows."""

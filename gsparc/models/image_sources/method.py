@@ -41,7 +41,7 @@ from gsparc.models.image_sources.rows import (
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.models.method import LeftOut, Method, Prediction
+from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import MeanOnly
 from gsparc.ops import Pose
@@ -335,8 +335,8 @@ class ImageSourceGP(FramedMethod):
         gains, delay, unit, carrier = self._stored_paths(gain.movedim(0, -1), away, towards)
         return gains / self.factors[:, None], delay, unit, carrier
 
-    def leave_one_out(self) -> LeftOut:
-        """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""
+    def left_out(self) -> LeftOutRows:
+        """Receivers, each predicted from all others."""
         self._fitted()
         each = torch.stack([member.left_out() for member in self.members])
         predicted = (self.weights[:, None, None] * each).sum(0)

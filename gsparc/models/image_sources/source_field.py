@@ -25,11 +25,8 @@ class FramedField(MethodField):
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of one channel per receiver."""
-        method, left = self.method, self.method.leave_one_out()
-        rows = method.members[0].rows if isinstance(method, ImageSourceGP) else method.rows
-        scale = (method.frame.carrier_hz / rows.frequency).float()[:, None] * method.frame.scale
-        mean = (rows.target * scale - left.residual)[:, :, None]
-        return LeftOutRows(left.rows, mean, torch.full((len(left.rows),), float("nan")))
+        result: LeftOutRows = self.method.left_out()
+        return result
 
 
 class SourceField(FramedField):
