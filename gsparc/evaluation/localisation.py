@@ -17,8 +17,8 @@ from matplotlib.patches import Rectangle
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
+from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, SHARE
-from gsparc.data.load import split_settings
 from gsparc.data.own import interpreted
 from gsparc.data.raw import read_raw
 from gsparc.evaluation.console import plain
@@ -37,8 +37,6 @@ from gsparc.locate.search import Unknown
 from gsparc.locate.snapshots import Snapshots, snapshots
 from gsparc.locate.track import followed
 from gsparc.models import checkpoint
-from gsparc.models.registry import build
-from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
@@ -168,16 +166,11 @@ def _trust(
     config: DictConfig, run: Opened, locator: Locator, cells: Callable[[np.ndarray], Cells], run_dir: Path
 ) -> tuple[Trust, int]:
     """Learned from training rows that were left out, and their number."""
-    settings = OmegaConf.create(run.stored[0].configuration)
-    if "model" not in settings:
-        raise ValueError(f"{config.ckpt} does not name its settings: calibrate=0 goes without")
-    split = settings.get("split")
-    context = FitContext(
-        run_dir=run_dir / "left_out", seed=int(config.seed), budget_s=float(config.calibrate_s),
-        split=None if split is None else split_settings(plain(split)),
-        stations=settings.get("stations", "auto"),
-    )  # fmt: skip
-    make = partial(build, settings.model)
+    brief = {"run_dir": run_dir / "left_out", "seed": int(config.seed), "budget_s": float(config.calibrate_s)}
+    try:
+        make, context = run.retraining(**brief)
+    except DataError as error:
+        raise DataError(f"{error}: calibrate=0 goes without") from None
     folds = int(config.calibrate)
     result = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
     log.info("trust learned from %d snapshots that were left out: %s", result[1], result[0])

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.load import datamodule, split_for
+from gsparc.data.errors import DataError
+from gsparc.data.load import datamodule, split_for, split_settings
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, indices_hash
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
+from gsparc.models.registry import build
 from gsparc.prediction.predictor import SAME_PLACE_M
+from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +54,26 @@ class Opened:
         """`dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
         own = {"split/foreign": self.foreign, "model/name": self.methods[0].name}
         return dataset_facts(self.data) | split_facts(self.split) | own
+
+    def retraining(self, **others: Any) -> tuple[Callable[[], Method], FitContext]:
+        """What makes the method unfitted, of gsparc's classes alone, and the context that it was fitted in.
+
+        Args:
+            **others: of `FitContext`, in place of the run's.
+
+        Raises:
+            DataError: the file does not name its settings.
+        """
+        config = self.stored[0].configuration
+        if "model" not in config:
+            raise DataError(f"{self.stored[0].path} does not say how it was trained")
+        split = config.get("split")
+        own = {
+            "seed": int(config.get("seed", 0)), "budget_s": config.get("budget_s"),
+            "budget_clock": config.get("budget_clock", "wall"), "stations": config.get("stations", "auto"),
+            "split": None if split is None else split_settings(split),
+        }  # fmt: skip
+        return partial(build, config["model"], trusted=False), FitContext(**own | others)
 
 
 def open_files(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 from gsparc.data.errors import DataError
@@ -16,7 +15,6 @@ from gsparc.maps.intervals import Coverage
 from gsparc.maps.promise import Promise, PromiseSettings, gather, stored_promise
 from gsparc.models import checkpoint
 from gsparc.models.method import Method
-from gsparc.models.registry import build
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -39,10 +37,6 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
     promise = None if settings.get("renew") else stored_promise(stored.extra)
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
-    if "model" not in stored.configuration:
-        raise DataError(
-            f"{path}: does not say how it was trained; say promised=false for a map without promise"
-        )
     method, make, data, fold, context = trained(path, settings["dataset"])
     log.info("a promise for this map: %d fits without blocks of places", how.folds)
     promise = gather(method, make, data, fold, how, context)
@@ -61,18 +55,13 @@ def trained(
     """
     try:
         run = open_files([path], dataset)
+        make, context = run.retraining()
     except (ValueError, OSError) as error:
         raise DataError(
             f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
         ) from None
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
-    config = run.stored[0].configuration
-    context = FitContext(
-        seed=int(config.get("seed", 0)), budget_s=config.get("budget_s"),
-        budget_clock=config.get("budget_clock", "wall"), stations=config.get("stations", "each"),
-    )  # fmt: skip
-    make = partial(build, config["model"], trusted=False)
     return run.methods[0], make, run.data, run.split.folds[0], context
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables.read import understand_table
 from gsparc.evaluation.baseline_cache import baseline
-from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.open_runs import Opened, aligned
 from gsparc.evaluation.scores import score
 from gsparc.models.per_station import for_links
 from gsparc.models.registry import method_class
@@ -154,3 +156,16 @@ def test_what_is_in_target_units_is_converted_with_the_target(room):
     assert np.allclose(back.target, room.target)
     assert np.allclose(back.uplink, heard) and np.allclose(back.noise_variance, noise)
     assert back.uplink.dtype == np.complex64 and back.noise_variance.dtype == np.float32
+
+
+def test_locate_built_whatever_class_a_checkpoint_named():
+    """Settings that the stored class does not follow were instantiated, `os.system` as well."""
+    settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "budget_s": 2.0}
+    run = Opened([], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, None)
+    make, context = run.retraining(budget_s=5.0)
+    assert (context.seed, context.budget_s, context.stations) == (3, 5.0, "auto")
+    with pytest.raises(ValueError, match=r"os\.system.*refused"):
+        make()
+    run.stored[0].configuration = {}
+    with pytest.raises(DataError, match=r"a\.ckpt does not say how it was trained"):
+        run.retraining()
