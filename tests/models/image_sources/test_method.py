@@ -202,7 +202,7 @@ def test_every_source_of_a_shoebox_is_found(tmp_path):
 @pytest.mark.slow
 def test_visibility_behind_a_pillar_is_learned(tmp_path):
     told, data, fold = shoebox(450, pillar=True)
-    method = ImageSourceGP(searches=2)
+    method = ImageSourceGP(searches=1)
     method.fit(data, fold, FitContext(tmp_path))
     assert error(method, data, fold.test) <= 0.02
     learned, true = learned_and_true_visibility(method, told, data, fold.test)
