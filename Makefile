@@ -61,10 +61,10 @@ $(VENV)/.sionna: $(VENV)/.installed
 	$(RUN) -m gsparc llvm
 	@touch $@
 
-demo: setup ## train on a small simulated site, print the table, draw the spectra (about two minutes)
+demo: setup ## train on a small simulated site, print the table, draw the spectra (half a minute)
 	$(RUN) train.py experiment=demo hydra.run.dir=demo
 
-test: setup ## fast tests (under 5 minutes on two idle cores)
+test: setup ## fast tests (under 6 minutes on two idle cores)
 	$(PYTEST) -m "not slow"
 
 browser: ## Debian's chromium for the test of the report, where packages can be reached
