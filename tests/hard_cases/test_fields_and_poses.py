@@ -1,4 +1,4 @@
-"""Everything at once: fields, poses, grids, precisions that nobody thought of, drawn by tests/helpers/fields.py.
+"""Everything at once: fields, poses, grids, precisions nobody thought of, drawn by tests/helpers/fields.py.
 
 Remedy: all of them together. Bound of every comparison: FACTOR rounding errors of the input, carried to the
 output as the float64 reference carries them: `fields.condition` measures how far, by nudging every number of
