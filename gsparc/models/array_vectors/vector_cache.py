@@ -41,6 +41,11 @@ def recovered(
     known = _read(path, len(data))
     have = np.zeros(len(data), dtype=bool) if known is None else known["wall"] >= 0
     missing = rows[~have[rows]]
+    if known is not None and have[rows].any():
+        log.info(
+            "array vectors of %d spectra are kept from before: the %.1f s of then are counted",
+            have[rows].sum(), known["wall"][rows][have[rows]].sum(),
+        )  # fmt: skip
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         watch = TimeBudget()
         recovery = recover(data.site, training_targets(data, part), data.tx[part], seed)

@@ -80,7 +80,8 @@ def test_very_few_spectra_and_a_zero_vector_of_a_zero_spectrum(known_campaign, r
     assert np.isfinite(found.vectors).all() and np.abs(found.vectors[-1]).max() < 1e-2
 
 
-def test_only_requested_rows_are_recovered_and_cached(known_campaign, tmp_path, monkeypatch):
+def test_only_requested_rows_are_recovered_and_cached(known_campaign, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO", "gsparc")
     data, _ = known_campaign
     asked = []
     inner = vector_cache.recover
@@ -93,6 +94,12 @@ def test_only_requested_rows_are_recovered_and_cached(known_campaign, tmp_path, 
     other = replace(data, site=replace(data.site, sha256="another"))
     vector_cache.recovered(other, np.arange(3), tmp_path)
     assert asked == [10, 5, 3]
+    kept = [line for line in caplog.messages if "kept from before" in line]
+    assert (
+        len(kept) == 1
+        and kept[0].startswith("array vectors of 5 spectra")
+        and "s of then are counted" in kept[0]
+    )
 
 
 def test_an_interrupted_recovery_resumes(known_campaign, tmp_path, monkeypatch):
