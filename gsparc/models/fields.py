@@ -17,6 +17,7 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.channels import field as channels
 from gsparc.models.channels import initial as waves
 from gsparc.models.channels.initial import ChannelSettings
+from gsparc.models.conditional import ConditionalField
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.haste import factor_s
 from gsparc.models.image_sources.known.images import counted
@@ -31,7 +32,6 @@ from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.powers import field as power_field
 from gsparc.models.powers.together import field as joint_field
 from gsparc.models.target_rows import heard
-from gsparc.training.conditional import ConditionalField
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.models.method import Method
 from gsparc.ops import Pose
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.training.context import FitContext
 
 

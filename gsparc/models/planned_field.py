@@ -24,6 +24,7 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.models import stations
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import restored, stored
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
@@ -39,7 +40,6 @@ from gsparc.models.terms import EffectSettings, Plan
 from gsparc.ops import Pose
 from gsparc.processes.posterior import approximated
 from gsparc.processes.powers import PowerProcess
-from gsparc.training.conditional import ConditionalField
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.fit import total_steps
@@ -200,10 +200,10 @@ class PlannedField(LearnedField):
         if self.most_steps:
             log.info("model.steps=%d is not used: closed-form weights take no steps", self.most_steps)
         init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
-        found = solve(chosen.parts, init, self.switches, data, fold, context)
-        self.field, self.started, self.runs = found.field, found.started, found.runs
-        self.explained, self.init_s, self.steps = found.explained, found.init_s, 0
-        return found.report
+        solved = solve(chosen.parts, init, self.switches, data, fold, context)
+        self.field, self.started, self.runs = solved.field, solved.started, solved.runs
+        self.explained, self.init_s, self.steps = solved.explained, solved.init_s, 0
+        return solved.report
 
     def best_stations(
         self, data: Measurements, fold: Fold, context: FitContext

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements
+from gsparc.models.conditional import ConditionalField
 from gsparc.models.mixture.weights import comparable, real
 from gsparc.ops import Pose
-from gsparc.training.conditional import ConditionalField
 
 SHARES = np.logspace(-3, 1.5, 46)  # c, candidates
 

@@ -16,10 +16,10 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.field.initial import InitSettings
+from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import INITIALISERS
 from gsparc.models.per_station import of_station
 from gsparc.models.target_rows import heard
-from gsparc.training.conditional import ConditionalField
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one

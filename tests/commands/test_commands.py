@@ -99,6 +99,20 @@ def while_it_logs(config):
     time.sleep(60)
 
 
+def while_a_log_waits_for_its_reader(config):
+    class Waiting(logging.Handler):
+        def emit(self, record):
+            signal.raise_signal(signal.SIGINT)
+            time.sleep(60)
+
+    waiting, log = Waiting(), logging.getLogger("gsparc")
+    log.addHandler(waiting)
+    try:
+        log.warning("to a pipe that nobody reads")
+    finally:
+        log.removeHandler(waiting)
+
+
 def with_advice(config):
     raise KeyboardInterrupt("go on with ckpt_path=last.ckpt")
 
@@ -109,6 +123,7 @@ def with_advice(config):
         (while_a_library_cleans_up, "error: interrupted"),
         (in_compiled_code, "error: interrupted: Invalid bounding box"),
         (while_it_logs, "error: interrupted"),
+        (while_a_log_waits_for_its_reader, "error: interrupted"),
         (with_advice, "error: go on with ckpt_path=last.ckpt"),
     ],
 )

@@ -25,7 +25,7 @@ from gsparc.commands.shared.plugins import offer, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, one_line
 
-WHILE_LOGGING = 0.01  # [s] until an interrupt that came inside `logging` is tried again
+RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
 LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
 
 
@@ -93,9 +93,10 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
     later: list[threading.Timer] = []
 
     def noted(signum: int, frame: FrameType | None) -> object:
-        if _in_logging(frame):  # whose lock every thread needs, and would be left taken: again when it is out
+        # Every thread needs the lock of `logging`, which would be left taken: tried again when it is out.
+        if len(later) < MOST_RETRIES and _in_logging(frame):
             again = partial(signal.pthread_kill, threading.get_ident(), signum)
-            later.append(threading.Timer(WHILE_LOGGING, again))
+            later.append(threading.Timer(RETRY_S, again))
             later[-1].start()
             return None
         interrupts.append(signum)

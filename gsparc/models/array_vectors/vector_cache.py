@@ -43,7 +43,7 @@ def recovered(
     missing = rows[~have[rows]]
     if known is not None and have[rows].any():
         log.info(
-            "array vectors of %d spectra are kept from before: the %.1f s of then are counted",
+            "array vectors of %d spectra are cached: training time includes the %.1f s they took to compute",
             have[rows].sum(), known["wall"][rows][have[rows]].sum(),
         )  # fmt: skip
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():

@@ -25,12 +25,12 @@ from gsparc.models.channels.covariance import (
     signals,
     specular,
 )
+from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.ops import Pose
 from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.conditional import LeftOutRows
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions, coherence
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse
@@ -36,7 +37,6 @@ from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
 from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out_group
-from gsparc.training.conditional import LeftOutRows
 from gsparc.training.context import FitContext, FitReport
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.

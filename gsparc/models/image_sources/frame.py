@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
+from gsparc.models.conditional import LeftOutRows
 from gsparc.models.image_sources.rows import Rows, query_elements, static_array
 from gsparc.models.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
-from gsparc.training.conditional import LeftOutRows
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
 

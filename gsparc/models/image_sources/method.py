@@ -16,6 +16,7 @@ from torch import Tensor
 from gsparc.data.assemble import identity
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.conditional import LeftOutRows
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
 from gsparc.models.image_sources.ensemble import (
     affordable_rows,
@@ -47,7 +48,6 @@ from gsparc.models.reduced import MeanOnly
 from gsparc.ops import Pose
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave, wave_over_band
-from gsparc.training.conditional import LeftOutRows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 

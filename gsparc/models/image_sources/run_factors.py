@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
+from gsparc.models.conditional import Posterior
 from gsparc.models.method import Prediction
-from gsparc.training.conditional import Posterior
 
 P = TypeVar("P", Prediction, Posterior)
 

@@ -13,11 +13,11 @@ import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
+from gsparc.models.conditional import LeftOutRows
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method_field import MethodField
-from gsparc.training.conditional import LeftOutRows
 
 
 class FramedField(MethodField):

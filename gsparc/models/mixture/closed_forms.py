@@ -12,13 +12,13 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.channels.field import ChannelField
+from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import INITIALISERS
 from gsparc.models.haste import factor_s
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.mixture import solutions
 from gsparc.models.mixture.weights import comparable, explained
 from gsparc.models.terms import EffectSettings
-from gsparc.training.conditional import ConditionalField
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.time_budget import less_repeatable
@@ -33,7 +33,7 @@ LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fi
 
 @dataclass(frozen=True)
 class Solved:
-    """What was found.
+    """A field in closed form, and how it was fitted.
 
     Attributes:
         field: conditioned on all rows.

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
+from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.ops import Pose
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 
 
 class Mixture(ConditionalField):

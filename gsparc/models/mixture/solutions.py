@@ -18,6 +18,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.conditional import ConditionalField, LeftOutRows
 from gsparc.models.fields import INITIALISERS
 from gsparc.models.haste import factor_s
 from gsparc.models.left_out_images import LeftOut
@@ -27,7 +28,6 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
-from gsparc.training.conditional import ConditionalField, LeftOutRows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 

@@ -12,10 +12,10 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
+from gsparc.models.conditional import LeftOutRows, Posterior
 from gsparc.models.method_field import MethodField
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.ops import Pose
-from gsparc.training.conditional import LeftOutRows, Posterior
 
 
 class BearingField(MethodField):

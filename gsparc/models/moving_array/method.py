@@ -20,6 +20,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Differentiable
+from gsparc.models.conditional import LeftOutRows, Posterior
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
 from gsparc.models.moving_array.error_model import ErrorModel, fit_error_model, image_features
@@ -39,7 +40,6 @@ from gsparc.ops import Pose
 from gsparc.physics.lags import BLOCK, Lags
 from gsparc.physics.separable import Separable, separable
 from gsparc.processes.kernel import Kernel
-from gsparc.training.conditional import LeftOutRows, Posterior
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.baselines.distance_law import law_of
+from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.models.haste import haste
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.settings import choose_prior, chosen_among
@@ -29,7 +30,6 @@ from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.trend import Trend, Walls, trend_of
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.training.time_budget import TimeBudget
 
 QUERIES = 512  # at a time: memory

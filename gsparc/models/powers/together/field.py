@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.models.per_station import SAME_PLACE_M
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
@@ -27,7 +28,6 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import REACH
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Shared
-from gsparc.training.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.training.time_budget import TimeBudget
 
 NEVER = -1  # in place of a station's number: one that was never heard
