@@ -14,6 +14,7 @@ from torch import Tensor
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
+from gsparc.field.readout import Readout
 from gsparc.training.processes import largest, total
 from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
 from gsparc.training.tracking import log_event
@@ -80,8 +81,8 @@ class Densify(Checked, L.Callback):
             radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
             self.statistics["radius"] = largest(torch.maximum(self.statistics["radius"], radius.float()))
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
-        """Edit the field when the schedule says so."""
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """Edit the field when the schedule says so: before a step, so that the look after the last was before."""
         step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
         if step is None or not due(step, module.global_step, *when, module.total_steps):
             return
@@ -91,14 +92,24 @@ class Densify(Checked, L.Callback):
         with torch.no_grad():
             # Draws are a pure function of (seed, step): a resumed run makes the same children.
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
-            planned = self.plan(model, draws)
+            planned = self.plan(model, draws, in_place=module.solved)
             before = len(model.gaussians)
+            rendered = Readout.of(model, module.batch.rx) if module.solved else None
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
+            if rendered is not None:
+                rendered.solve_again(model, module.batch.rx)
             self.statistics = self._blank(model)
         _log_edit(trainer, module, planned, before, step)
 
-    def plan(self, model: GaussianModel, generator: torch.Generator) -> edit.Edit:
-        """Decide what to clone, split and prune from the statistics gathered so far."""
+    def plan(self, model: GaussianModel, generator: torch.Generator, in_place: bool = False) -> edit.Edit:
+        """Decide what to clone, split and prune from the statistics gathered so far.
+
+        Args:
+            model: the field.
+            generator: of the places of children.
+            in_place: children stay where the parent was, as large, and let through together what it did, so
+                that the field renders as before: for emissions that were solved for it.
+        """
         gaussians = model.gaussians
         mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp_min(1)
         under_reconstructed = mean_gradient >= self.grad_threshold
@@ -112,12 +123,15 @@ class Densify(Checked, L.Callback):
         prune = self._keep_at_least(prune, gaussians.opacities)
 
         room = max(self.max_gaussians - int((~prune).sum()), 0)
-        cost = torch.where(large, self.children - 1, 1)
+        cost = torch.where(large | in_place, self.children - 1, 1)
         chosen = self._strongest(under_reconstructed & ~prune, mean_gradient, cost, room)
-        clone, split = chosen & ~large, chosen & large
+        clone, split = (chosen & ~large, chosen & large) if not in_place else (chosen & False, chosen)
         clones = clone.nonzero().squeeze(1)
         splits = split.nonzero().squeeze(1).repeat_interleave(self.children)
         parents = torch.cat([clones, splits])
+        if in_place:
+            apart = -torch.expm1(torch.log1p(-gaussians.opacities[splits]) / self.children)
+            return edit.Edit(~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(apart)})
         smaller = gaussians.log_scales[splits] - math.log(0.8 * self.children)
         scales = torch.cat([gaussians.log_scales[clones], smaller])
         spread = _sample_inside(gaussians.scales[splits], gaussians.quats[splits], generator)

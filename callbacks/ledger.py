@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
 
-COLUMNS = ("step", "train_s", "num_gaussians", "train/task_loss", "val/ssim_gauss", "val/psnr_db", "val/mse")
+from gsparc.training import curve
 
 
 class CostLedger(L.Callback):
     """A stopwatch that runs only while the model learns, and the learning curve against it.
 
-    Args:
-        file: name of the curve's CSV file in the run directory; a row per validation.
+    `learning_curve.csv` in the run directory has a row per validation, the first before the first step.
     """
 
-    def __init__(self, file: str = "learning_curve.csv") -> None:
-        self.file = file
+    def __init__(self) -> None:
         self.seconds = 0.0
+        self._rows: list[dict[str, Any]] = []
         self._running_since: float | None = None
 
     @staticmethod
@@ -62,7 +59,10 @@ class CostLedger(L.Callback):
         return self.seconds + running
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Start the watch."""
+        """Start the watch; the curve of an interrupted run ends with the checkpoint that it goes on from."""
+        if trainer.is_global_zero and trainer.global_step:
+            self._rows = [row for row in self._rows if int(row["step"]) <= trainer.global_step]
+            curve.write(module.run_dir, self._rows)
         self._start()
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
@@ -79,37 +79,28 @@ class CostLedger(L.Callback):
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         """Write a row of the learning curve and go on."""
-        if trainer.sanity_checking:
-            return
-        if trainer.is_global_zero:
+        fitting = trainer.state.fn == "fit"
+        if trainer.is_global_zero and fitting and module.figures:
             self._note(trainer, module)
-        if trainer.state.fn == "fit":
+        if fitting and not trainer.sanity_checking:
             self._start()
 
     def _note(self, trainer: L.Trainer, module: Any) -> None:
-        figures = {key: float(value) for key, value in trainer.callback_metrics.items()}
-        row = {key: figures.get(key, "") for key in COLUMNS}
-        row |= {
-            "step": trainer.global_step,
-            "train_s": round(module.prepared_seconds + self.seconds, 3),
-            "num_gaussians": int(figures.get("model/num_gaussians", 0)),
-        }
-        self._append(module.run_dir / self.file, row)
-
-    @staticmethod
-    def _append(path: Path, row: dict[str, Any]) -> None:
-        fresh = not path.exists()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            if fresh:
-                writer.writeheader()
-            writer.writerow(row)
+        step, loss = trainer.global_step, trainer.callback_metrics.get("train/task_loss")
+        shown = {name: value for name, value in module.figures.items() if name in curve.FIGURES}
+        row = curve.point(
+            module.prepared_seconds + self.seconds, f"step {step}" if step else module.start,
+            module.figures["val/error"], step, num_gaussians=module.count,
+            **shown, **({} if loss is None else {"train/task_loss": float(loss)}),
+        )  # fmt: skip
+        self._rows.append(row)
+        curve.write(module.run_dir, self._rows)
+        curve.log(trainer.loggers, row)
 
     def state_dict(self) -> dict[str, Any]:
-        """The time so far, so that a resumed run keeps counting."""
-        return {"seconds": self.elapsed()}
+        """The time and the curve so far, so that a resumed run goes on with both."""
+        return {"seconds": self.elapsed(), "rows": list(self._rows)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on counting."""
-        self.seconds = float(state["seconds"])
+        self.seconds, self._rows = float(state["seconds"]), list(state["rows"])

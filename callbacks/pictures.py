@@ -12,6 +12,7 @@ import torch
 from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.pictures import draw_spectra
+from gsparc.training.schedule import INTERVAL, in_steps
 from gsparc.training.tracking import picture
 
 
@@ -20,11 +21,11 @@ class Pictures(Checked, L.Callback):
     """Draw a few validation rows; without any, nothing, because training rows flatter.
 
     Args:
-        every: steps between pictures; the last step is always drawn.
+        every: steps between pictures, or a share of all; the last step is always drawn.
         count: number of rows drawn.
     """
 
-    every: int = setting(1000, whole(1))
+    every: int | float = setting(0.5, INTERVAL)
     count: int = setting(4, whole(1))
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
@@ -32,7 +33,8 @@ class Pictures(Checked, L.Callback):
         step = trainer.global_step
         if not trainer.is_global_zero:
             return
-        if (step % self.every and step != trainer.max_steps) or module.site.kind != "spectrum":
+        every = in_steps(self.every, module.total_steps)
+        if (step % every and step != trainer.max_steps) or module.site.kind != "spectrum":
             return
         data = trainer.datamodule  # type: ignore[attr-defined]
         candidates = data.fold.val

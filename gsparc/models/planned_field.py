@@ -154,8 +154,7 @@ class PlannedField(LearnedField):
         if not self.settings.field.count:
             self.most_steps = 0
         choices, _ = resolve(self.settings, self.init.name, data.site)
-        steps = total_steps(context) if self.most_steps is None else self.most_steps
-        steps = 0 if choices.closed_form and self.closed_forms_end else steps
+        steps = total_steps(context, len(fold.train), self.most_steps, choices.closed_form)
         log.info(
             "training %s by rendering: %d Gaussians, terms %s, init=%s, at most %d steps; callbacks %s",
             GaussianModule.__name__, self.settings.field.count, self.effects, choices.init, steps,
@@ -171,7 +170,7 @@ class PlannedField(LearnedField):
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
-        log.info("%d Gaussians, %d gradient steps kept", self.size(), self.steps)
+        log.info("%d Gaussians, %d of %d gradient steps kept", super().size(), self.steps, self.steps_taken)
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}

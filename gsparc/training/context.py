@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from gsparc.data.splits import FileSettings, SplitSettings
+from gsparc.training import curve
 from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import NOTHING, Clock, Spent, TimeBudget
 
@@ -100,6 +101,14 @@ class FitContext:
     def within(self, folder: str, **changes: Any) -> FitContext:
         """The context of a part of the fit, which may write to a folder of its own in `run_dir`."""
         return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
+
+    def curve(
+        self, seconds: float, what: str, error: float | None = None, step: int | None = None, **figures: Any
+    ) -> None:
+        """Add a point to the learning curve of this fit, in its folder and in the loggers; see `curve.point`."""
+        row = curve.point(seconds, what, error, step, **figures)
+        curve.write(self.run_dir, [*curve.read(self.run_dir), row])
+        curve.log(self.loggers, row)
 
     def time_budget(self, seconds: float | None = None, before: Spent = NOTHING) -> TimeBudget:
         """So many seconds of this context's clock (None: `budget_s`, or no end), some spent before."""

@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 TAKEN = "steps/taken"
 KEPT = ("steps/kept", "steps/kept_position")
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
+LOOKS = 10  # validations of a training, where the Trainer is given no interval
+STEPS, AFTER_CLOSED_FORM = 400, 60  # where neither model nor Trainer is given a number
 
 # What conf/trainer/cpu.yaml says, for callers from Python.
 DEFAULTS = partial(
@@ -41,9 +43,6 @@ DEFAULTS = partial(
     devices=1,
     strategy="auto",
     precision="32-true",
-    max_steps=400,
-    val_check_interval=100,
-    num_sanity_val_steps=0,
     enable_progress_bar=False,
     enable_model_summary=False,
 )
@@ -57,23 +56,40 @@ class Ran:
         seconds: that it took, validations too [s].
         steps: whose result is kept.
         position: of that in the schedule [steps]; None where nothing was kept back.
+        taken: steps in all.
+        timed_out: whether `trainer.max_time` ended it.
     """
 
     seconds: float
     steps: int
     position: int | None
+    taken: int = 0
+    timed_out: bool = False
 
 
-def total_steps(context: FitContext) -> int:
-    """Steps that schedules are written for.
+def total_steps(context: FitContext, rows: int, own: int | None = None, closed_form: bool = False) -> int:
+    """Return the steps that schedules are written for: the Trainer's, else the model's, else the usual ones.
+
+    Args:
+        context: of the fit; `trainer.max_steps` and `trainer.max_epochs` win over all others.
+        rows: that are learned from, for epochs.
+        own: as the model is configured; None: `STEPS`, or `AFTER_CLOSED_FORM`.
+        closed_form: whether training starts from a solution.
 
     Raises:
-        ValueError: the Trainer is given no number of steps.
+        ValueError: the Trainer is given what is no number of steps.
     """
-    steps = (context.trainer or DEFAULTS).keywords.get("max_steps", -1)
-    if type(steps) is not int or steps < 1:
-        raise ValueError(f"trainer.max_steps={steps!r}: a whole number of at least 1 is needed")
-    return steps
+    options = (context.trainer or DEFAULTS).keywords
+    steps, epochs = options.get("max_steps"), options.get("max_epochs")
+    for name, value in (("max_steps", steps), ("max_epochs", epochs)):
+        if value is not None and (type(value) is not int or value < 0):
+            raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or null")
+    size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
+    given = [*([] if steps is None else [steps]), *([] if epochs is None else [epochs * -(-rows // size)])]
+    if given:
+        return min(given)
+    usual = AFTER_CLOSED_FORM if closed_form else STEPS
+    return usual if own is None else own
 
 
 class ReturnMetrics(L.Callback):
@@ -88,8 +104,10 @@ class _Stopped(BaseException):
     """Ends training from inside; Lightning would turn a KeyboardInterrupt into an exit without a word."""
 
 
-class StopBetweenSteps(L.Callback):
+class StopBetweenSteps(L.callbacks.Checkpoint):
     """An interrupt waits for the end of the step, so that the checkpoint it leaves is a whole state.
+
+    The last step leaves one, too.
 
     In several processes it does not wait, nor does a second one: the checkpoint before is what is left.
 
@@ -109,6 +127,10 @@ class StopBetweenSteps(L.Callback):
         if self.requested:
             trainer.save_checkpoint(self.file)
             raise _Stopped
+
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Leave the state after the last step."""
+        trainer.save_checkpoint(self.file)
 
     @contextmanager
     def handling_interrupts(self) -> Iterator[None]:
@@ -131,7 +153,7 @@ class StopBetweenSteps(L.Callback):
 
 def run_stage(
     module: GaussianModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
-    budget: TimeBudget, watch: Sequence[L.Callback] = (), validate_every: int | None = None,
+    budget: TimeBudget, watch: Sequence[L.Callback] = (),
 ) -> Ran:  # fmt: skip
     """Train `module` on `fold.train`, watching `fold.val`.
 
@@ -141,7 +163,6 @@ def run_stage(
         checkpoints: how `last.ckpt` is written.
         budget: of the fit, running.
         watch: callbacks that say which steps are kept.
-        validate_every: steps between validations; None: as the Trainer is configured.
 
     Raises:
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
@@ -160,29 +181,28 @@ def run_stage(
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
-    every = validate_every or make.keywords.get("val_check_interval")
-    every = every if type(every) is int else LOG_EVERY
+    given = make.keywords.get("val_check_interval")
+    every = given if type(given) is int else max(1, module.total_steps // LOOKS)
     module.log_every = math.gcd(LOG_EVERY, every)  # a validation sees the figures of its own step
     per_epoch = max(1, len(fold.train) // batches.batch_size)
     options: dict[str, Any] = {
         "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
         "check_val_every_n_epoch": None,  # validations are counted in steps
+        "val_check_interval": every if given is None else given,
+        "num_sanity_val_steps": -1,  # all validation rows, before the first step: where the curve begins
     }
-    if validate_every is not None:
-        options["val_check_interval"] = validate_every
     if not len(fold.val):
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     options["max_steps"] = module.total_steps if pace is None else -1
+    options["max_epochs"] = -1
     processes = Processes.named(make.keywords.get("strategy"))
     if processes is not None:
         options["strategy"] = processes
     trainer = make(
-        max_epochs=-1,
         callbacks=[*callbacks, ReturnMetrics(), stop],
         logger=list(context.loggers) or False,
         plugins=[checkpoints],
         default_root_dir=folder,
-        enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
         **options,
     )
     if trainer.world_size > 1 and processes is None:
@@ -202,7 +222,12 @@ def run_stage(
     more = Spent(*metrics[SPENT].tolist()) - budget.counted  # of other processes, and of an earlier run
     budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
     steps, position = (int(metrics[name]) if name in metrics else None for name in KEPT)
-    return Ran((budget.counted - before).wall, int(metrics[TAKEN]) if steps is None else steps, position)
+    taken = int(metrics[TAKEN])
+    timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]
+    timed_out = any((timer.time_remaining() or 0) <= 0 for timer in timers)
+    if timed_out:
+        log.warning("trainer.max_time ended training after %d of %d steps", taken, module.total_steps)
+    return Ran((budget.counted - before).wall, taken if steps is None else steps, position, taken, timed_out)
 
 
 def _lost(error: ProcessException, advice: str) -> str:

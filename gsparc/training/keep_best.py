@@ -1,4 +1,4 @@
-"""Gradient steps that pay: parameters of the best validation are kept, and steps end when none is better."""
+"""Steps that pay: of all looks at validation rows the best is kept, the one before the first step among them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import lightning.pytorch as L
 import torch
+from torch import Tensor
 
 from gsparc.field import edit
 from gsparc.training.fit import KEPT
@@ -16,86 +17,72 @@ from gsparc.training.processes import agreed
 
 log = logging.getLogger(__name__)
 
-PATIENCE = 0.25  # of the schedule without a better validation: an opacity reset takes some of it to recover
-SHORT = 0.1  # the same after a closed-form start, and the share between validations
-LEAST_GAIN = 1e-3  # of the error, for a validation to count as better
+SURE = 2.0  # standard errors of paired rows by which a look must be better than the start
 
 
 class KeepBest(L.Callback):
-    """Looks before the first step and at every validation; restores the best when training ends.
+    """Restores the parameters of the best look when training ends; it does not end training.
 
-    Args:
-        patience: share of the schedule without a better validation that ends training.
+    A look is kept where the error of its rows is below that of the same rows before the first step by two
+    standard errors, and below that of all looks before it.
 
     Attributes:
         position: of the kept parameters in the schedule [steps]; 0: as they were before the first.
         step: the number of steps taken until then.
     """
 
-    def __init__(self, patience: float = PATIENCE) -> None:
-        self.patience, self.error = patience, float("inf")
+    def __init__(self) -> None:
+        self.error = float("inf")
         self.step = self.position = 0
+        self.start = torch.zeros(0)  # errors of the rows before the first step (n,)
         self._kept: dict[str, Any] | None = None
-        self._looked_at = -1  # step
-
-    def on_train_start(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """What the initialiser has reached."""
-        if self._kept is None:
-            self._measure(trainer, module)
-            if self._kept is not None:
-                for logger in trainer.loggers:  # where the learning curve begins
-                    logger.log_metrics({"val/error": self.error}, step=0)
-
-    def _measure(self, trainer: L.Trainer, module: GaussianModule) -> None:
-        data = trainer.datamodule  # type: ignore[attr-defined]
-        if len(data.fold.val):
-            with torch.no_grad():
-                parts = [(len(b), module.error(b.to(module.device)).mean()) for b in data.val_dataloader()]
-            error = sum(n * float(e) for n, e in parts) / sum(n for n, _ in parts)
-            self._look(module, agreed(error, trainer), trainer.global_step)
 
     def on_validation_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """Keep what is better; end training when nothing was for long."""
-        if trainer.sanity_checking or trainer.state.fn != "fit":
+        """Keep what is better; the look before the first step is Lightning's sanity check."""
+        if trainer.state.fn != "fit" or not len(module.held_out):
             return
-        error = agreed(float(trainer.callback_metrics["val/error"]), trainer)
-        self._look(module, error, trainer.global_step)
-        if module.position - self.position >= self.patience * module.total_steps:
-            trainer.should_stop = True
-
-    def _look(self, module: GaussianModule, error: float, step: int) -> None:
-        self._looked_at = step
-        if error < (1 - LEAST_GAIN) * self.error:
-            self.error, self.step, self.position = error, step, module.position
+        error = agreed(float(module.held_out.mean()), trainer)
+        if trainer.sanity_checking:
+            self.start = module.held_out
+        surely = agreed(float(_surely_less(module.held_out, self.start)), trainer)
+        if trainer.sanity_checking or (error < self.error and surely):
+            self.error, self.step, self.position = error, trainer.global_step, module.position
             self._kept = copy.deepcopy(module.model.state_dict())
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Back to the best; also after a checkpoint with every step done."""
-        if self._looked_at != trainer.global_step:  # a checkpoint is written before its step's validation
-            self._measure(trainer, module)
         if self._kept is None:
             return
         for name, value in zip(KEPT, (self.step, self.position), strict=True):  # also from another process
             trainer.callback_metrics[name] = torch.tensor(value, dtype=torch.float64)
-        if self.step == trainer.global_step:
+        taken = trainer.global_step
+        if self.step == taken:
             return
         model = module.model
         edit.resize(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
-        steps = trainer.global_step
         log.info(
-            "gradient steps: %d taken, %s kept: what came after was no better on validation rows",
-            steps, f"the first {self.step}" if self.step else "none",
+            "gradient steps: %d taken, %s kept: what came after was not surely better on %d validation rows",
+            taken, f"the first {self.step}" if self.step else "none", len(self.start),
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
         """What is kept, so that a resumed run ends with it, too."""
-        return {"error": self.error, "step": self.step, "position": self.position, "kept": self._kept}
+        names = ("error", "step", "position", "start")
+        return {**{name: getattr(self, name) for name in names}, "kept": self._kept}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on."""
         self.error, self.step, self.position = state["error"], state["step"], state["position"]
-        self._kept = state["kept"]
+        self.start, self._kept = state["start"], state["kept"]
+
+
+def _surely_less(errors: Tensor, start: Tensor) -> bool:
+    """Whether errors (n,) are below those of the start (n,) by `SURE` standard errors of their differences."""
+    if len(errors) != len(start) or len(errors) < 2:
+        return len(errors) != len(start)  # a training without a look before its first step keeps the least
+    gain = start - errors
+    return bool(gain.mean() > SURE * gain.std() / len(gain) ** 0.5)
 
 
 class StopAt(L.Callback):

@@ -67,7 +67,11 @@ class GaussianModule(L.LightningModule):
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
         self.solved = False  # whether training starts from emissions in closed form
+        self.start = "start"  # what the learning curve calls its first point
         self.log_every = 1  # steps; a figure costs as much as a kernel to log
+        self.held_out = torch.zeros(0)  # squared error of each validation row (n,), at the last look
+        self.figures: dict[str, float] = {}  # of all validation rows, at the last look
+        self._looks: list[tuple[Tensor, dict[str, Tensor]]] = []
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
 
@@ -148,7 +152,8 @@ class GaussianModule(L.LightningModule):
         if batch.mask is not None:
             mean = torch.where(batch.mask, mean, batch.target)
         size = len(batch)
-        figures = {"val/error": squared_error(mean, batch, str(self.site.kind)).mean()}
+        errors = squared_error(mean, batch, str(self.site.kind))
+        figures = {"val/error": errors.mean()}
         error = (mean - batch.target).abs().square().flatten(1).mean(1)
         if self.site.kind != "spectrum":
             figures["val/mse"] = error.mean()
@@ -156,9 +161,25 @@ class GaussianModule(L.LightningModule):
             if holds_window(mean):
                 figures["val/ssim_gauss"] = ssim(mean, batch.target).mean()
             figures["val/psnr_db"] = (-10 * error.clamp_min(1e-12).log10()).mean()
+        self._looks.append((errors, figures))
         self.log_dict(figures, batch_size=size, prog_bar=True)
         # Dashboards get the seconds beside every figure too.
         self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
+
+    def on_validation_epoch_start(self) -> None:
+        """Begin a look."""
+        self._looks = []
+
+    def on_validation_epoch_end(self) -> None:
+        """Keep the errors of all rows and their figures: Lightning drops those of the look before step 1."""
+        if not self._looks:
+            return
+        self.held_out = torch.cat([errors for errors, _ in self._looks]).double().cpu()
+        share = [len(errors) / len(self.held_out) for errors, _ in self._looks]
+        every = [figures for _, figures in self._looks]
+        self.figures = {
+            name: sum(part * float(one[name]) for part, one in zip(share, every, strict=True)) for name in every[0]
+        }
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:
         """Targets (B, ...) in stored units, spectra within [0, 1]."""

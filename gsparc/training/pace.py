@@ -52,7 +52,7 @@ class Budget(L.Callback):
     """Counts the seconds of a stage, validations too, and ends it with its pace.
 
     Args:
-        pace: told after every step; None where steps decide.
+        pace: told after every step; None where steps decide, and the budget only ends them.
         budget: running, with all that was spent before.
     """
 
@@ -69,6 +69,8 @@ class Budget(L.Callback):
         if self.pace is not None:
             self.pace.spend(agreed(self._learned.by(self.budget.clock) + self._validating, trainer))
             trainer.should_stop = trainer.should_stop or self.pace.over
+        elif agreed(float(self.budget.over()), trainer):
+            trainer.should_stop = True
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
         """Of several processes each has a processor time of its own."""

@@ -158,7 +158,7 @@ def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
     values = run.curve.get(f"val/{figure}")
     if values is not None and np.isfinite(values).any():
         known = np.isfinite(values)
-        return run.curve["train_s"][known], values[known]
+        return run.curve["seconds"][known], values[known]
     end, value = number(run.facts.get("time/train_s")), run.figure_of(figure)
     if end is None or value is None:
         return np.zeros(0), np.zeros(0)

@@ -15,12 +15,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.inner_folds import cut_inside
-from gsparc.data.limits import check_arguments, or_null, or_word, switch, whole
+from gsparc.data.limits import check_arguments, or_word, switch, whole
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
 from gsparc.field import edit
-from gsparc.field.confidence import Confidence, ConfidenceSettings
+from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel, fit_errors
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
@@ -41,8 +41,8 @@ from gsparc.models.splat.closed_form import prepare
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.fit import run_stage, total_steps
-from gsparc.training.keep_best import SHORT, KeepBest, StopAt
-from gsparc.training.module import GaussianModule, LossSettings
+from gsparc.training.keep_best import KeepBest, StopAt
+from gsparc.training.module import GaussianModule, LossSettings, squared_error
 from gsparc.training.optimizer import OptimizerSettings
 from gsparc.training.pace import Pace
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
@@ -64,9 +64,9 @@ class LearnedField(Method):
         name: as it appears in tables.
         init: where Gaussians come from; `auto` solves the emission in closed form where it can.
         refit: after validation, train again on training and validation rows together.
-        keep_best: end with the parameters of the best validation, and end early when none is better.
-        steps: of gradient, at most, where it is rendered; None: `trainer.max_steps`; `auto`: none after a
-            start in closed form, which they did not better on held-out rows, else `trainer.max_steps`.
+        keep_best: end with the parameters of the best look at validation rows, the start among them.
+        steps: of gradient, where `trainer.max_steps` and `trainer.max_epochs` give none; `auto`: 60 after a
+            start in closed form, else 400. 0 of either is the start alone.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
@@ -91,18 +91,17 @@ class LearnedField(Method):
         init: InitSettings | None = None,
         refit: bool = True,
         keep_best: bool = True,
-        steps: int | Literal["auto"] | None = "auto",
+        steps: int | Literal["auto"] = "auto",
         guesses: Sequence[str] = (),
     ) -> None:
         check_arguments(
-            locals(), refit=switch(), keep_best=switch(), steps=or_null(or_word(whole(0), "auto"))
+            locals(), refit=switch(), keep_best=switch(), steps=or_word(whole(0), "auto")
         )
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
         self.refit, self.guesses = refit, tuple(guesses)
         self.keep_best, self.most_steps = keep_best, None if steps == "auto" else steps
-        self.closed_forms_end = steps == "auto"
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self.choices: Choices | None = None
@@ -110,7 +109,7 @@ class LearnedField(Method):
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
         self._paying: int | None = None  # position in the schedule after which steps did not pay
-        self.steps = 0  # of gradient, of the last stage
+        self.steps = self.steps_taken = 0  # of gradient: kept in the last stage, and taken in the first
         self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._billed = Spent()  # for reusable work, by the stages so far
         self.frozen: FrozenView | FrozenArray | None = None
@@ -124,8 +123,10 @@ class LearnedField(Method):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
 
-        The second stage (`refit`) trains again on both with the confidence fixed, because the baselines
-        learn from all of them. Without steps (`steps=0`) both are solved at once.
+        A start in closed form is step 0, with the same looks at validation rows as every later step. Where it
+        stays the best, it is solved again on all rows, and that is the result. Where steps are kept, a second
+        stage (`refit`) takes as many on training and validation rows together, because the baselines learn
+        from all of them, with the confidence of the first.
         """
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
         if data.site.kind == "csi":
@@ -142,58 +143,75 @@ class LearnedField(Method):
         budget = context.time_budget(before=Spent(*marks.get("spent", ())))
         now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
+        self.steps_taken = int(marks.get("taken", 0))
         self.spent, self._apart = {}, _apart(data, fold)
         self._left_out = LeftOut.of(
             marks.get("left_out")
         )  # the initialiser of an interrupted run is not repeated
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
-        if self._told_by_few(fold) and not self.choices.closed_form:
-            fold = _more_told(data, fold, context)
-        if self._solved(fold):
-            if self.refit:
-                fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
-            self._stage("train", origin, data, fold, context, budget, seconds)
-            self._weigh_process(data, fold)
-            self.frozen = self._doubled = None
-            return FitReport(budget.counted.wall, limited_by=self._limited_by)
+        solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
+        watched = _more_told(data, fold, context) if few else fold
+        steps = total_steps(context, len(watched.train), self.most_steps, solved)
+        watching = not self.keep_best or len(watched.val) > 0 or not solved
         if stage == "train":
-            seconds += self._stage("train", origin, data, fold, context, budget, seconds)
-            self._calibrate(data, fold)
-            self._weigh_process(data, fold)
+            if steps and watching:
+                seconds += self._stage("train", origin, data, watched, context, budget, seconds, steps)
+            if solved and (few or not watching):
+                self._paying = 0  # by so few rows steps would be chosen by chance
+            if solved and (self._paying == 0 or not steps):
+                return self._end_with_start(origin, data, fold, context, budget, seconds)
+            if not steps:
+                self._stage("train", origin, data, watched, context, budget, seconds, 0)
+            self._calibrate(data, watched)
+            self._weigh_process(data, watched)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
-        if self.refit and len(fold.val) and self._pays():
-            every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+        if self.refit and len(watched.val) and self._pays():
+            every = Fold(np.sort(np.concatenate([watched.train, watched.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
             again = context.within("refit", resume=resume)
-            confidence = self.fitted().confidence
-            self._stage("refit", origin, data, every, again, budget, seconds, confidence)
+            known = self.fitted().confidence, self.fitted().error
+            self._stage("refit", origin, data, every, again, budget, seconds, steps, *known)
+        return self._ended(context, budget)
+
+    def _end_with_start(
+        self, origin: Origin, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, seconds: float
+    ) -> FitReport:
+        """Solve the start again on all rows: no step was surely better, or none was asked for."""
+        every = np.sort(np.concatenate([fold.train, fold.val]))
+        fold = Fold(every, fold.val[:0], fold.test) if self.refit else fold
+        self.steps, again = 0, replace(context, resume=None)
+        self._stage("final", origin, data, fold, again, budget, seconds, 0)
+        self._weigh_process(data, fold)
+        return self._ended(context, budget)
+
+    def _ended(self, context: FitContext, budget: TimeBudget) -> FitReport:
         self.frozen = self._doubled = None
+        what = f"final, {self.steps} of {self.steps_taken} steps kept"
+        context.curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
         return FitReport(budget.counted.wall, limited_by=self._limited_by)
 
     def _pays(self) -> bool:
         """Whether another stage is worth its seconds."""
         return True
 
-    def _solved(self, fold: Fold) -> bool:
-        """Whether a closed-form start is the answer: few validation rows choose steps by chance."""
-        assert self.choices is not None
-        ends = self.most_steps == 0 or self.closed_forms_end
-        return self.choices.closed_form and (ends or self._told_by_few(fold))
-
-    def _told_by_few(self, fold: Fold) -> bool:
-        return self.keep_best and len(fold.val) < LEAST_TOLD
-
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
-        budget: TimeBudget, earlier_s: float, confidence: Confidence | None = None,
+        budget: TimeBudget, earlier_s: float, steps: int,
+        confidence: Confidence | None = None, error: ErrorModel | None = None,
     ) -> float:  # fmt: skip
-        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
+        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s].
+
+        Args:
+            stage: `train`, `refit` or `final`, which takes no steps.
+            steps: of the schedule.
+            confidence, error: of an earlier stage, told by rows that this one learns from.
+        """
         folder, resume = context.run_dir, context.resume
         L.seed_everything(context.seed, verbose=False)
         started = budget.counted
         assert self.choices is not None
-        if context.init_from is not None and resume is None and stage == "train":
+        if context.init_from is not None and resume is None:
             self._start_from(data.site, context.init_from)
         elif resume is None:
             start = prepare(
@@ -215,49 +233,54 @@ class LearnedField(Method):
             self.restore(data.site, checkpoint.read(resume).state)
         if confidence is not None:
             self.fitted().confidence = confidence.requires_grad_(False)
+        if error is not None:
+            self.fitted().error = error
         prepared = (budget.counted - started).wall
         self.init_s = (self.init_s or 0.0) + prepared
         again = "" if stage == "train" else " again, on all rows"
         self.spent["initialiser" + again] = prepared
-        if stage == "train" and self._solved(fold):
+        if not steps:
             return prepared
-        steps, pace = total_steps(context) if self.most_steps is None else self.most_steps, None
-        if context.budget_s is not None:
+        pace = None
+        if context.budget_s is not None and self.choices.closed_form:
+            if budget.over():
+                log.info("budget_s=%.3g: none is left for gradient steps", context.budget_s)
+                self._paying = 0 if stage == "train" else self._paying
+        elif context.budget_s is not None:
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
             end = context.budget_s * 0.5 if first else context.budget_s - self._reserve_s
             pace = Pace(steps, end - budget.spent)
             if pace.budget_s <= 0 and self._paying != 0:
-                blind = stage == "train" and self.keep_best and self.choices.closed_form
-                self._paying = 0 if blind else self._paying  # nothing shows that steps would gain
                 log.warning(
                     "budget_s=%.3g: %.1f of %.3g s went before the first step of stage %s (preparation, "
-                    "earlier stages), which has %s; give more",
-                    context.budget_s, budget.spent, end, stage, "none" if blind else "one step",
+                    "earlier stages), which has one step; give more",
+                    context.budget_s, budget.spent, end, stage,
                 )  # fmt: skip
         if self._paying == 0:
             self.steps = 0
             return prepared
         module = self.module(steps, folder, pace)
         module.prepared_seconds, module.solved = earlier_s + prepared, self.choices.closed_form
+        module.start = f"init={self.choices.init}" + (", closed form" if module.solved else "")
         marks = {
             "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
             "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
+            "taken": self.steps_taken,
             "left_out": None if self._left_out is None else self._left_out.state(), **origin.marks(),
         }  # fmt: skip
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         watch: list[L.Callback] = []
-        every = None
         if self.keep_best and stage == "train":
-            assert self.choices is not None
-            watch.append(KeepBest(SHORT) if self.choices.closed_form else KeepBest())
-            every = max(1, round(SHORT / 2 * steps)) if self.choices.closed_form else None
+            watch.append(KeepBest())
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
-        ran = run_stage(module, data, fold, context, files, budget, watch, every)
+        ran = run_stage(module, data, fold, context, files, budget, watch)
         self.steps = ran.steps
         self.spent["gradient steps" + again] = ran.seconds
+        if ran.timed_out or budget.limited:
+            self._limited_by = less_repeatable(self._limited_by, "wall" if ran.timed_out else budget.clock)
         if stage == "train":
-            self._paying = ran.position
+            self._paying, self.steps_taken = ran.position, ran.taken
         return prepared + ran.seconds
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
@@ -265,7 +288,9 @@ class LearnedField(Method):
 
     def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
         """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
-        return GaussianModule(self.fitted(), self.loss, self.rates, steps, run_dir, pace)
+        solved = self.choices is not None and self.choices.closed_form
+        rates = self.rates.after_closed_form(steps) if solved else self.rates
+        return GaussianModule(self.fitted(), self.loss, rates, steps, run_dir, pace)
 
     def _start_from(self, site: Site, path: Path) -> None:
         """Take the weights of another model of this site; what is learned anew are these rows.
@@ -296,11 +321,19 @@ class LearnedField(Method):
         settings, transmitter = settled(self.settings, self.choices), self._ends.get("tx_position")
         return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
 
+    @torch.no_grad()
     def _calibrate(self, data: Measurements, fold: Fold) -> None:
+        """Fit what tells errors on validation rows, which steps did not learn from."""
         model = self.fitted()
         rows = fold.val if len(fold.val) else fold.train
         if model.confidence is not None:
             model.confidence.calibrate(torch.from_numpy(np.asarray(data.moving[rows], dtype=np.float32)))
+        if model.error is not None and len(fold.val) >= LEAST_HELD:
+            batch = data.batch(fold.val)
+            result = model(batch.tx, batch.rx)
+            assert result.unknown is not None
+            error = squared_error(result.mean.clamp(0, 1), batch, "spectrum")
+            model.error.set(*fit_errors(result.unknown.numpy(), error.double().numpy()))
 
     # -- answering ---------------------------------------------------------------------------------
 

@@ -1,0 +1,28 @@
+"""The state of a training as `last.ckpt`, to go on from after an interruption."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import lightning.pytorch as L
+
+from gsparc.data.limits import Checked, setting
+from gsparc.training.schedule import INTERVAL, in_steps
+
+
+@dataclass(eq=False)
+class Checkpoint(Checked, L.callbacks.Checkpoint):  # Lightning calls it after all other callbacks
+    """Write the state every `interval` steps, or share of all steps; after the last step it always is.
+
+    Args:
+        interval: steps between two; below 1 a share of all steps.
+    """
+
+    interval: int | float = setting(0.25, INTERVAL)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """Write when the schedule says so."""
+        step = module.schedule_step(self.interval)
+        if step and step % in_steps(self.interval, module.total_steps) == 0 and step < module.total_steps:
+            trainer.save_checkpoint(module.run_dir / "last.ckpt")
