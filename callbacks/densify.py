@@ -82,7 +82,7 @@ class Densify(Checked, L.Callback):
             self.statistics["radius"] = largest(torch.maximum(self.statistics["radius"], radius.float()))
 
     def on_train_batch_start(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
-        """Edit the field when the schedule says so: before a step, so that the look after the last was before."""
+        """Edit the field when the schedule says so, after the validation of the step before."""
         step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
         if step is None or not due(step, module.global_step, *when, module.total_steps):
             return

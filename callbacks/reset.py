@@ -45,7 +45,7 @@ class OpacityReset(Checked, L.Callback):
             log.info("no opacity reset in fewer than %d steps (least_steps)", self.least_steps)
 
     def on_train_batch_start(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
-        """Reset when the schedule says so: before a step, so that the look after the last one was before."""
+        """Reset when the schedule says so, after the validation of the step before."""
         step = module.schedule_step(self.interval)
         if step is None or module.solved or module.total_steps < self.least_steps:
             return

@@ -24,6 +24,7 @@ from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
 SLOWEST_BATCH_MS = 20_000.0  # of one batch, from single queries; slower methods are not timed in batches
+FIELD = "field"  # Gaussians of the evaluated method, without the process that they are mixed with
 OWN = "self"  # the evaluated method's name among the timed ones; baselines may carry the same name as it
 
 
@@ -79,6 +80,10 @@ def evaluate(
     others = {name: baseline(name, data, split, eval_on, cache) for name in names}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
+    alone = [method.field_alone() for method in methods]
+    fields = [one for one in alone if one is not None]
+    if len(fields) == len(methods):
+        every[FIELD] = score(fields, data, split, eval_on)
     for stem, one in every.items():
         own = {**pooled(one, data, split), "skill": _skill(one, others)}
         facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
@@ -92,6 +97,8 @@ def evaluate(
     facts["time/train_s"] = None if seconds is None else float(np.mean(seconds))
     facts["time/train_total_s"] = None if seconds is None else float(sum(seconds))
     contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
+    if FIELD in every:
+        contenders[FIELD], facts[f"{FIELD}/train_s"] = fields[0], facts["time/train_s"]
     facts |= timing.machine_facts()
     facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock)
     first = methods[0]
@@ -147,7 +154,7 @@ def latencies(
         ),
     }
     for name in methods:
-        room = "time" if name == OWN else f"baseline/{name}"
+        room = {OWN: "time", FIELD: FIELD}.get(name, f"baseline/{name}")
         p50, p95 = percentiles(one[name])
         facts |= {
             f"{room}/render_ms_p50": p50,

@@ -82,8 +82,10 @@ def result_rows(
     wanted = [(name, form_of(name)) for name in (*TABLES[facts["dataset/kind"]], "skill")]
     names = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")})
     names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
-    rows = []
-    for name, figures, times in [*((n, *[f"baseline/{n}"] * 2) for n in names), (method, prefix, "time")]:
+    rows, own = [], [(method, prefix, "time")]
+    if f"field/{wanted[0][0]}" in facts:
+        own.insert(0, (f"{method}, Gaussians alone", "field", "field"))
+    for name, figures, times in [*((n, *[f"baseline/{n}"] * 2) for n in names), *own]:
         cells = [shown(facts.get(f"{figures}/{figure}"), form) for figure, form in wanted]
         cells += [shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
         rows.append([f"{name} (baseline)" if name == method and times != "time" else name, *cells])
@@ -123,6 +125,8 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     }
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
     cost = [f"cost: {facts['time/cost']}"] if facts.get("time/cost") else []
+    if facts.get("model/made") not in (None, facts.get("model/label")):
+        cost.insert(0, f"{facts['model/label']}: {facts['model/made']}")
     return [*seen.get(prefix, []), *run_conditions(facts), *rest, *cost]
 
 

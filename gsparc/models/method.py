@@ -74,6 +74,15 @@ class Method(ABC):
         return self.name
 
     @property
+    def made(self) -> str:
+        """What was fitted, in words: under one name a method may be one thing here and another there."""
+        return self.label
+
+    def field_alone(self) -> Method | None:
+        """Return its Gaussians without the process that they are mixed with; None where nothing is mixed."""
+        return None
+
+    @property
     def stored_as(self) -> type[Method]:
         """The class that a checkpoint names."""
         return type(self)
@@ -132,8 +141,11 @@ class Method(ABC):
         """What `summary.json` says of a fitted model, None where it means nothing here."""
         return {
             "model/num_gaussians": self.size() if self.has_gaussians else None,
+            "model/made": self.made,
+            "model/choices": None,
             "model/init": None,
             "model/steps": None,
+            "model/steps_taken": None,
             "model/variance_explained": None,
             "time/init_s": None,
         }

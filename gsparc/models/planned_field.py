@@ -156,9 +156,9 @@ class PlannedField(LearnedField):
         choices, _ = resolve(self.settings, self.init.name, data.site)
         steps = total_steps(context, len(fold.train), self.most_steps, choices.closed_form)
         log.info(
-            "training %s by rendering: %d Gaussians, terms %s, init=%s, at most %d steps; callbacks %s",
+            "training %s by rendering: %d Gaussians, terms %s, init=%s, %d steps; callbacks %s",
             GaussianModule.__name__, self.settings.field.count, self.effects, choices.init, steps,
-            ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
+            ", ".join(type(callback).__name__ for callback in context.callbacks()) if steps else "none",
         )  # fmt: skip
         report = super().fit(data, fold, context)
         self.started = self.choices.init if self.choices is not None else ""
@@ -170,7 +170,7 @@ class PlannedField(LearnedField):
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
-        log.info("%d Gaussians, %d of %d gradient steps kept", super().size(), self.steps, self.steps_taken)
+        log.info("%s: %s", self.name, self.made)
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}
@@ -192,6 +192,12 @@ class PlannedField(LearnedField):
             self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
             self.explained = self.explained if explained is None else explained
             self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
+        if self._alone and super().size():
+            log.warning(
+                "the plain process has all the weight: no option of the field changes the result. The row of "
+                "the Gaussians alone shows what they do; model=splat is the field alone, and "
+                "model.effects.residual=false leaves the process out"
+            )
 
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
@@ -374,12 +380,26 @@ class PlannedField(LearnedField):
             return 0
         return super().size() if self.field is None else self.field.count
 
+    @property
+    def made(self) -> str:
+        """See `Method`."""
+        if self.field is not None:
+            terms = ", ".join(self.field.terms) or "a process alone"
+            return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
+        weight = 0.0 if self._average is None else self._average[1]
+        return super().made + (
+            f"; a plain process weighs {weight:.2g}" if self.plan and self.plan.plain else ""
+        )
+
+    def field_alone(self) -> Method | None:
+        """See `Method.field_alone`."""
+        if self._average is None or not super().size():
+            return None
+        alone = copy.copy(self)
+        alone._average, alone._doubled = None, None
+        return alone
+
     def facts(self) -> dict[str, float | int | str | None]:
         """See `Method.facts`."""
-        return {
-            **super().facts(),
-            "model/init": self.started,
-            "model/steps": self.steps,
-            "model/variance_explained": self.explained,
-            "time/init_s": self.init_s,
-        }
+        own = {**super().facts(), "model/init": self.started, "model/variance_explained": self.explained}
+        return own if self.field is None else {**own, "model/choices": None}

@@ -35,6 +35,7 @@ METHODS = {
     "complex_gp": "gsparc.models.channels.complex_gp.ComplexGP",
     "image_source_gp": "gsparc.models.image_sources.method.ImageSourceGP",
     "directional_gp": "gsparc.models.directional.method.DirectionalGP",
+    "splat": "gsparc.models.splat.alone.Splat",
     "array": "gsparc.models.splat.array.ArrayField",
     "moving_array": "gsparc.models.moving_array.method.MovingArrayField",
     "gsparc": "gsparc.models.gsparc.Gsparc",

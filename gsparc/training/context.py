@@ -105,7 +105,7 @@ class FitContext:
     def curve(
         self, seconds: float, what: str, error: float | None = None, step: int | None = None, **figures: Any
     ) -> None:
-        """Add a point to the learning curve of this fit, in its folder and in the loggers; see `curve.point`."""
+        """Add a point to the learning curve, in the folder and the loggers; see `curve.point`."""
         row = curve.point(seconds, what, error, step, **figures)
         curve.write(self.run_dir, [*curve.read(self.run_dir), row])
         curve.log(self.loggers, row)

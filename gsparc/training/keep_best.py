@@ -1,4 +1,4 @@
-"""Steps that pay: of all looks at validation rows the best is kept, the one before the first step among them."""
+"""Steps that pay: of all looks at validation rows, from before the first step on, the best is kept."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class KeepBest(L.Callback):
 
 
 def _surely_less(errors: Tensor, start: Tensor) -> bool:
-    """Whether errors (n,) are below those of the start (n,) by `SURE` standard errors of their differences."""
+    """Whether errors (n,) are below those of the start (n,) by `SURE` standard errors of the differences."""
     if len(errors) != len(start) or len(errors) < 2:
         return len(errors) != len(start)  # a training without a look before its first step keeps the least
     gain = start - errors

@@ -178,7 +178,8 @@ class GaussianModule(L.LightningModule):
         share = [len(errors) / len(self.held_out) for errors, _ in self._looks]
         every = [figures for _, figures in self._looks]
         self.figures = {
-            name: sum(part * float(one[name]) for part, one in zip(share, every, strict=True)) for name in every[0]
+            name: sum(part * float(one[name]) for part, one in zip(share, every, strict=True))
+            for name in every[0]
         }
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:

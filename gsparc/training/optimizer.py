@@ -45,7 +45,9 @@ class OptimizerSettings(Checked):
 
     def after_closed_form(self, total: int) -> OptimizerSettings:
         """Return the rates of `total` steps after a start in closed form: a share of these, from zero."""
-        shares = {name: self.solved_share * getattr(self, name) for name in (*KINDS.values(), "positions_final")}
+        shares = {
+            name: self.solved_share * getattr(self, name) for name in (*KINDS.values(), "positions_final")
+        }
         return replace(self, **shares, warmup=max(self.warmup, round(WARMUP * total)))
 
 

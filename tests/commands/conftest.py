@@ -27,7 +27,7 @@ def field(spectra_file, tmp_path_factory) -> Objects:
 @pytest.fixture(scope="session")
 def halfway(spectra_file, tmp_path_factory) -> Objects:
     """The same on the training rows alone; beside its model lies the training state of step 15 of 20."""
-    often = "callbacks.checkpoint.every_n_train_steps=15"
+    often = "callbacks.checkpoint.interval=15"
     config = compose(*brief(spectra_file, "model.refit=false", often))
     return train(config, tmp_path_factory.mktemp("halfway"))[1]
 

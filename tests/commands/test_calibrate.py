@@ -201,7 +201,7 @@ def _trained(folder, *more: str, run: str = "run"):
 def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_path) -> None:
     """`last.ckpt` and `refit/last.ckpt` took any split for their own: 38 dB where 29 were true."""
     file = spectra(tmp_path / "own.npz")
-    often = "callbacks.checkpoint.every_n_train_steps=10"
+    often = "callbacks.checkpoint.interval=10"
     _, objects = train(compose(*brief(file, often)), tmp_path / "run")
     for path in (tmp_path / "run" / "last.ckpt", tmp_path / "run" / "refit" / "last.ckpt"):
         assert len(collect([str(path)], {}, {})[0]) == len(objects.split.folds[0].test)

@@ -21,9 +21,7 @@ STEPS, EVERY = 30, 10  # of each stage, and between checkpoints
 def swept(folder: Path, launcher: str) -> Answer:
     """Two trainings; the first that comes to step 25 is killed, once."""
     kill = f"+callbacks.kill={{_target_: lost.KillOnce, step: 25, folder: '{folder}'}}"
-    settings = brief(
-        folder / "own.npz", "seed=0,1", f"callbacks.checkpoint.every_n_train_steps={EVERY}", kill
-    )
+    settings = brief(folder / "own.npz", "seed=0,1", f"callbacks.checkpoint.interval={EVERY}", kill)
     settings = [s for s in settings if not s.startswith("trainer.max_steps")]
     where = f"hydra.sweep.dir={folder / 'sweep'}", f"hydra/launcher={launcher}"
     return knock(main, "train.py", ["-m", *settings, f"trainer.max_steps={STEPS}", *where])

@@ -239,7 +239,7 @@ def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, w
 def test_weights_to_start_from_beside_a_run_to_go_on_from_are_those_it_began_with(
     spectra_file, halfway, tmp_path
 ):
-    often, start = "callbacks.checkpoint.every_n_train_steps=10", f"init_from={halfway.checkpoints[0]}"
+    often, start = "callbacks.checkpoint.interval=10", f"init_from={halfway.checkpoints[0]}"
     train(short(spectra_file, start, often), tmp_path / "begun")
     on = f"ckpt_path={tmp_path / 'begun' / 'last.ckpt'}"
     assert train(short(spectra_file, start, on), tmp_path / "on")
@@ -451,7 +451,7 @@ def test_the_objective_is_for_searches_alone(tmp_path, way):
 
 def test_an_interrupt_leaves_a_checkpoint_that_goes_on(spectra_file, tmp_path):
     rare = "model.refit=false", "trainer.val_check_interval=50000"
-    often = "callbacks.checkpoint.every_n_train_steps=10"
+    often = "callbacks.checkpoint.interval=10"
     stopped = "+callbacks.stop={_target_: lost.Interrupt, step: 15}", f"hydra.run.dir={tmp_path / 'run'}"
     answer = knock(main, "train.py", brief(spectra_file, *rare, often, *stopped))
     last = tmp_path / "run" / "last.ckpt"
@@ -466,7 +466,7 @@ def test_an_interrupt_leaves_a_checkpoint_that_goes_on(spectra_file, tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupted_process_ends_with_130_and_one_line(spectra_file, tmp_path):
-    run, often = tmp_path / "run", "callbacks.checkpoint.every_n_train_steps=10"
+    run, often = tmp_path / "run", "callbacks.checkpoint.interval=10"
     words = brief(spectra_file, "trainer.max_steps=100000", often, f"hydra.run.dir={run}")
     process = subprocess.Popen(
         [sys.executable, "train.py", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True

@@ -55,9 +55,7 @@ def test_no_space_is_said_so(fitted, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_training_stops_with_one_line_and_goes_on_when_there_is_room(tmp_path):
-    settings = brief(
-        spectra(tmp_path / "own.npz"), "callbacks.checkpoint.every_n_train_steps=5", "model.refit=false"
-    )
+    settings = brief(spectra(tmp_path / "own.npz"), "callbacks.checkpoint.interval=5", "model.refit=false")
     folder = tmp_path / "run"
     assert run(training, str(folder), settings)[0] == 0
     good, size = (folder / "last.ckpt").read_bytes(), (folder / "last.ckpt").stat().st_size

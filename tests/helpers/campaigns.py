@@ -82,7 +82,6 @@ def brief(file: Path, *more: str) -> list[str]:
         *RENDERED,
         "model.keep_best=false",
         "model.field.count=40",
-        "model.steps=null",
         "trainer.max_steps=20",
         "dataset.batch_size=8",
         "trainer.val_check_interval=10",

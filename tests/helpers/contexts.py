@@ -5,9 +5,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as L
 from campaigns import brief, compose
 
+from gsparc.callbacks import Checkpoint
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -29,11 +29,7 @@ def short(
     """`steps` optimiser steps; `last.ckpt` after each `every` of them."""
 
     def made() -> list[Any]:
-        last = L.callbacks.ModelCheckpoint(
-            filename="last", every_n_train_steps=every, save_on_train_epoch_end=False,
-            enable_version_counter=False,
-        )  # fmt: skip
-        return [*callbacks(), *([last] if every else [])]
+        return [*callbacks(), *([Checkpoint(every)] if every else [])]
 
     trainer = partial(DEFAULTS, max_steps=steps, val_check_interval=validate_every)
     return FitContext(run_dir, batch_size=batch_size, trainer=trainer, callbacks=made, **more)

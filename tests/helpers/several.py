@@ -17,7 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from modules import module
 from torch import distributed
 
-from gsparc.callbacks import Densify, OpacityReset
+from gsparc.callbacks import Checkpoint, Densify, OpacityReset
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold
@@ -96,9 +96,7 @@ def trained(
     )  # with less, Adam makes a whole step of a gradient that is rounding
     fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
     shown = (Doubles if double else Loaded)(data, BATCH)
-    last = L.callbacks.ModelCheckpoint(
-        filename="last", every_n_train_steps=7, save_on_train_epoch_end=False, enable_version_counter=False
-    )
+    last = Checkpoint(7)
     trainer = partial(
         DEFAULTS, max_steps=steps, devices=devices, strategy="ddp_fork" if devices > 1 else "auto"
     )

@@ -31,7 +31,7 @@ from gsparc.evaluation.summary import provenance, result_rows, write_samples, wr
 from gsparc.models import checkpoint, parts
 from gsparc.models.method import Method, TrainsByGradient
 from gsparc.models.registry import build
-from gsparc.training import tracking
+from gsparc.training import curve, tracking
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -89,6 +89,8 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
     def keep(number: int, method: Method, report: FitReport) -> None:
         _log_fit(method, report, config.budget_s)
+        if not curve.read(folders[number]):  # a method that trains in one piece
+            context(number).curve(report.seconds, method.name, report.error)
         marks = parts.marks(report, data, split.folds[number], context(number))
         extra = {**marks, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(files[number], method, yaml, extra)

@@ -94,9 +94,7 @@ class LearnedField(Method):
         steps: int | Literal["auto"] = "auto",
         guesses: Sequence[str] = (),
     ) -> None:
-        check_arguments(
-            locals(), refit=switch(), keep_best=switch(), steps=or_word(whole(0), "auto")
-        )
+        check_arguments(locals(), refit=switch(), keep_best=switch(), steps=or_word(whole(0), "auto"))
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
@@ -152,6 +150,7 @@ class LearnedField(Method):
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
         steps = total_steps(context, len(watched.train), self.most_steps, solved)
+        log.info("%d gradient steps%s", steps, " after a start in closed form" if solved else "")
         watching = not self.keep_best or len(watched.val) > 0 or not solved
         if stage == "train":
             if steps and watching:
@@ -175,7 +174,13 @@ class LearnedField(Method):
         return self._ended(context, budget)
 
     def _end_with_start(
-        self, origin: Origin, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, seconds: float
+        self,
+        origin: Origin,
+        data: Measurements,
+        fold: Fold,
+        context: FitContext,
+        budget: TimeBudget,
+        seconds: float,
     ) -> FitReport:
         """Solve the start again on all rows: no step was surely better, or none was asked for."""
         every = np.sort(np.concatenate([fold.train, fold.val]))
@@ -434,13 +439,15 @@ class LearnedField(Method):
         choices = None if self.choices is None else vars(self.choices)
         model = self.fitted().state_dict()
         return {
-            "choices": choices, "ends": self._ends, "prior": prior, "shape": self._shape, "model": model
+            "choices": choices, "ends": self._ends, "prior": prior, "shape": self._shape, "model": model,
+            "steps": (self.steps, self.steps_taken),
         }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the field whose `state()` this was."""
         self.site = site
         self.choices = Choices(**state["choices"])
+        self.steps, self.steps_taken = state["steps"]
         self._ends = dict(state["ends"])
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
@@ -452,6 +459,32 @@ class LearnedField(Method):
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.fitted().gaussians)
+
+    @property
+    def made(self) -> str:
+        """See `Method`."""
+        if self.choices is None or self.model is None:
+            return self.label
+        hidden, count = self.settings.emission.hidden, len(self.model.gaussians)
+        kind = "array process" if self.settings.response.array else "process of images"
+        made = f"networks of {hidden} hidden units in {count} Gaussians" if hidden else f"{count} Gaussians"
+        made = f"{kind} through {made}" if self.choices.closed_form else made
+        kept = "all" if self.steps == self.steps_taken else self.steps or "none"
+        return made + (
+            f", {self.steps_taken} gradient steps, {kept} kept" if self.steps_taken else ", no gradient steps"
+        )
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """See `Method.facts`."""
+        own = super().facts()
+        if self.choices is not None:
+            chosen = {"init": self.choices.init, "encoding": self.choices.encoding}
+            chosen |= {"activation": self.choices.activation, "steps": self.steps_taken}
+            own |= {"model/choices": ", ".join(f"{name}={value}" for name, value in chosen.items())}
+            own |= {"model/init": self.choices.init}
+        return own | {
+            "model/steps": self.steps, "model/steps_taken": self.steps_taken, "time/init_s": self.init_s,
+        }  # fmt: skip
 
 
 def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:

@@ -105,7 +105,7 @@ def test_the_frozen_field_is_the_rasterized_one_and_has_gradients(trained):
 def test_steps_are_taken_where_asked_for(known_campaign, tmp_path):
     data, _ = known_campaign
     fold = Fold(np.arange(0, 120, 2), np.arange(1, 40, 4), np.arange(121, 160, 2))
-    asked = "model.steps=null", "model.keep_best=false", "model.refit=false"
+    asked = "model.keep_best=false", "model.refit=false"
     more = _trained(data, fold, tmp_path, COUNT, *asked, steps=6)
     none = _trained(data, fold, tmp_path, COUNT, "model.steps=0", "model.refit=false")
     moved = (more.fitted().gaussians.means - none.fitted().gaussians.means).abs().max()
