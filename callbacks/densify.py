@@ -14,12 +14,14 @@ from torch import Tensor
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
-from gsparc.field.readout import Readout
+from gsparc.field.readout import solved_again
 from gsparc.training.processes import largest, total
 from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
 from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)
+
+MOST_CHANGE = 1e-3  # root mean square, that an edit may make of spectra whose emissions were solved for
 
 
 @dataclass(eq=False)
@@ -94,10 +96,16 @@ class Densify(Checked, L.Callback):
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
             planned = self.plan(model, draws, in_place=module.solved)
             before = len(model.gaussians)
-            rendered = Readout.of(model, module.batch.rx) if module.solved else None
+            solved = solved_again(model, planned, module.batch) if module.solved else None
+            if solved is not None and solved.change > MOST_CHANGE:
+                text = "step %d: no Gaussians added: spectra would change by %.1e, more than %g"
+                log.info(text, step, solved.change, MOST_CHANGE)
+                self.statistics = self._blank(model)
+                return
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
-            if rendered is not None:
-                rendered.solve_again(model, module.batch.rx)
+            if solved is not None:
+                model.emission.weight2.copy_(solved.weight)
+                model.emission.bias2.copy_(solved.bias)
             self.statistics = self._blank(model)
         _log_edit(trainer, module, planned, before, step)
 

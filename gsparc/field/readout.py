@@ -2,49 +2,66 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from gsparc.data.schema import Batch
+from gsparc.field import edit
 from gsparc.field.frozen import seen_by_array
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.ops import Pose
 
-RIDGE = 1e-5  # of the mean energy of a view: footprints overlap, and less lets weights cancel each other
+RIDGE = 1e-3  # of the mean energy of a view: footprints overlap, and less lets weights cancel each other
 
 
 @dataclass(frozen=True)
-class Readout:
-    """What a field with linear emissions renders: features times weights times view.
+class Solved:
+    """The read-out of a field after an edit.
 
     Attributes:
-        rendered: (E + 1, P) pixels, or (E + 1, M) complex array vectors, of each feature and the constant.
+        weight, bias: of the emission's last layer.
+        change: of what is rendered, root mean square over a batch.
     """
 
-    rendered: Tensor
+    weight: Tensor
+    bias: Tensor
+    change: float
 
-    @classmethod
-    @torch.no_grad()
-    def of(cls, model: GaussianModel, rx: Pose) -> Readout | None:
-        """Return what it renders at a pose; None where emissions are not linear in their features."""
-        emission = model.emission.settings
-        if emission.hidden or emission.activation != "linear":
-            return None
-        return cls(_lines(model) @ _view(model, rx))
 
-    @torch.no_grad()
-    def solve_again(self, model: GaussianModel, rx: Pose) -> None:
-        """Correct the weights of an edited field by least squares, so that it renders the same."""
-        view = _view(model, rx)
-        gram = (view @ view.mH).to(torch.complex128 if view.is_complex() else torch.float64)
-        ridge = RIDGE * gram.diagonal().real.mean() * torch.eye(len(gram), device=gram.device)
-        missing = (self.rendered - _lines(model) @ view) @ view.mH
-        lines = torch.linalg.solve(gram + ridge, missing.to(gram.dtype).mH).mH.to(view.dtype)
-        change = torch.view_as_real(lines) if lines.is_complex() else lines.unsqueeze(-1)
-        model.emission.weight2 += change[:-1].transpose(0, 1)
-        model.emission.bias2 += change[-1]
+@torch.no_grad()
+def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solved | None:
+    """Return the read-out with which an edited field renders what it does now; the field stays as it is.
+
+    Weights of the edited field are corrected by least squares, for all features at once.
+
+    Args:
+        model: of spectra and a static receiver.
+        change: that is planned.
+        batch: of which the change is measured.
+
+    Returns:
+        None where emissions are not linear in their features.
+    """
+    emission = model.emission.settings
+    if emission.hidden or emission.activation != "linear":
+        return None
+    rendered = _lines(model) @ _view(model, batch.rx)
+    trial = copy.deepcopy(model)
+    edit.apply(change, trial, trial.gaussians)
+    view = _view(trial, batch.rx)
+    gram = (view @ view.mH).to(torch.complex128 if view.is_complex() else torch.float64)
+    ridge = RIDGE * gram.diagonal().real.mean() * torch.eye(len(gram), device=gram.device)
+    missing = (rendered - _lines(trial) @ view) @ view.mH
+    lines = torch.linalg.solve(gram + ridge, missing.to(gram.dtype).mH).mH.to(view.dtype)
+    correction = torch.view_as_real(lines) if lines.is_complex() else lines.unsqueeze(-1)
+    trial.emission.weight2 += correction[:-1].transpose(0, 1)
+    trial.emission.bias2 += correction[-1]
+    error = trial(batch.tx, batch.rx).mean - model(batch.tx, batch.rx).mean
+    return Solved(trial.emission.weight2, trial.emission.bias2, float(error.square().mean().sqrt()))
 
 
 def _lines(model: GaussianModel) -> Tensor:

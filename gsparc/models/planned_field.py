@@ -42,7 +42,6 @@ from gsparc.processes.posterior import approximated
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.fit import total_steps
 from gsparc.training.module import GaussianModule
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 
@@ -154,11 +153,10 @@ class PlannedField(LearnedField):
         if not self.settings.field.count:
             self.most_steps = 0
         choices, _ = resolve(self.settings, self.init.name, data.site)
-        steps = total_steps(context, len(fold.train), self.most_steps, choices.closed_form)
         log.info(
-            "training %s by rendering: %d Gaussians, terms %s, init=%s, %d steps; callbacks %s",
-            GaussianModule.__name__, self.settings.field.count, self.effects, choices.init, steps,
-            ", ".join(type(callback).__name__ for callback in context.callbacks()) if steps else "none",
+            "training %s by rendering: %d Gaussians, terms %s, init=%s; callbacks %s",
+            GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
+            ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
         )  # fmt: skip
         report = super().fit(data, fold, context)
         self.started = self.choices.init if self.choices is not None else ""

@@ -34,7 +34,6 @@ TAKEN = "steps/taken"
 KEPT = ("steps/kept", "steps/kept_position")
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 LOOKS = 10  # validations of a training, where the Trainer is given no interval
-STEPS, AFTER_CLOSED_FORM = 400, 60  # where neither model nor Trainer is given a number
 
 # What conf/trainer/cpu.yaml says, for callers from Python.
 DEFAULTS = partial(
@@ -67,14 +66,13 @@ class Ran:
     timed_out: bool = False
 
 
-def total_steps(context: FitContext, rows: int, own: int | None = None, closed_form: bool = False) -> int:
-    """Return the steps that schedules are written for: the Trainer's, else the model's, else the usual ones.
+def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> int | None:
+    """Return the number of steps that the Trainer is given, else the model's own; None where neither is.
 
     Args:
         context: of the fit; `trainer.max_steps` and `trainer.max_epochs` win over all others.
         rows: that are learned from, for epochs.
-        own: as the model is configured; None: `STEPS`, or `AFTER_CLOSED_FORM`.
-        closed_form: whether training starts from a solution.
+        own: as the model is configured.
 
     Raises:
         ValueError: the Trainer is given what is no number of steps.
@@ -86,10 +84,7 @@ def total_steps(context: FitContext, rows: int, own: int | None = None, closed_f
             raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or null")
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     given = [*([] if steps is None else [steps]), *([] if epochs is None else [epochs * -(-rows // size)])]
-    if given:
-        return min(given)
-    usual = AFTER_CLOSED_FORM if closed_form else STEPS
-    return usual if own is None else own
+    return min(given) if given else own
 
 
 class ReturnMetrics(L.Callback):

@@ -1,9 +1,9 @@
-import csv
 from types import SimpleNamespace
 
 import pytest
 
 from gsparc.callbacks import CostLedger, ledger
+from gsparc.training import curve
 
 
 @pytest.fixture
@@ -21,13 +21,22 @@ def trainer(callbacks=(), **figures) -> SimpleNamespace:
         sanity_checking=False,
         is_global_zero=True,
         global_step=7,
+        loggers=[],
         state=SimpleNamespace(fn="fit"),
     )
 
 
 @pytest.fixture
 def module(tmp_path):
-    return SimpleNamespace(run_dir=tmp_path / "new", train_seconds=0.0, prepared_seconds=0.0)
+    figures = {"val/error": 0.25, "val/psnr_db": 21.5}
+    return SimpleNamespace(
+        run_dir=tmp_path / "new",
+        train_seconds=0.0,
+        prepared_seconds=0.0,
+        figures=figures,
+        count=40,
+        start="start",
+    )
 
 
 def test_validation_and_pictures_are_not_billed(clock, module):
@@ -58,26 +67,46 @@ def test_a_pause_of_a_stopped_watch_or_of_none_starts_nothing(clock):
 
 
 def test_the_curve_has_accuracy_beside_seconds(clock, module):
-    bill = CostLedger()
-    run = trainer([bill], **{"val/psnr_db": 21.5, "model/num_gaussians": 40.0, "other": 1.0})
+    bill, run = CostLedger(), trainer(**{"train/task_loss": 0.5})
+    run.sanity_checking, run.global_step = True, 0
+    bill.on_validation_end(run, module)  # before the first step
+    run.sanity_checking = False
     bill.on_train_start(run, module)
-    for _ in range(2):
+    for run.global_step in (7, 14):
         clock.value += 2
         bill.on_validation_start(run, module)
         bill.on_validation_end(run, module)
-    with (module.run_dir / "learning_curve.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["train_s"] for row in rows] == ["2.0", "4.0"]
-    assert rows[0]["val/psnr_db"] == "21.5" and rows[0]["num_gaussians"] == "40" and "other" not in rows[0]
+    rows = curve.read(module.run_dir)
+    assert [row["seconds"] for row in rows] == ["0.0", "2.0", "4.0"]
+    assert [row["what"] for row in rows] == ["start", "step 7", "step 14"]
+    assert (
+        rows[0]["val/psnr_db"] == "21.5" and rows[0]["error"] == "0.25" and rows[0]["num_gaussians"] == "40"
+    )
+
+
+def test_the_curve_of_a_resumed_run_ends_with_its_checkpoint(clock, module):
+    """Rows after the checkpoint stood twice."""
+    bill, run = CostLedger(), trainer()
+    bill.on_train_start(run, module)
+    bill.on_validation_end(run, module)
+    state = bill.state_dict()
+    run.global_step = 14
+    bill.on_validation_end(run, module)
+    again, run.global_step = CostLedger(), 7
+    again.load_state_dict(state)
+    again.on_train_start(run, module)
+    assert [row["step"] for row in curve.read(module.run_dir)] == ["7"]
 
 
 def test_a_resumed_run_keeps_counting_and_an_exception_stops_the_watch(clock):
     bill = CostLedger()
-    bill.on_train_start(trainer(), SimpleNamespace())
+    run = trainer()
+    run.global_step = 0
+    bill.on_train_start(run, SimpleNamespace())
     clock.value += 4
     again = CostLedger()
     again.load_state_dict(bill.state_dict())
-    again.on_train_start(trainer(), SimpleNamespace())
+    again.on_train_start(run, SimpleNamespace())
     clock.value += 1
     assert again.elapsed() == 5
     again.on_exception(trainer(), SimpleNamespace(), RuntimeError())

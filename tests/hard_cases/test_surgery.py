@@ -93,7 +93,7 @@ def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
         wanting = (torch.rand(n, generator=draw) < edit["want"]).float()
         densify.statistics = {"gradient": wanting, "seen": torch.ones(n), "radius": torch.ones(n)}
         trainer.global_step = number
-        densify.on_train_batch_end(trainer, module)
+        densify.on_train_batch_start(trainer, module)
 
         ids = model.gaussians.ids.tolist()
         assert len(set(ids)) == len(ids) >= 1
@@ -111,7 +111,7 @@ def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
 
         if edit["reset"]:
             before = rows_by_id(model, optimizer)
-            OpacityReset(1, 99, 0.01).on_train_batch_end(trainer, module)
+            OpacityReset(1, 99, 0.01, least_steps=0).on_train_batch_start(trainer, module)
             assert (model.gaussians.opacities <= 0.01 + 1e-6).all()
             after = rows_by_id(model, optimizer)
             opacity = list(row_parameters(model, len(ids))).index("gaussians.opacity_logits")
@@ -140,8 +140,8 @@ def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
         0, 99, 1, 0.5, draws.draw(st.sampled_from([0.0, 1e9])), max_radius=5.0, max_gaussians=20
     )
     densify.statistics = nasty
-    module = SimpleNamespace(model=model, total_steps=99, global_step=0, schedule_step=lambda interval: 1)
-    densify.on_train_batch_end(trainer, module)
+    module = SimpleNamespace(model=model, total_steps=99, global_step=0, schedule_step=lambda interval: 1, solved=False)
+    densify.on_train_batch_start(trainer, module)
     assert 1 <= len(model.gaussians) <= 20
     assert all(p.isfinite().all() for p in model.parameters())
     assert all(t.isfinite().all() for t in densify.statistics.values())

@@ -92,7 +92,8 @@ class Watching(L.Callback):
             self.steps.append(float("nan"))
 
     def on_validation_start(self, trainer, module):
-        self.logged[trainer.global_step] = float(trainer.callback_metrics["train/task_loss"])
+        if not trainer.sanity_checking:
+            self.logged[trainer.global_step] = float(trainer.callback_metrics["train/task_loss"])
 
 
 @pytest.mark.parametrize("val_every", [4, 7, 10])

@@ -6,7 +6,10 @@ import torch
 from campaigns import brief, compose, spectra
 from contexts import loaded, short
 
+from gsparc.callbacks import CostLedger
 from gsparc.models.registry import build
+from gsparc.training import curve
+from gsparc.training.keep_best import _surely_less
 
 COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 
@@ -43,7 +46,7 @@ def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
     method = fitted(measured, tmp_path / "wild", *wild)
     start = fitted(measured, tmp_path / "start", "init=images", "model.steps=0", "model.refit=false")
     assert method.steps == 0 and held_out(method, measured) < 1.1 * held_out(start, measured)
-    assert "none kept" in caplog.text and "40 taken" not in caplog.text
+    assert "40 taken, none kept" in caplog.text  # keeping the best ends no training
 
 
 def test_the_second_stage_takes_the_steps_that_paid_in_the_first(measured, tmp_path):
@@ -64,3 +67,22 @@ def test_a_budget_spent_before_the_first_step_took_steps_that_nothing_spoke_for(
     """One step of the first stage chose as many as seconds were left for in the second: 29.1 -> 28.0 dB."""
     late = fitted(measured, tmp_path / "late", "init=images", "model.refit=true", budget_s=1e-3)
     assert late.steps == 0 and "first step of stage train" in caplog.text and "stage refit" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("errors", "kept"),
+    [([1, 1, 1, 0.9], False), ([0.9, 0.8, 0.9, 0.85], True), ([1.1, 1.0, 1.2, 1.1], False)],
+)
+def test_a_look_is_kept_where_its_rows_are_better_by_two_standard_errors(errors, kept):
+    """One row of four that gains nothing but noise chose steps that cost the others."""
+    start = torch.ones(4, dtype=torch.float64)
+    assert _surely_less(torch.tensor(errors, dtype=torch.float64), start) == kept
+
+
+def test_the_start_is_the_first_point_of_the_curve_and_the_result_the_last(measured, tmp_path):
+    fitted(measured, tmp_path, "init=images", steps=20, callbacks=lambda: [CostLedger()])
+    rows = curve.read(tmp_path)
+    assert [row["step"] for row in rows] == ["0", "5", "10", "15", "20", "20"]
+    assert rows[0]["what"] == "init=images, closed form" and rows[-1]["what"].startswith("final, ")
+    errors = [float(row["val/psnr_db"]) for row in rows[:-1]]
+    assert min(errors) > errors[0] - 0.1 and rows[-1]["error"] == ""

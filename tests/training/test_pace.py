@@ -12,6 +12,7 @@ from torch import nn
 from gsparc.commands.train import train
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
+from gsparc.training import curve
 from gsparc.training.context import FitContext
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.training.pace import Budget, Pace
@@ -152,6 +153,6 @@ def test_a_run_ends_with_its_budget_in_both_stages(tmp_path):
     config = compose(*brief(file, "budget_s=2.0", "trainer.max_steps=100000"))
     facts, objects = train(config, tmp_path / "run")
     assert 1.0 < facts["time/train_s"] < 3.5  # less the reading; the step in progress is finished
-    last = (tmp_path / "run" / "learning_curve.csv").read_text().splitlines()[-1].split(",")
-    assert 0.2 < float(last[1]) < 1.6  # half of it; the rest is the second stage
+    last = curve.read(tmp_path / "run")[-2]  # before `final`
+    assert 0.2 < float(last["seconds"]) < 1.6  # half of it; the rest is the second stage
     assert objects.checkpoints[0].exists()

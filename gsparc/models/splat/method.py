@@ -40,7 +40,7 @@ from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.models.splat.closed_form import prepare
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.fit import run_stage, total_steps
+from gsparc.training.fit import run_stage, steps_asked_for
 from gsparc.training.keep_best import KeepBest, StopAt
 from gsparc.training.module import GaussianModule, LossSettings, squared_error
 from gsparc.training.optimizer import OptimizerSettings
@@ -50,6 +50,7 @@ from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatabl
 log = logging.getLogger(__name__)
 
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
+STEPS, AFTER_CLOSED_FORM = 400, 60  # of gradient, where neither model nor Trainer is given a number
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
@@ -111,6 +112,7 @@ class LearnedField(Method):
         self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._billed = Spent()  # for reusable work, by the stages so far
         self.frozen: FrozenView | FrozenArray | None = None
+        self._stretched = True  # whether a budget stretches the schedule; else it only ends it
         self._reserve_s = 0.0  # of the budget, for what follows the last stage [s]
         self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
         self._left_out: LeftOut | None = None  # of the initialiser; not stored
@@ -149,8 +151,13 @@ class LearnedField(Method):
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
-        steps = total_steps(context, len(watched.train), self.most_steps, solved)
-        log.info("%d gradient steps%s", steps, " after a start in closed form" if solved else "")
+        asked = steps_asked_for(context, len(watched.train), self.most_steps)
+        steps = (AFTER_CLOSED_FORM if solved else STEPS) if asked is None else asked
+        log.info(
+            "steps=%s%d: a start %s", "auto -> " if asked is None else "", steps,
+            "in closed form" if solved else f"from init={self.choices.init}",
+        )  # fmt: skip
+        self._stretched = asked is not None or not solved
         watching = not self.keep_best or len(watched.val) > 0 or not solved
         if stage == "train":
             if steps and watching:
@@ -247,7 +254,7 @@ class LearnedField(Method):
         if not steps:
             return prepared
         pace = None
-        if context.budget_s is not None and self.choices.closed_form:
+        if context.budget_s is not None and not self._stretched:
             if budget.over():
                 log.info("budget_s=%.3g: none is left for gradient steps", context.budget_s)
                 self._paying = 0 if stage == "train" else self._paying
@@ -256,10 +263,12 @@ class LearnedField(Method):
             end = context.budget_s * 0.5 if first else context.budget_s - self._reserve_s
             pace = Pace(steps, end - budget.spent)
             if pace.budget_s <= 0 and self._paying != 0:
+                blind = stage == "train" and self.keep_best and self.choices.closed_form
+                self._paying = 0 if blind else self._paying  # nothing shows that steps would gain
                 log.warning(
                     "budget_s=%.3g: %.1f of %.3g s went before the first step of stage %s (preparation, "
-                    "earlier stages), which has one step; give more",
-                    context.budget_s, budget.spent, end, stage,
+                    "earlier stages), which has %s; give more",
+                    context.budget_s, budget.spent, end, stage, "none" if blind else "one step",
                 )  # fmt: skip
         if self._paying == 0:
             self.steps = 0
