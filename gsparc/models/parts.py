@@ -163,15 +163,16 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
     """`key=value (here other)` for every setting under `keys` that differs; none without a configuration."""
     if not before or not now:
         return []
-    one, two = dict(_leaves(before)), dict(_leaves(now))
+    one, two = dict(leaves(before)), dict(leaves(now))
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
     under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
 
 
-def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield settings by dotted name."""
     for key, value in node.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
+            yield from leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value

@@ -140,7 +140,9 @@ def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
         0, 99, 1, 0.5, draws.draw(st.sampled_from([0.0, 1e9])), max_radius=5.0, max_gaussians=20
     )
     densify.statistics = nasty
-    module = SimpleNamespace(model=model, total_steps=99, global_step=0, schedule_step=lambda interval: 1, solved=False)
+    module = SimpleNamespace(
+        model=model, total_steps=99, global_step=0, schedule_step=lambda interval: 1, solved=False
+    )
     densify.on_train_batch_start(trainer, module)
     assert 1 <= len(model.gaussians) <= 20
     assert all(p.isfinite().all() for p in model.parameters())

@@ -19,9 +19,11 @@ from gsparc.data.schema import Kind
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import write_samples
+from gsparc.models.parts import leaves
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
 
+RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 HIDDEN = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
 
 
@@ -35,6 +37,7 @@ class Run:
         samples: `per_sample.csv` by column; empty when absent.
         curve: `learning_curve.csv` by column, (n,) float64; empty for methods that train in one piece.
         overrides: of the command line, `model.emission.hidden=8`.
+        config: composed settings by dotted name.
         render_ms: (n,) times of single queries measured after a sweep, alone; empty when not.
     """
 
@@ -43,6 +46,7 @@ class Run:
     samples: dict[str, np.ndarray] = field(default_factory=dict)
     curve: dict[str, np.ndarray] = field(default_factory=dict)
     overrides: tuple[str, ...] = ()
+    config: dict[str, Any] = field(default_factory=dict)
     render_ms: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
@@ -63,6 +67,17 @@ class Run:
         named = [o for o in overrides if not o.startswith(("model=", "dataset=", "split="))]
         short = [o.removeprefix("model.").removeprefix("trainer.") for o in named]
         return " ".join([str(self.facts.get("model/name", "?")), *short])
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """Settings of the model, its training and data by name, with what was chosen for those at `auto`."""
+        own = {name: v for name, v in self.config.items() if name.startswith(RESOLVED)}
+        chosen = [one.partition("=") for one in str(self.facts.get("model/choices") or "").split(", ")]
+        return own | {name: value for name, _, value in chosen if value}
+
+    def swept(self, name: str) -> bool:
+        """Whether the command line set it."""
+        return any(o.lstrip("+~").startswith(f"{name}=") for o in self.overrides)
 
     @property
     def effects(self) -> str:
@@ -165,6 +180,7 @@ def read_run(folder: Path) -> Run:
         columns(folder / "per_sample.csv"),
         {k: v for k, v in columns(folder / "learning_curve.csv").items() if v.dtype.kind == "f"},
         _overrides(folder / ".hydra" / "overrides.yaml"),
+        _config(folder / ".hydra" / "config.yaml"),
         np.zeros(0) if render is None else render,
     )
 
@@ -189,6 +205,12 @@ def _overrides(path: Path) -> tuple[str, ...]:
     if not path.is_file():
         return ()
     return tuple(str(line) for line in yaml.safe_load(path.read_text(encoding="utf-8")) or ())
+
+
+def _config(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    return dict(leaves(yaml.safe_load(path.read_text(encoding="utf-8")) or {}))
 
 
 def number(value: object) -> float | None:

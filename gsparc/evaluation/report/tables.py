@@ -74,13 +74,34 @@ def seeds(runs: Sequence[Run]) -> Table:
     figures = [
         Column(heading_of(f), form_of(f), of=partial(Run.figure_of, name=f)) for f in TABLES[runs[0].kind]
     ]
+    alone = f"field/{runs[0].figure}"
+    if any(run.facts.get(alone) is not None for run in runs):
+        head = f"{heading_of(runs[0].figure)} of Gaussians alone"
+        figures.append(Column(head, form_of(runs[0].figure), of=alone))
     spread = [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
-    columns = [SETTING, Column("seeds", "d"), *spread]
+    differs = differing(runs)
+    also = [Column("differs, too")] if any(differs.values()) else []
+    columns = [SETTING, *also, Column("seeds", "d"), *spread]
     rows = [
-        [setting, len(group), *(over_seeds([number(c.value(run)) for run in group]) for c in spread)]
+        [
+            setting, *([differs[setting]] if also else []), len(group),
+            *(over_seeds([number(c.value(run)) for run in group]) for c in spread),
+        ]
         for setting, group in grouped(runs).items()
-    ]
+    ]  # fmt: skip
     return Table("Settings over seeds", columns, rows, "Brackets: least and largest over seeds.")
+
+
+def differing(runs: Sequence[Run]) -> dict[str, str]:
+    """Return, by setting, resolved values in which runs differ besides what was swept: `init=sphere, ...`."""
+    groups = grouped(runs)
+    every = {setting: group[0].resolved for setting, group in groups.items()}
+    names = dict.fromkeys(name for one in every.values() for name in one)
+    vary = [n for n in names if len({str(one.get(n)) for one in every.values()}) > 1]
+    return {
+        setting: ", ".join(f"{name}={one.get(name)}" for name in vary if not groups[setting][0].swept(name))
+        for setting, one in every.items()
+    }
 
 
 def costs(runs: Sequence[Run]) -> Table:
