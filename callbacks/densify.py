@@ -51,6 +51,7 @@ class Densify(Checked, L.Callback):
     max_gaussians: int = setting(100_000, whole(1))
     min_gaussians: int = setting(16, whole(0))
     statistics: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+    _ended: bool = field(default=False, init=False, repr=False)  # an edit would have changed what is rendered
 
     def _blank(self, model: GaussianModel) -> dict[str, Tensor]:
         count = len(model.gaussians)
@@ -88,7 +89,7 @@ class Densify(Checked, L.Callback):
         step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
         if step is None or not due(step, module.global_step, *when, module.total_steps):
             return
-        if not self.statistics:
+        if not self.statistics or self._ended:
             return
         model: GaussianModel = module.model
         with torch.no_grad():
@@ -98,9 +99,9 @@ class Densify(Checked, L.Callback):
             before = len(model.gaussians)
             solved = solved_again(model, planned, module.batch) if module.solved else None
             if solved is not None and solved.change > MOST_CHANGE:
-                text = "step %d: no Gaussians added: spectra would change by %.1e, more than %g"
+                text = "step %d: no Gaussians added from here on: spectra would change by %.1e, more than %g"
                 log.info(text, step, solved.change, MOST_CHANGE)
-                self.statistics = self._blank(model)
+                self._ended = True
                 return
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
             if solved is not None:
@@ -166,11 +167,11 @@ class Densify(Checked, L.Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Statistics gathered since the last edit."""
-        return {"statistics": dict(self.statistics)}
+        return {"statistics": dict(self.statistics), "ended": self._ended}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue in the middle of an interval."""
-        self.statistics = dict(state["statistics"])
+        self.statistics, self._ended = dict(state["statistics"]), bool(state["ended"])
 
 
 def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int, step: int) -> None:

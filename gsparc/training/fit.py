@@ -78,10 +78,10 @@ def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> i
         ValueError: the Trainer is given what is no number of steps.
     """
     options = (context.trainer or DEFAULTS).keywords
-    steps, epochs = options.get("max_steps"), options.get("max_epochs")
+    steps, epochs = (None if options.get(n) == -1 else options.get(n) for n in ("max_steps", "max_epochs"))
     for name, value in (("max_steps", steps), ("max_epochs", epochs)):
         if value is not None and (type(value) is not int or value < 0):
-            raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or null")
+            raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     given = [*([] if steps is None else [steps]), *([] if epochs is None else [epochs * -(-rows // size)])]
     return min(given) if given else own

@@ -456,7 +456,7 @@ class LearnedField(Method):
         """Become the field whose `state()` this was."""
         self.site = site
         self.choices = Choices(**state["choices"])
-        self.steps, self.steps_taken = state["steps"]
+        self.steps, self.steps_taken = state.get("steps", (0, 0))
         self._ends = dict(state["ends"])
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])

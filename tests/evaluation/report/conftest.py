@@ -62,7 +62,7 @@ def invent(
     if curve:
         steps = np.arange(1, 6)
         _csv(folder / "learning_curve.csv", {
-            "step": steps, "train_s": steps * seconds / 5, "num_gaussians": [500] * 5,
+            "step": steps, "seconds": steps * seconds / 5, "num_gaussians": [500] * 5,
             "train/task_loss": 1 / steps, "val/ssim_gauss": [0.9] * 5, "val/psnr_db": psnr - 5 / steps,
             "val/mse": [""] * 5,
         })  # fmt: skip

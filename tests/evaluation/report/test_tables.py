@@ -98,8 +98,8 @@ def test_time_to_accuracies_and_best_within_minutes(three):
 def test_of_channels_the_least_error_is_the_best_reached(tmp_path):
     """The largest was: a mean squared error was taken for a figure of which more are better."""
     facts = {"dataset/kind": "csi", "model/name": "splat", "time/train_s": 200.0}
-    falling = {"train_s": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.2, 0.1])}
-    slower = {"train_s": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.7, 0.5])}
+    falling = {"seconds": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.2, 0.1])}
+    slower = {"seconds": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.7, 0.5])}
     runs = [Run(tmp_path, {**facts, "seed": i}, curve=c) for i, c in enumerate((falling, slower))]
     table = tables.within_minutes(runs)
     first, second = cells(table, 0), cells(table, 1)
