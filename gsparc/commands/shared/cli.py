@@ -52,6 +52,10 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     offer()
     if config == "simulate":
         offer_scenes()
+    if config == "train":  # what it imports brings torch
+        from gsparc.commands.shared.continued import with_settings_of_run
+
+        sys.argv[1:] = with_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
