@@ -89,6 +89,12 @@ VALUES = {
     "model.confidence.clamp=1e4": "at most 80",
     "model.effects.phase=ture": "one of true, false, auto",
     "model.effects.residual=splat": "one of true, false, auto",
+    "model.effects=off": "one by one: model.effects.image=..., model.effects.array=...",
+    "model.attenuation=null": "one by one: model.attenuation.inverse_distance=...",
+    "model.emission.encoding=raw": "one by one: model.emission.encoding.kind=...",
+    "model.optimizer=adam": "one by one: model.optimizer.positions=...",
+    "model.init=sources": "say init=sources",
+    "callbacks.densify=off": "null leaves it out",
     "init.name=maybe": "one of auto, sphere",
     "model.refit=perhaps": "one of true, false",
     "model._target_=os.system": "'os.system'",
@@ -101,7 +107,7 @@ VALUES = {
     "=": "Could not override",
 }
 CASES = {**SLIPS, **VALUES}
-QUICK = ("modle=gsparc", "experiment=paper/rfdi", "model.emission.encoding.octavs=3", "+model.field.cout=3",
+QUICK = ("model.effects=off", "modle=gsparc", "experiment=paper/rfdi", "model.emission.encoding.octavs=3", "+model.field.cout=3",
          "seed=abc", "model.attenuation.d_min=0", "eval_on=tset")  # fmt: skip
 
 
