@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import signal
 import subprocess
 import sys
@@ -30,6 +31,17 @@ def test_without_a_command_all_are_listed_at_once():
     assert done.returncode == 0
     listed = [line.split()[0] for line in done.stdout.splitlines() if line.startswith("  ")]
     assert listed == list(COMMANDS)
+
+
+@pytest.mark.parametrize("words", [("--version",), ("train", "--help"), ("study", "-h"), ("check", "--help")])
+def test_help_waited_seconds_for_torch(words):
+    """`gsparc train --help` took up to 13 s on a busy machine; `gsparc --version` was no command."""
+    code = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules, file=sys.stderr));"
+    code += "from gsparc.__main__ import main; main()"
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "False\n")
+    said = {"--version": r"^gsparc \d+\.\d+", "train": r"model=.*\|gsparc\|", "study": r"kind=effects\|"}
+    assert re.search(said.get(words[0], "usage: gsparc check"), done.stdout)
 
 
 def test_a_typo_gets_the_nearest_command():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import logging
 import os
@@ -12,9 +13,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial, wraps
+from importlib.util import find_spec
+from pathlib import Path
 from types import FrameType
 
 import hydra
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -23,7 +27,9 @@ from rich.console import Console
 from gsparc.commands.shared import job_name  # noqa: F401  # configurations name folders by it
 from gsparc.commands.shared.plugins import offer, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release
-from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, one_line
+from gsparc.data.instantiate import GROUPS, plugins
+from gsparc.evaluation.console import CONFIGS, FULL_ERROR, choices, config_folder, one_line
+from gsparc.models import registry
 
 RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
 LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
@@ -48,7 +54,8 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         config: name of the primary configuration.
     """
     if {"--help", "-h"} & set(sys.argv[1:]):
-        sys.stdout.write(_explained(task, config))  # Hydra's own list of choices and values follows
+        doc = inspect.getmodule(task).__doc__  # type: ignore[union-attr]
+        sys.stdout.write(_explained(doc, config))  # Hydra's own list of choices and values follows
     offer()
     if config == "simulate":
         offer_scenes()
@@ -144,9 +151,27 @@ def _message_of(error: BaseException) -> str:
     return one_line(error)
 
 
-def _explained(task: Callable[[DictConfig], object], config: str) -> str:
+def overview(module: str, config: str) -> str:
+    """What `gsparc COMMAND --help` says: the command, its settings and the choices of its groups.
+
+    Read from files: Hydra's list of every value imports the classes whose arguments they are, for seconds.
+    """
+    source = Path(str(find_spec(module).origin)).read_text(encoding="utf-8")  # type: ignore[union-attr]
+    registry.offer()
+    offer_scenes()
+    given = yaml.safe_load((config_folder() / f"{config}.yaml").read_text(encoding="utf-8"))
+    groups = [group for one in given.get("defaults", ()) if isinstance(one, dict) for group in one]
+    named = {group: {*choices(group), *(plugins(group) if group in GROUPS else ())} for group in groups}
+    lines = "".join(f"  {group}={'|'.join(sorted(names))}\n" for group, names in named.items())
+    more = f"gsparc {config} model=NAME --help" if "model" in groups else f"gsparc {config} --cfg job"
+    return (
+        _explained(ast.get_docstring(ast.parse(source)), config) + f"{lines}\n`{more}` lists every value.\n"
+    )
+
+
+def _explained(doc: str | None, config: str) -> str:
     """What a command does and its settings with their comments, which Hydra leaves out."""
-    what = inspect.cleandoc(inspect.getmodule(task).__doc__ or "").partition("\n\n")[0]  # type: ignore[union-attr]
+    what = inspect.cleandoc(doc or "").partition("\n\n")[0]
     folder = config_folder()
     texts = [(folder / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
     kind = re.search(r"^  - kind: (\w+)", texts[0], re.MULTILINE)  # settings of the command itself

@@ -107,8 +107,8 @@ VALUES = {
     "=": "Could not override",
 }
 CASES = {**SLIPS, **VALUES}
-QUICK = ("model.effects=off", "modle=gsparc", "experiment=paper/rfdi", "model.emission.encoding.octavs=3", "+model.field.cout=3",
-         "seed=abc", "model.attenuation.d_min=0", "eval_on=tset")  # fmt: skip
+QUICK = ("modle=gsparc", "experiment=paper/rfdi", "model.emission.encoding.octavs=3", "+model.field.cout=3",
+         "seed=abc", "model.attenuation.d_min=0", "eval_on=tset", "model.effects=off")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
