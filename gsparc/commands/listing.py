@@ -43,10 +43,10 @@ class Command:
             sys.exit(import_module(path).main(sys.argv[1:]))
         from gsparc.commands.shared import cli
 
-        if sys.argv[1:] in (["--help"], ["-h"]):
-            sys.stdout.write(cli.overview(path, self.name))
-            return
-        cli.run(import_module(path).task, self.name)
+        if {"--help", "-h"} & {*sys.argv[1:]}:  # before torch is imported
+            sys.stdout.write(cli.overview(self.answers, self.name))
+        else:
+            cli.run(import_module(path).task, self.name)
 
 
 COMMANDS = {

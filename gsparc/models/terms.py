@@ -90,28 +90,23 @@ def called_for(
     networks = f"emission.hidden={hidden}" if hidden else None
     placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
     request = networks or placed  # asks for Gaussians that are rendered
-    distance = "attenuation.inverse_distance=true asks for emissions that are no linear read-out"
-    nothing = {  # to be computed here
-        "array": _no_array(site, "rx", "the receiver moves"),
-        "moving_array": _no_array(site, "tx", "the receiver stands still"),
-        "phase": _no_phase(data),
+    distance = distant and init.name != "vectors"
+    obstacles = {
+        "array": _no_array(site, "rx", "the receiver moves")
+        or (networks and f"{networks} asks for networks")
+        or ("attenuation.inverse_distance=true leaves no linear read-out" if distance else None),
+        "moving_array": _no_array(site, "tx", "the receiver stands still")
+        or (request and f"{request} asks for rendered Gaussians"),
+        "phase": _no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
-    rendering = request and f"{request} asks for rendered Gaussians"
-    asked = {
-        "array": (networks and f"{networks} asks for networks")
-        or (distance if distant and init.name != "vectors" else None),
-        "moving_array": rendering,
-        "phase": rendering,
-    }
-    obstacles = {name: why or asked.get(name) for name, why in nothing.items()}
     on, reasons = {}, []
     for name, obstacle in obstacles.items():
         switch = getattr(switches, name)
         if switch is True and obstacle is not None:
             raise ValueError(f"model.effects.{name}=true is not possible: {obstacle}")
         on[name] = switch is not False and obstacle is None
-        if nothing[name] is None:
+        if obstacle is None or "=" in obstacle:  # other settings decide, not the data
             why = obstacle if switch == "auto" else "as configured"
             reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}" + (f": {why}" if why else ""))
     if init.name == "scene":

@@ -14,7 +14,6 @@ from unittest.mock import Mock
 
 import pytest
 from doors import Answer, knock
-from hydra._internal.hydra import Hydra
 
 from gsparc.__main__ import READER_LEFT, main
 from gsparc.commands.listing import COMMANDS
@@ -50,14 +49,12 @@ def test_a_typo_gets_the_nearest_command():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_says_what_a_command_does_and_what_its_settings_mean(command, monkeypatch):
-    if command != "train":
-        monkeypatch.setattr(Hydra, "list_all_config_groups", lambda *_: [])  # Hydra's own list takes most
+def test_help_says_what_a_command_does_and_what_its_settings_mean(command):
     answer = gsparc(command, "--help")
     text = "\n".join(answer.out)
     assert answer.status == 0 and f"gsparc {command}" in text
     if COMMANDS[command].configured:
-        assert "hydra.run.dir" not in text.partition("powered by Hydra")[0] and "  # " in text
+        assert "hydra.run.dir" not in text and "  # " in text
     kinds = {"positions": "errors_deg", "measurements": "shares of the training rows"}
     for kind, setting in kinds.items() if command == "study" else ():
         assert any(setting in line for line in gsparc("study", f"kind={kind}", "-h").out)

@@ -152,6 +152,9 @@ class Recording:
         self.closed: list[str] = []
         Recording.made.append(self)
 
+    def log_hyperparams(self, settings):
+        self.settings = settings
+
     def log_metrics(self, metrics, step=None):
         self.metrics = metrics
 

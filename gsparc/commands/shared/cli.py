@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
 import logging
 import os
-import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial, wraps
-from importlib.util import find_spec
-from pathlib import Path
 from types import FrameType
 
 import hydra
@@ -53,14 +48,11 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         task: called with the composed configuration.
         config: name of the primary configuration.
     """
-    if {"--help", "-h"} & set(sys.argv[1:]):
-        doc = inspect.getmodule(task).__doc__  # type: ignore[union-attr]
-        sys.stdout.write(_explained(doc, config))  # Hydra's own list of choices and values follows
     offer()
     if config == "simulate":
         offer_scenes()
-    if config == "train":  # what it imports brings torch
-        from gsparc.commands.shared.continued import with_settings_of_run
+    if config == "train":
+        from gsparc.commands.shared.continued import with_settings_of_run  # which brings torch
 
         sys.argv[1:] = with_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
@@ -151,35 +143,24 @@ def _message_of(error: BaseException) -> str:
     return one_line(error)
 
 
-def overview(module: str, config: str) -> str:
-    """What `gsparc COMMAND --help` says: the command, its settings and the choices of its groups.
+def overview(answers: str, config: str) -> str:
+    """What `--help` says: what a command `answers`, its settings with their comments, choices of its groups.
 
-    Read from files: Hydra's list of every value imports the classes whose arguments they are, for seconds.
+    Read from files: Hydra's own list of all values imports the classes whose arguments they are, for seconds.
     """
-    source = Path(str(find_spec(module).origin)).read_text(encoding="utf-8")  # type: ignore[union-attr]
     registry.offer()
     offer_scenes()
-    given = yaml.safe_load((config_folder() / f"{config}.yaml").read_text(encoding="utf-8"))
-    groups = [group for one in given.get("defaults", ()) if isinstance(one, dict) for group in one]
-    named = {group: {*choices(group), *(plugins(group) if group in GROUPS else ())} for group in groups}
-    lines = "".join(f"  {group}={'|'.join(sorted(names))}\n" for group, names in named.items())
-    more = f"gsparc {config} model=NAME --help" if "model" in groups else f"gsparc {config} --cfg job"
-    return (
-        _explained(ast.get_docstring(ast.parse(source)), config) + f"{lines}\n`{more}` lists every value.\n"
-    )
-
-
-def _explained(doc: str | None, config: str) -> str:
-    """What a command does and its settings with their comments, which Hydra leaves out."""
-    what = inspect.cleandoc(doc or "").partition("\n\n")[0]
-    folder = config_folder()
-    texts = [(folder / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
-    kind = re.search(r"^  - kind: (\w+)", texts[0], re.MULTILINE)  # settings of the command itself
-    if kind is not None:
+    text = (config_folder() / f"{config}.yaml").read_text(encoding="utf-8")
+    texts = [answers, text.partition("\nhydra:")[0].rstrip()]
+    defaults = yaml.safe_load(text).get("defaults", ())
+    groups = {group: choice for one in defaults if isinstance(one, dict) for group, choice in one.items()}
+    if "kind" in groups:  # settings of the command itself
         kinds = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
-        file = folder / "kind" / f"{(kinds or [kind[1]])[-1]}.yaml"
+        file = config_folder() / "kind" / f"{[groups['kind'], *kinds][-1]}.yaml"
         texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
-    return "\n\n".join([what, *texts]) + "\n\n"
+    named = {group: {*choices(group), *(plugins(group) if group in GROUPS else ())} for group in groups}
+    texts.append("\n".join(f"  {group}={'|'.join(sorted(names))}" for group, names in named.items()))
+    return "\n\n".join(texts) + f"\n\n`gsparc {config} key=value ... --cfg job` shows every value.\n"
 
 
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:

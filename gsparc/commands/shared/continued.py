@@ -45,9 +45,8 @@ def with_settings_of_run(words: Sequence[str]) -> list[str]:
         return [*words]
     files = (told / "overrides.yaml", told / "hydra.yaml")
     its, hydra = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
-    groups = [key for key in said if "." not in key]
-    own = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & {*groups, "ckpt_path"}]
-    own = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in own if _key(one) not in said]
+    own = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & said.keys()]
+    own = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in own]
     once_only = [] if {"-m", "--multirun"} & {*words} else ["hydra.mode=RUN"]  # it may be a job of a multirun
     return [*own, *once_only, *words]
 
