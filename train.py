@@ -1,6 +1,6 @@
 """Train and test a method: `python train.py dataset=rfid model=gsparc dataset.root=DIR split=random`."""
 
 if __name__ == "__main__":
-    from gsparc.commands.train import main
+    from gsparc.commands.listing import COMMANDS
 
-    main()
+    COMMANDS["train"].run()

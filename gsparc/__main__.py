@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.metadata import version
 
 from gsparc.commands.listing import COMMANDS, listed, nearest
 
@@ -29,6 +30,9 @@ def _run() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("--help", "-h", "help"):
         sys.stdout.write(listed())
+        return
+    if name == "--version":
+        sys.stdout.write(f"gsparc {version('gsparc')}\n")
         return
     if name not in COMMANDS:
         sys.stderr.write(f"error: no command is called {name!r}{nearest(name)}\n")

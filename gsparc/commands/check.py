@@ -8,11 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gsparc.data.checks.describe import describe
-from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
-from gsparc.data.datasets.own import read_any
 from gsparc.data.errors import DataError
-from gsparc.data.load import split_for
 
 SETTINGS = ("dataset.stations_file=", "dataset.columns.")
 
@@ -31,6 +27,12 @@ def check(
         console: where lines go.
         draw: PNG file for a map; None draws none.
     """
+    # Here: they bring torch, which --help does not need.
+    from gsparc.data.checks.describe import describe
+    from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
+    from gsparc.data.datasets.own import read_any
+    from gsparc.data.load import split_for
+
     try:
         reading = read_any(path, columns, stations_file)
     except DataError as error:

@@ -38,12 +38,15 @@ class Command:
 
     def run(self) -> None:
         """Run it with the command line in `sys.argv`; ends the process when it fails."""
-        module = import_module(self.module or f"gsparc.commands.{self.name}")
+        path = self.module or f"gsparc.commands.{self.name}"
         if not self.configured:
-            sys.exit(module.main(sys.argv[1:]))
+            sys.exit(import_module(path).main(sys.argv[1:]))
         from gsparc.commands.shared import cli
 
-        cli.run(module.task, self.name)
+        if {"--help", "-h"} & {*sys.argv[1:]}:  # before torch is imported
+            sys.stdout.write(cli.overview(self.answers, self.name))
+        else:
+            cli.run(import_module(path).task, self.name)
 
 
 COMMANDS = {

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
@@ -19,6 +19,8 @@ from gsparc.evaluation.summary import program, provenance, write_summary
 
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    if OmegaConf.is_missing(config, "runs"):
+        raise ValueError("no run is named; say gsparc report RUN..., folders of runs or of whole sweeps")
     paths = [Path(path) for path in config.runs]
     runs = find_runs(paths)
     if config.retime:

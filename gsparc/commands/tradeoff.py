@@ -76,8 +76,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
     heads, lines = tradeoff.cells_of(best, figure)
-    with tracking.opened(config.logger) as loggers:
-        tracking.picture(loggers, "operating points", run_dir / "tradeoff.png", 0)
+    with tracking.opened(config) as loggers:
+        tracking.picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.table(loggers, "operating points", heads, lines)
     sentences = [*tradeoff.irreducible(method), *tradeoff.slope(facts)]
     facts = finish(run_dir, facts, table(title, ["not beaten"], heads[1:], lines), lines=sentences)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from gsparc.commands.shared.settings import RunSettings
 from gsparc.evaluation.experiment.run import Objects, objective_of, run
 from gsparc.evaluation.metric_formats import score_of
 from gsparc.evaluation.summary import remarks, results_table
+
+log = logging.getLogger(__name__)
 
 
 def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
@@ -39,6 +42,9 @@ def task(config: DictConfig) -> float:
             where the data do not tell it and no search asks.
     """
     job = HydraConfig.get().mode == RunMode.MULTIRUN
+    if config.ckpt_path is not None:
+        words = HydraConfig.get().overrides.task
+        log.info("with the settings of the run that it goes on from: %s", " ".join(words))
     return once(run_directory(), config, _train_and_show, again=not job)
 
 

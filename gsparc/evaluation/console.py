@@ -46,7 +46,7 @@ def one_line(error: BaseException) -> str:
             part, _, choice = choice.rpartition("/")
             there = ", ".join(error.options)
             return f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin installed?)"
-        return f"{group}={choice}: no such choice{suggest(choice, _choices(group) or list(error.options))}"
+        return f"{group}={choice}: no such choice{suggest(choice, choices(group) or list(error.options))}"
     if isinstance(error, errors.OverrideParseException):
         return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
     if isinstance(error, errors.ConfigCompositionException) and isinstance(
@@ -79,7 +79,7 @@ def config_folder() -> Path:
     return Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0])
 
 
-def _choices(group: str) -> list[str]:
+def choices(group: str) -> list[str]:
     """Every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
     folder = config_folder() / group
     own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}

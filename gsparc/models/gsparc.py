@@ -15,12 +15,15 @@ class Gsparc(PlannedField):
 
     def planned(self, data: Measurements) -> Plan:
         """See `PlannedField.planned`."""
-        return plan(self.switches, self.init, data, self.settings.emission.hidden, self.settings.field.count)
+        its = self.settings
+        falls = its.attenuation.inverse_distance
+        return plan(self.switches, self.init, data, its.emission.hidden, its.field.count, falls)
 
 
 def plan(
-    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int = 1
-) -> Plan:
+    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int = 1,
+    distant: bool = False,
+) -> Plan:  # fmt: skip
     """The terms for these measurements: the first row of the table that they call for.
 
     Args:
@@ -29,11 +32,12 @@ def plan(
         data: measurements; targets are not looked at.
         hidden: units of the emission's networks: a network is trained by rendering.
         count: of Gaussians to start from; 0 is the residual alone.
+        distant: whether emissions fall with the distance of a Gaussian.
 
     Raises:
         ValueError: a term that is asked for means nothing here.
     """
-    terms, site = called_for(switches, init, data, hidden, count), data.site
+    terms, site = called_for(switches, init, data, hidden, count, distant), data.site
     plain = switches.residual is not False  # a plain process may stand in, or beside
     several = site.stations is not None and len(site.stations) > 1
     searched = ("sources", "rays") if data.directions is not None else ("sources",)

@@ -17,6 +17,7 @@ import numpy as np
 import yaml
 
 from gsparc.data.assemble import content_hash
+from gsparc.data.errors import some
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, indices_hash
 from gsparc.models import checkpoint
@@ -142,7 +143,7 @@ class Origin:
             raise ValueError(f"ckpt_path={stored.path}: does not say what it learned from; start without it")
         for name, group, what in _HASHED:
             if origin[name] != own[name]:
-                differing.append(", ".join(_differences(before, now, (group,))) or f"other {what}")
+                differing += _differences(before, now, (group,)) or [f"other {what}"]
         if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
             facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}
             differing += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
@@ -151,12 +152,12 @@ class Origin:
         differing += _differences(before, now, DECIDING)
         if differing:
             raise ValueError(
-                f"ckpt_path={stored.path}: was trained with {'; '.join(differing)}: "
+                f"ckpt_path={stored.path}: was trained with {some(differing)}: "
                 "go on with the same, or start again without ckpt_path"
             )
         changed = _differences(before, now, CHANGEABLE)
         if changed:
-            log.warning("going on from %s, which had %s", stored.path, "; ".join(changed))
+            log.warning("going on from %s, which had %s", stored.path, some(changed))
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:

@@ -9,7 +9,8 @@ from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.instantiate import node_of, plugins, refuse_foreign, suggest, targets
+from gsparc.data.instantiate import find, node_of, plugins, refuse_foreign, suggest, targets
+from gsparc.data.limits import SettingError
 
 if TYPE_CHECKING:  # brings torch, which a list of choices does not need
     from gsparc.models.method import Method
@@ -101,7 +102,26 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
             refuse_foreign(path)
     from gsparc.models.method import Method
 
+    kind = find(str(target))
+    if isinstance(kind, type):
+        _refuse_words("model", node, node_of(kind))
     method = instantiate(node)
     if not isinstance(method, Method):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method
+
+
+def _refuse_words(group: str, node: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
+    """`SettingError` where a group of settings, at any depth, is given as one value."""
+    for name, own in defaults.items():
+        value = node.get(name, own)
+        if name == "init" and isinstance(value, str):  # a group of the run, which the method's follows
+            raise SettingError(f"{group}.{name}={value}: say {name}={value}")
+        if not isinstance(own, Mapping):
+            continue
+        if not isinstance(value, Mapping):
+            some = "=..., ".join(f"{group}.{name}.{key}" for key in list(own)[1:3])  # after `_target_`
+            raise SettingError(
+                f"{group}.{name}={value}: is a group of settings, given one by one: {some}=..."
+            )
+        _refuse_words(f"{group}.{name}", value, own)

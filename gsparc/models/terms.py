@@ -77,9 +77,11 @@ class Terms:
 
 
 def called_for(
-    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int
+    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, distant: bool
 ) -> Terms:
     """The terms that mean something here and are not switched off; see `gsparc.plan`.
+
+    `distant`: whether emissions fall with the distance, which makes them no linear read-out of an array.
 
     Raises:
         ValueError: a term that is asked for means nothing here.
@@ -88,9 +90,11 @@ def called_for(
     networks = f"emission.hidden={hidden}" if hidden else None
     placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
     request = networks or placed  # asks for Gaussians that are rendered
+    distance = distant and init.name != "vectors"
     obstacles = {
         "array": _no_array(site, "rx", "the receiver moves")
-        or (networks and f"{networks} asks for networks"),
+        or (networks and f"{networks} asks for networks")
+        or ("attenuation.inverse_distance=true leaves no linear read-out" if distance else None),
         "moving_array": _no_array(site, "tx", "the receiver stands still")
         or (request and f"{request} asks for rendered Gaussians"),
         "phase": _no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
@@ -102,9 +106,9 @@ def called_for(
         if switch is True and obstacle is not None:
             raise ValueError(f"model.effects.{name}=true is not possible: {obstacle}")
         on[name] = switch is not False and obstacle is None
-        if obstacle is None:
-            suffix = "" if switch == "auto" else ": as configured"
-            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{suffix}")
+        if obstacle is None or "=" in obstacle:  # other settings decide, not the data
+            why = obstacle if switch == "auto" else "as configured"
+            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}" + (f": {why}" if why else ""))
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True

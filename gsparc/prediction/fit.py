@@ -50,7 +50,7 @@ def fit(
         rssi: (n,) received powers [dBm].
         csi: (n,), (n, subcarriers) or (n, antennas, subcarriers) complex channels.
         spectrum: (n, elevations, azimuths) directional spectra.
-        model: a name of `gsparc --help model`.
+        model: a name of `gsparc train --help`.
         budget_s: seconds of training; None: the model's own.
         seed: of whatever is random.
         save: a checkpoint to write, for `gsparc.load` and all commands.

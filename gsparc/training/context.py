@@ -100,6 +100,10 @@ class FitContext:
 
     def within(self, folder: str, **changes: Any) -> FitContext:
         """The context of a part of the fit, which may write to a folder of its own in `run_dir`."""
+        if self.loggers:
+            from gsparc.training.tracking import Part  # imports Lightning
+
+            changes = {"loggers": [Part(one, folder) for one in self.loggers], **changes}
         return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
 
     def curve(

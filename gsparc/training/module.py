@@ -19,7 +19,7 @@ from gsparc.field.initial import Snapshot
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian
 from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ssim
-from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
+from gsparc.training.optimizer import OptimizerSettings, kind_of, optimizer_for, scheduler_for
 from gsparc.training.pace import Pace
 from gsparc.training.processes import count
 from gsparc.training.schedule import in_steps
@@ -127,10 +127,10 @@ class GaussianModule(L.LightningModule):
         return loss * batch.share
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        """The rates of the step that was taken."""
+        """The rates of the step that was taken, under the names of their settings (`OptimizerSettings`)."""
         if self.global_step % self.log_every == 0:
-            for group in self.trainer.optimizers[0].param_groups:
-                self.log(f"rate/{group['name']}", group["lr"])
+            groups = self.trainer.optimizers[0].param_groups
+            self.log_dict({f"rate/{kind_of(group['name'])}": group["lr"] for group in groups})
 
     @property
     def count(self) -> int:

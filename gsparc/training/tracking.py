@@ -8,24 +8,65 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.types import RunMode
 from hydra.utils import instantiate
+from lightning.pytorch.loggers import CSVLogger, Logger
+from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
     import lightning.pytorch as L
-    from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+    from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+
+TAGS = ("dataset", "split", "model", "paper", "experiment")  # groups whose choices are tags
+NAME = 120  # characters
+
+
+class Part(Logger):
+    """The dashboard of a run for a part of it, a refit or a fold: figures under its name, a series each."""
+
+    def __init__(self, whole: Logger, part: str) -> None:
+        super().__init__()
+        self.whole, self.part = whole, part
+
+    name = property(lambda self: self.whole.name)
+    version = property(lambda self: self.whole.version)
+
+    def log_hyperparams(self, *unused: Any, **named: Any) -> None:
+        """Nothing: the run's are said once."""
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log figures under the part's name."""
+        self.whole.log_metrics({f"{self.part}/{name}": value for name, value in metrics.items()}, step)
+
+    def log_image(self, name: str, files: Sequence[str], step: int | None = None) -> None:
+        """Show a picture under the part's name, where the dashboard shows any."""
+        picture([self.whole], f"{self.part}/{name}", Path(files[0]), step)
+
+    def save(self) -> None:
+        """Write what was logged."""
+        self.whole.save()
 
 
 @contextmanager
-def opened(nodes: Mapping[str, Any] | None) -> Iterator[list[Logger]]:
-    """Loggers of a config of the group `logger`, closed whatever happens."""
+def opened(config: DictConfig) -> Iterator[list[Logger]]:
+    """Loggers of `config.logger`, told the whole resolved `config`, closed whatever happens."""
     made: list[Logger] = []
+    settings: Any = OmegaConf.to_container(config, resolve=True)
     status = "failed"
     try:
-        made.extend(instantiate(node) for node in (nodes or {}).values())
+        made.extend(instantiate(node) for node in (config.logger or {}).values())
+        for logger in made:
+            if not isinstance(logger, CSVLogger):
+                logger.log_hyperparams(settings)
         yield made
         status = "success"
     finally:
         for logger in made:
+            if isinstance(logger, CSVLogger):  # now: its folder is opened by the process that trains
+                logger.log_hyperparams(settings)
             logger.finalize(status)
             if hasattr(logger, "experiment") and hasattr(logger.experiment, "finish"):
                 logger.experiment.finish(exit_code=0 if status == "success" else 1)
@@ -36,7 +77,7 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
 
     Args:
         offline: None keeps the run on disk (`wandb sync` sends it later) unless `wandb login` was done.
-        **settings: of Lightning's `WandbLogger`.
+        **settings: of Lightning's `WandbLogger`; name, group and tags that are null follow from the job.
     """
     import wandb  # slow to import, and few runs need it
     from lightning.pytorch.loggers import WandbLogger
@@ -44,7 +85,25 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
     stays = not wandb.login(prompt=False) if offline is None else offline
     # Lightning sets a variable that wandb, once asked for a login, does not read again.
     mode: dict[str, Any] = {"mode": "offline"} if stays else {}
-    return WandbLogger(offline=stays, **mode, **settings)
+    given = {name: value for name, value in settings.items() if value}
+    return WandbLogger(offline=stays, **{**_of_job(), **given, **mode})
+
+
+def _of_job() -> dict[str, Any]:
+    """What runs are sorted by: choices of groups, and of a job its multirun and what it differs in."""
+    if not HydraConfig.initialized():
+        return {}
+    hydra = HydraConfig.get()
+    tags = [str(one) for group in TAGS if (one := hydra.runtime.choices.get(group))]
+    if hydra.mode != RunMode.MULTIRUN:
+        return {"name": "-".join(tags), "tags": tags}
+    given, file = [], Path(hydra.sweep.dir) / "multirun.yaml"
+    if file.exists():  # of Hydra's own sweeper
+        given = yaml.safe_load(file.read_text(encoding="utf-8"))["hydra"]["overrides"]["task"]
+    every = OverridesParser.create().parse_overrides(given)
+    varies = {one.key_or_group: one.is_sweep_override() for one in every}
+    own = " ".join(o for o in hydra.overrides.task if varies.get(o.lstrip("+~").partition("=")[0], True))
+    return {"name": f"{hydra.job.num} {own}"[:NAME], "group": Path(hydra.sweep.dir).name, "tags": tags}
 
 
 def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardLogger:
@@ -56,14 +115,23 @@ def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardL
     from lightning.pytorch.loggers import TensorBoardLogger
 
     try:
-        return TensorBoardLogger(save_dir, name=name, version="")
+        return TensorBoardLogger(save_dir, name=name, version="", default_hp_metric=False)
     except ModuleNotFoundError:
         raise ValueError(
             'logger=tensorboard: TensorBoard is not installed; say pip install "gsparc[tensorboard]"'
         ) from None
 
 
-def picture(loggers: Iterable[Any], name: str, path: Path, step: int) -> None:
+def final(loggers: Iterable[Any], figures: Mapping[str, float]) -> None:
+    """Give the dashboards the figures of the whole run."""
+    for logger in loggers:
+        if hasattr(logger, "hparams"):  # TensorBoard sorts runs by settings and figures that come together
+            logger.log_hyperparams(logger.hparams, dict(figures))
+        else:
+            logger.log_metrics(dict(figures))
+
+
+def picture(loggers: Iterable[Any], name: str, path: Path, step: int | None = None) -> None:
     """Give a PNG file to the dashboards that show pictures."""
     for logger in loggers:
         if hasattr(logger, "log_image"):  # Weights & Biases

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import re
+from inspect import signature
 from pathlib import Path
 
 import hydra
 import pytest
+import yaml
 from campaigns import brief, compose, spectra
 from doors import knock
 from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
+from lightning import Trainer
+from omegaconf import OmegaConf, open_dict
 
 import gsparc.conf
 from gsparc.commands.train import main
@@ -53,6 +56,26 @@ def test_every_choice_composes_and_builds(choice, monkeypatch):
         assert re.fullmatch(rf"outputs/own/{name}/[\d_-]+-\d{{6}}", config.hydra.run.dir)
 
 
+def said_in(file: Path) -> dict:
+    """What a file says itself, on top of what the files of its own folder say that it builds on."""
+    own = yaml.safe_load(file.read_text())
+    below = [one for one in own.pop("defaults", []) if isinstance(one, str) and one != "_self_"]
+    under = OmegaConf.merge(*(said_in(file.with_name(f"{one}.yaml")) for one in below), own)
+    return OmegaConf.to_container(under)
+
+
+@pytest.mark.parametrize(
+    "file", [f for group in ("experiment", "paper") for f in sorted((CONF / group).rglob("*.yaml"))], ids=str
+)
+def test_what_an_experiment_says_is_what_is_done(file, monkeypatch):
+    """`threads: 1` and `baselines: [nearest, gp]` of ablations never acted: train.yaml had the last word."""
+    group, choice = file.relative_to(CONF).parts[0], file.relative_to(CONF / file.relative_to(CONF).parts[0])
+    config = composed(monkeypatch, f"{group}={choice.with_suffix('')}")
+    with open_dict(config):
+        as_said = OmegaConf.merge(config, said_in(file))
+    assert OmegaConf.to_container(as_said) == OmegaConf.to_container(config)
+
+
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
     """A new `auto` must be settled (training/auto_settings.py, training/terms.py) and be named here."""
 
@@ -74,7 +97,15 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
 def test_trainer_defaults_in_code_are_those_of_the_configuration():
     trainer = OmegaConf.to_container(compose().trainer)
     del trainer["_target_"]
-    assert trainer.pop("gradient_clip_val") is None and DEFAULTS.keywords == trainer
+    lightning = {name: one.default for name, one in signature(Trainer).parameters.items()}
+    assert {**lightning, **DEFAULTS.keywords} == {**lightning, **trainer}
+
+
+@pytest.mark.parametrize("option", ["max_epochs=3", "max_time=00:00:01:00", "profiler=simple"])
+def test_options_of_the_trainer_need_no_plus(option):
+    """`trainer.max_epochs=3`: no such setting."""
+    name, _, value = option.partition("=")
+    assert str(compose(f"trainer.{option}").trainer[name]) == value
 
 
 def test_the_paper_leaves_nothing_to_auto():

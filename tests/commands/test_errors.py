@@ -22,7 +22,7 @@ REFUSED = [
     ("study kind=efects", "kind=efects: no such choice; did you mean 'effects'?"),
     ("study baselines=[gpp]", "baselines=['gpp']: a list of methods is needed, 'gpp' is none"),
     ("study model.field.count=-1", "model.field.count=-1: a whole number of at least 0"),
-    ("report", "runs is not set; give runs=..."),
+    ("report", "no run is named; say gsparc report RUN..., folders of runs"),
     ("serve ckpt=none.ckpt host=0.0.0.0", "others reach it; set GSPARC_TOKEN, or say token=WORD"),
     # Without baselines it was an AttributeError, after every combination had been made.
     ("tradeoff ckpt={spectra} baselines=[] eval_on=tset", "eval_on='tset' is none of train, val, test"),

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, channels, compose, powers, spectra
-from doors import knock
+from doors import assert_refused, knock
 from lightning.pytorch import Trainer
 from omegaconf import open_dict
 
@@ -151,6 +151,9 @@ class Recording:
         self.inner = CSVLogger(os.devnull)
         self.closed: list[str] = []
         Recording.made.append(self)
+
+    def log_hyperparams(self, settings):
+        self.settings = settings
 
     def log_metrics(self, metrics, step=None):
         self.metrics = metrics
@@ -462,6 +465,22 @@ def test_an_interrupt_leaves_a_checkpoint_that_goes_on(spectra_file, tmp_path):
     facts, _ = train(compose(*brief(spectra_file, *rare, *more)), tmp_path / "on")
     assert np.isfinite(facts["test/psnr_db"])
     assert checkpoint.read(tmp_path / "on" / "model.ckpt").method == "gsparc"
+
+
+def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
+    """The settings it did not name were the defaults, and each of them stood in the refusal."""
+    stopped = "callbacks.stop={_target_: lost.Interrupt, step: 15}"
+    begun = brief(spectra_file, "model.refit=false", f"+{stopped}", f"hydra.run.dir={tmp_path / 'run'}")
+    assert knock(main, "train.py", begun).status == 130
+    on = f"ckpt_path={tmp_path / 'run'}", f"hydra.run.dir={tmp_path / 'on'}"
+    others = [f"model.emission.{name}=0.5" for name in ("init_scale", "init_bias")] + ["seed=3"]
+    others += [f"model.effects.{name}=auto" for name in ("array", "phase", "power", "residual")]
+    answer = knock(main, "train.py", [*on, *others, "+callbacks.stop=null"])
+    assert_refused(answer, r"trained with seed=0 \(here 3\)(, \S+ \(here \S+\)){4} and 2 more: go on with")
+    assert knock(main, "train.py", [*on, "+callbacks.stop=null"]).status == 0
+    resumed = checkpoint.read(tmp_path / "on" / "model.ckpt").configuration
+    assert resumed["dataset"]["file"] == str(spectra_file) and resumed["model"]["field"]["count"] == 40
+    assert resumed["seed"] == 0 and resumed["trainer"]["max_steps"] == 20
 
 
 @pytest.mark.slow

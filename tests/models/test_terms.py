@@ -56,6 +56,16 @@ def test_what_a_site_calls_for(kind, given, parts):
     assert kind != "unplaced csi" or "does not say where the static end is" in found.reasons[-1]
 
 
+def test_inverse_distance_was_refused_with_advice_that_undid_it():
+    """With an array that is `auto` the Gaussians emit powers; one that was asked for stays an error."""
+    data, said = measured("array"), (0, 1, True)
+    found = plan(EffectSettings(), InitSettings(), data, *said)
+    assert found.rasterized and not found.array
+    assert "effects.array -> off: attenuation.inverse_distance=true" in found.reasons[0]
+    with pytest.raises(ValueError, match=r"array=true is not possible: attenuation\.inverse_distance"):
+        plan(EffectSettings(array=True), InitSettings(), data, *said)
+
+
 def test_an_array_may_be_switched_off():
     assert not planned("array", {"array": False}).array
 

@@ -1,10 +1,23 @@
-"""Dashboards get pictures and the final table; a logger that shows neither is left alone."""
+"""Dashboards get settings, names, series, pictures and the final table; read back from what they wrote."""
+
+from dataclasses import fields
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+import yaml
+from campaigns import brief, spectra
+from doors import knock
+from offline import offline_run
 from PIL import Image
 
-from gsparc.training.tracking import picture, table, tensorboard_logger
+from gsparc.commands.train import main
+from gsparc.training.optimizer import OptimizerSettings
+from gsparc.training.tracking import Part, picture, table, tensorboard_logger
+
+COUNTS = {0: 40, 1: 30}  # of Gaussians, in the jobs of the sweep
 
 
 class Records:
@@ -53,3 +66,80 @@ def test_other_loggers_are_left_alone(file):
     picture([logger], "predictions", file, 7)
     table([logger], "results", ["method"], [["gp"]])
     assert not vars(logger)
+
+
+def test_a_part_has_pictures_and_figures_under_its_name(file):
+    logger = Records()
+    logger.log_metrics = lambda figures, step: logger.said.append((figures, step))
+    part = Part(Part(logger, "fold1"), "refit")
+    part.log_metrics({"train/loss": 0.5}, 9)
+    picture([part], "predictions", file, 7)
+    assert logger.said == [({"fold1/refit/train/loss": 0.5}, 9), ("fold1/refit/predictions", [str(file)], 7)]
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory) -> list[Path]:
+    """Folders of two jobs with a refit each, told to all dashboards."""
+    folder = tmp_path_factory.mktemp("told")
+    board = "{_target_: gsparc.training.tracking.tensorboard_logger, save_dir: '${hydra:runtime.output_dir}'}"
+    words = [word for word in brief(spectra(folder / "own.npz")) if word != "logger=none"]
+    words += ["logger=wandb", "logger.wandb.offline=true", "~hydra.callbacks.sweep"]
+    words += [f"+logger.tensorboard={board}"] if find_spec("tensorboard") else []
+    words += [
+        f"model.field.count={','.join(map(str, COUNTS.values()))}",
+        f"hydra.sweep.dir={folder / 'swept'}",
+    ]
+    assert knock(main, "train.py", ["-m", *words]).status == 0
+    return sorted(file.parent for file in (folder / "swept").glob("*/summary.json"))
+
+
+def rises(steps) -> bool:
+    return len(steps) > 0 and list(steps) == sorted(set(steps))
+
+
+@pytest.mark.parametrize("job", COUNTS)
+def test_wandb_knew_neither_settings_nor_name_nor_sweep(sweep, job):
+    run = offline_run(sweep[job])
+    assert (run.name, run.group) == (f"{job} model.field.count={COUNTS[job]}", "swept")
+    assert run.tags == ["own", "random", "gsparc"]
+    model, trainer = run.config["model"], run.config["trainer"]
+    assert model["field"]["count"] == COUNTS[job] and trainer["max_steps"] == 20
+    assert model["optimizer"]["positions"] == 1e-3
+    for key in ("train/loss", "refit/train/loss", "val/psnr_db"):
+        assert rises([step for step, _ in run.series(key)]), key
+    told = {key for row in run.rows for key in row}
+    rates = {key.removeprefix("rate/") for key in told if key.startswith("rate/")}
+    assert {"positions", "emission"} < rates <= {setting.name for setting in fields(OptimizerSettings)}
+    assert {"final/test/psnr_db", "test rows.filenames", "results.path"} <= told
+
+
+@pytest.mark.parametrize("job", COUNTS)
+def test_csv_knew_no_settings_and_a_refit_began_its_series_again(sweep, job):
+    folder = sweep[job] / "csv" / "version_0"
+    settings = yaml.safe_load((folder / "hparams.yaml").read_text())
+    assert settings["model"]["field"]["count"] == COUNTS[job] and settings["seed"] == 0
+    rows = pd.read_csv(folder / "metrics.csv")
+    for key in ("train/loss", "refit/train/loss", "val/psnr_db", "refit/rate/positions"):
+        assert rises(rows.step[rows[key].notna()]), key
+    assert rows["final/test/psnr_db"].notna().sum() == 1
+
+
+@pytest.mark.parametrize("job", COUNTS)
+def test_tensorboard_knew_no_settings_beside_the_figures(sweep, job):
+    pytest.importorskip("tensorboard", reason="TensorBoard is not installed: the extra tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+
+    found = EventAccumulator(str(sweep[job] / "tensorboard")).Reload()
+    for key in ("train/loss", "refit/train/loss", "val/psnr_db"):
+        assert rises([one.step for one in found.Scalars(key)]), key
+    (content,) = found.PluginTagToContent("hparams").keys() & {"_hparams_/session_start_info"}
+    told = HParamsPluginData.FromString(
+        found.PluginTagToContent("hparams")[content]
+    ).session_start_info.hparams
+    assert told["model/field/count"].number_value == COUNTS[job] and told["seed"].number_value == 0
+    assert len(found.Scalars("final/test/psnr_db")) == 1
+    assert (
+        found.Images("test rows")
+        and b"gsparc" in found.Tensors("results/text_summary")[0].tensor_proto.string_val[0]
+    )

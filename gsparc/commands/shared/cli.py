@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 import os
-import re
 import signal
 import sys
 import threading
@@ -15,6 +13,7 @@ from functools import partial, wraps
 from types import FrameType
 
 import hydra
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -23,7 +22,9 @@ from rich.console import Console
 from gsparc.commands.shared import job_name  # noqa: F401  # configurations name folders by it
 from gsparc.commands.shared.plugins import offer, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release
-from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, one_line
+from gsparc.data.instantiate import GROUPS, plugins
+from gsparc.evaluation.console import CONFIGS, FULL_ERROR, choices, config_folder, one_line
+from gsparc.models import registry
 
 RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
 LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
@@ -47,11 +48,13 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         task: called with the composed configuration.
         config: name of the primary configuration.
     """
-    if {"--help", "-h"} & set(sys.argv[1:]):
-        sys.stdout.write(_explained(task, config))  # Hydra's own list of choices and values follows
     offer()
     if config == "simulate":
         offer_scenes()
+    if config == "train":
+        from gsparc.commands.shared.continued import with_settings_of_run  # which brings torch
+
+        sys.argv[1:] = with_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
@@ -140,17 +143,24 @@ def _message_of(error: BaseException) -> str:
     return one_line(error)
 
 
-def _explained(task: Callable[[DictConfig], object], config: str) -> str:
-    """What a command does and its settings with their comments, which Hydra leaves out."""
-    what = inspect.cleandoc(inspect.getmodule(task).__doc__ or "").partition("\n\n")[0]  # type: ignore[union-attr]
-    folder = config_folder()
-    texts = [(folder / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
-    kind = re.search(r"^  - kind: (\w+)", texts[0], re.MULTILINE)  # settings of the command itself
-    if kind is not None:
+def overview(answers: str, config: str) -> str:
+    """What `--help` says: what a command `answers`, its settings with their comments, choices of its groups.
+
+    Read from files: Hydra's own list of all values imports the classes whose arguments they are, for seconds.
+    """
+    registry.offer()
+    offer_scenes()
+    text = (config_folder() / f"{config}.yaml").read_text(encoding="utf-8")
+    texts = [answers, text.partition("\nhydra:")[0].rstrip()]
+    defaults = yaml.safe_load(text).get("defaults", ())
+    groups = {group: choice for one in defaults if isinstance(one, dict) for group, choice in one.items()}
+    if "kind" in groups:  # settings of the command itself
         kinds = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
-        file = folder / "kind" / f"{(kinds or [kind[1]])[-1]}.yaml"
+        file = config_folder() / "kind" / f"{[groups['kind'], *kinds][-1]}.yaml"
         texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
-    return "\n\n".join([what, *texts]) + "\n\n"
+    named = {group: {*choices(group), *(plugins(group) if group in GROUPS else ())} for group in groups}
+    texts.append("\n".join(f"  {group}={'|'.join(sorted(names))}" for group, names in named.items()))
+    return "\n\n".join(texts) + f"\n\n`gsparc {config} key=value ... --cfg job` shows every value.\n"
 
 
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.run_lock import in_use, locked
@@ -22,7 +23,44 @@ log = logging.getLogger(__name__)
 
 RECORD = "job.json"  # of a job's folder: its settings and data, when it began, and what it returned
 WHERE = ("engine", "workers", "ray")  # settings of where a job is done
+PATHS = ("init_from", "known_walls")  # settings that may be files, beside those of groups
+DEEP = 4  # RUN/fold0/refit/last.ckpt
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
+
+
+def with_settings_of_run(words: Sequence[str]) -> list[str]:
+    """A command line with the settings of the run that its `ckpt_path=` names; what it says itself wins.
+
+    Args:
+        words: overrides and options. A group chosen among them, as `model=gp`, leaves out what the run was
+            told of that group.
+    """
+    said = {_key(word): word.partition("=")[2].strip("'\"") for word in words if not word.startswith("-")}
+    if not said.get("ckpt_path"):
+        return [*words]
+    left = Path(said["ckpt_path"]).resolve()
+    notes = [folder / ".hydra" for folder in (left, *left.parents)[:DEEP]]
+    told = next((folder for folder in notes if (folder / "overrides.yaml").exists()), None)
+    if told is None:
+        return [*words]
+    files = (told / "overrides.yaml", told / "hydra.yaml")
+    its, hydra = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
+    own = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & said.keys()]
+    own = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in own]
+    once_only = [] if {"-m", "--multirun"} & {*words} else ["hydra.mode=RUN"]  # it may be a job of a multirun
+    return [*own, *once_only, *words]
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _found_from(folder: Path, override: str) -> str:
+    """The override with a path that was given in another working folder made absolute."""
+    key, _, value = override.partition("=")
+    path = folder / value.strip("'\"")
+    moved = folder != Path.cwd() and value and ("." in key or key in PATHS) and path.exists()
+    return f"{key}='{path}'" if moved else override
 
 
 def once(

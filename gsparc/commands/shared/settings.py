@@ -64,7 +64,9 @@ class RunSettings(Checked):
             raise SettingError(f"trainer.accelerator={accelerator}: there is no GPU here; say trainer=cpu")
         if "model" in config:
             build(config.model)  # its parts check themselves, and so do callbacks
-        for node in (config.get("callbacks") or {}).values():
+        for name, node in (config.get("callbacks") or {}).items():
+            if node is not None and not isinstance(node, Mapping):
+                raise SettingError(f"callbacks.{name}={node}: is a group of settings; null leaves it out")
             instantiate(node)
         for key, value in _leaves(values):
             if isinstance(value, float):

@@ -95,12 +95,13 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         extra = {**marks, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(files[number], method, yaml, extra)
 
-    with tracking.opened(config.logger) as loggers:
+    with tracking.opened(config) as loggers:
         read_s = watch.spent  # counts: the seconds that are given begin with the first read
 
         def context(number: int) -> FitContext:
-            own = {"run_dir": folders[number], "resume": resumes[number]}
-            base = context_of(config, loggers=loggers, datamodule=module, **own)
+            own = loggers if count == 1 else [tracking.Part(one, f"fold{number}") for one in loggers]
+            there = {"run_dir": folders[number], "resume": resumes[number]}
+            base = context_of(config, loggers=own, datamodule=module, **there)
             if number or base.budget_s is None:
                 return base
             return replace(base, budget_s=max(base.budget_s - read_s, LEAST_SHARE * base.budget_s))
@@ -131,17 +132,16 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             for name, value in facts.items()
             if isinstance(value, (int, float)) and not name.startswith(("baseline/", "paired/"))
         }
-        for logger in loggers:
-            logger.log_metrics(own)
+        tracking.final(loggers, own)
         title = f"{data.site.name}: test rows of {methods[0].label}"
         draw_predictions(methods[0], data, split.folds[0], title, run_dir / "test.png")
-        tracking.picture(loggers, "test rows", run_dir / "test.png", 0)
+        tracking.picture(loggers, "test rows", run_dir / "test.png")
         label = str(facts["model/label"])
         tracking.table(loggers, "results", *result_rows(facts, label, config.eval_on))
         objects = methods[0].objects()
         if len(objects):
             draw_found(data, objects, run_dir / "found.png", known)
-            tracking.picture(loggers, "found", run_dir / "found.png", 0)
+            tracking.picture(loggers, "found", run_dir / "found.png")
     write_samples(run_dir / "per_sample.csv", evaluation.columns)
     write_summary(run_dir / "summary.json", facts)
     return facts, Objects(methods, files, data, split, evaluation)

@@ -6,7 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsparc.commands.shared.cli import _message_of
-from gsparc.commands.shared.continued import once
+from gsparc.commands.shared.continued import once, with_settings_of_run
 from gsparc.commands.shared.run_lock import locked
 from gsparc.evaluation.report.sweep import FAILURE
 
@@ -107,3 +107,34 @@ def test_a_run_among_its_own_data_was_done_again(tmp_path):
     (tmp_path / "a.csv").write_text("changed")
     once(tmp_path / "runs" / "1", config, lambda config: seen.append(1) or 7.5)
     assert seen == [1, 1]
+
+
+HYDRA = "hydra: {runtime: {cwd: WHERE}}"
+
+
+@pytest.mark.parametrize(
+    ("words", "kept"),
+    [
+        ([], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "+trainer.x=1", "hydra.mode=RUN"]),
+        (["model.steps=7"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
+        (["model=gp"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
+        (["dataset=rfid", "-m"], ["model.steps=5", "+trainer.x=1"]),
+        (["~trainer.x"], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "hydra.mode=RUN"]),
+    ],
+)
+@pytest.mark.parametrize("of", ["run", "run/last.ckpt", "run/fold0/refit/last.ckpt"])
+def test_a_run_to_go_on_from_brings_its_settings(tmp_path, of, words, kept):
+    """`ckpt_path=RUN` loaded the default data and model, and was refused for not being those of the run."""
+    notes, data = tmp_path / "run" / ".hydra", tmp_path / "site.npz"
+    notes.mkdir(parents=True)
+    data.touch()
+    told = "[dataset=own, dataset.file=site.npz, model.steps=5, +trainer.x=1, ckpt_path=before]"
+    (notes / "overrides.yaml").write_text(told)
+    (notes / "hydra.yaml").write_text(HYDRA.replace("WHERE", str(tmp_path)))  # where the run was started
+    line = [f"ckpt_path={tmp_path / of}", *words]
+    assert with_settings_of_run(line) == [*(one.replace("DATA", str(data)) for one in kept), *line]
+
+
+def test_a_command_line_without_a_run_to_go_on_from_stays(tmp_path):
+    for line in (["model=gp"], ["ckpt_path=null"], [f"ckpt_path={tmp_path / 'gone.ckpt'}", "seed=1"]):
+        assert with_settings_of_run(line) == line

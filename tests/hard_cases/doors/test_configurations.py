@@ -89,6 +89,12 @@ VALUES = {
     "model.confidence.clamp=1e4": "at most 80",
     "model.effects.phase=ture": "one of true, false, auto",
     "model.effects.residual=splat": "one of true, false, auto",
+    "model.effects=off": "one by one: model.effects.image=..., model.effects.array=...",
+    "model.attenuation=null": "one by one: model.attenuation.inverse_distance=...",
+    "model.emission.encoding=raw": "one by one: model.emission.encoding.kind=...",
+    "model.optimizer=adam": "one by one: model.optimizer.positions=...",
+    "model.init=sources": "say init=sources",
+    "callbacks.densify=off": "null leaves it out",
     "init.name=maybe": "one of auto, sphere",
     "model.refit=perhaps": "one of true, false",
     "model._target_=os.system": "'os.system'",
@@ -102,7 +108,7 @@ VALUES = {
 }
 CASES = {**SLIPS, **VALUES}
 QUICK = ("modle=gsparc", "experiment=paper/rfdi", "model.emission.encoding.octavs=3", "+model.field.cout=3",
-         "seed=abc", "model.attenuation.d_min=0", "eval_on=tset")  # fmt: skip
+         "seed=abc", "model.attenuation.d_min=0", "eval_on=tset", "model.effects=off")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
