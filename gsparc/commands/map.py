@@ -51,7 +51,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "area": settings["area"], "height_m": config.height_m, "step_m": config.step_m,
         "threshold_db": float(config.threshold_db), "stations": stations_of(settings["stations"]),
         "load": settings["load"], "noise_db": config.noise_db, "other_end": settings["other_end"],
-        "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db),
+        "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db), "unit": config.unit,
     }  # fmt: skip
     map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
     geotiff_wanted(config.geotiff, predictor.site.georeference)
@@ -59,8 +59,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     field = map_of(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
     lines = notes_of(field, coverage)
-    unit = str(config.unit or predictor.site.level_unit)
-    sheets = list(layers(field, unit))
+    sheets = list(layers(field))
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")

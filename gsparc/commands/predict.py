@@ -15,20 +15,15 @@ from gsparc.prediction.operating_point import load
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
     RunSettings.of(config)
-    predictor = load(config.ckpt, confidence=config.confidence)
-    facts = predict(
-        predictor,
-        config.places,
-        config.out,
-        station=None if config.station is None else str(config.station),
-        columns=plain(config.columns),
-        overwrite=bool(config.overwrite),
-    )
+    predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
+    station = None if config.station is None else str(config.station)
+    how: dict[str, Any] = {"columns": plain(config.columns), "overwrite": bool(config.overwrite)}
+    facts = predict(predictor, config.places, config.out, station=station, **how)
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:
         before += f", {stations} station{'s' * (stations > 1)}"
-    if "predict/lowest_db" in facts:
-        low, high = facts["predict/lowest_db"], facts["predict/highest_db"]
-        before += f": {low:.1f} to {high:.1f} {predictor.site.level_unit}"
+    ends = [value for name, value in facts.items() if name.startswith(("predict/lowest", "predict/highest"))]
+    if ends:
+        before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"
     before += f"; predictions in {facts['out']}; summary "
     return finish(run_directory(), facts | {"ckpt": str(config.ckpt)}, before=before)

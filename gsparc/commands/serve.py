@@ -40,9 +40,9 @@ def task(config: DictConfig) -> None:
 
     from gsparc.prediction.serving import application
 
-    predictor = load(config.ckpt)
+    predictor = load(config.ckpt, unit=config.unit)
     predictor = predictor if config.station is None else predictor.at(config.station)
-    if predictor.site.static_end is None or (predictor.site.stations and config.station is None):
+    if predictor.site.static_end is None or (predictor.site.stations and predictor.site.kind != "rssi"):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
     app = application(predictor, config.delay_ms / 1e3, config.most, token)
     open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)

@@ -64,7 +64,7 @@ def view_of(settings: dict[str, Any]) -> SiteView:
     map_layers: tuple[Any, ...] = ()
     if settings["map"] is not None:
         field = FieldMap.read(settings["map"])
-        map_layers = tuple((field.grid, layer) for layer in layers(field, viewed.unit) if not layer.words)
+        map_layers = tuple((field.grid, layer) for layer in layers(field) if not layer.words)
     at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
     return SiteView(viewed, building, grid_for(viewed, settings, plan), map_layers, at, other)
 

@@ -153,8 +153,7 @@ def assemble(
         target_scale=target_scale, static_position=still, georeference=links.georeference,
         moving_box=np.stack([moving[usual].min(axis=0), moving[usual].max(axis=0)]),
         stations=None if stations is None else replace(stations, position=stations.position - origin),
-        rx_rotation=np.array(rx_rotation[0], dtype=np.float64),
-        level_unit=(provenance or {}).get("level_unit", "dB"), **facts,
+        rx_rotation=np.array(rx_rotation[0], dtype=np.float64), **facts,
     )  # fmt: skip
     names = row_names or [f"row {i}" for i in range(len(target))]
     return Measurements(

@@ -21,6 +21,7 @@ from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements
+from gsparc.data.units import LINEAR, PowerUnit
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +110,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     check = Checker(raw, str(source))
     check.names()
     measured = check.measurement()
-    about = _attributes(check, Path(source).stem)
+    about = _attributes(check, Path(source).stem, measured)
     links = None if measured is None else expand(check, measured)
     if measured is None or links is None:
         check.problems.raise_if_any()
@@ -174,7 +175,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     return Reading(data, tuple(check.notes))
 
 
-def _attributes(check: Checker, stem: str) -> dict[str, Any]:
+def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, Any]:
     """Arguments of `assemble` that come from the file's attributes."""
     attributes = check.raw.attributes
     normalisation = str(attributes.get("normalisation", "none"))
@@ -187,7 +188,16 @@ def _attributes(check: Checker, stem: str) -> dict[str, Any]:
     for name in ("name", "stand_in"):
         if not isinstance(attributes.get(name), str | None):
             check.refuse(name, f"a {type(attributes[name]).__name__}; expected text")
+    level_unit, unit = str(attributes.get("level_unit", "dBW" if measured == "rssi" else "dB")), None
+    if measured in ("rssi", "rssi_db"):
+        linear = "W" if level_unit == "dBW" else LINEAR
+        unit = attributes.get("unit", linear if measured == "rssi" else None)
+    try:
+        PowerUnit.of(unit, level_unit)
+    except ValueError as fault:
+        check.refuse("unit", str(fault))
     return {
+        **{"level_unit": level_unit, "unit": unit},
         "name": str(attributes.get("name") or stem),
         "normalisation": normalisation,
         "stand_in": None if stand_in is None else str(stand_in),

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
+from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ class Site:
         moving_box: (2, 3) float64 [m], lower and upper corner of where the moving end was, *local*; (2, 6)
             of both as in `Measurements.moving`.
         level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
+        unit: that powers were given in, and are answered in; None: `level_unit`.
     """
 
     name: str
@@ -130,6 +132,7 @@ class Site:
     stations: Stations | None = None
     georeference: Georeference | None = None
     level_unit: str = "dB"
+    unit: str | None = None
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:
@@ -172,6 +175,24 @@ class Site:
         """Array (M, 3) [m], grid and wavelength [m] of spectra whose `array_problem` is None."""
         assert self.array is not None and self.grid is not None and self.wavelength is not None
         return self.array, self.grid, self.wavelength
+
+    def power_unit(self, name: str | None = None) -> PowerUnit:
+        """Between stored powers and values in a unit; None: that of the measurements.
+
+        Raises:
+            ValueError: see `PowerUnit.of`.
+        """
+        return PowerUnit.of(name or self.unit, self.level_unit, self.target_scale)
+
+    def in_levels(self, unit: str | None) -> Site:
+        """The same, its levels and answers in a unit of levels; None: as they are.
+
+        Raises:
+            ValueError: another unit, or one that these levels cannot be turned into.
+        """
+        wanted = PowerUnit.of(unit, self.level_unit, levels=True)
+        scale = self.target_scale * (wanted.scale if self.kind == "rssi" else wanted.scale**0.5)
+        return replace(self, level_unit=wanted.name, unit=wanted.name, target_scale=scale)
 
     def tones(self) -> np.ndarray:
         """Frequencies (K,) float64 [Hz] of the channel; `ValueError` when nothing names them."""

@@ -17,7 +17,7 @@ from gsparc.data.executor import each
 from gsparc.data.files import whole_file
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Kind, Site
-from gsparc.evaluation.intervals import in_decibels
+from gsparc.data.units import PowerUnit
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction
 from gsparc.prediction.placing import far_outside, in_a_speck, in_world, stations_of, with_heights
@@ -37,7 +37,7 @@ class Answers:
     Attributes:
         place: (N,) int64, row of the places.
         station: (N,) names; None where the model has no stations.
-        mean: (N, ...) in the units of the measurements.
+        mean: (N, ...) in the predictor's unit.
         variance: (N,) float64, expected squared error per entry; None where the method has none.
         confidence: (N,) float32; None where the method has none.
     """
@@ -53,14 +53,9 @@ class Answers:
 
 
 def predict(
-    predictor: Predictor,
-    places: str | Path,
-    out: str | Path | None = None,
-    *,
-    station: str | None = None,
-    columns: dict[str, object] | None = None,
-    overwrite: bool = False,
-) -> dict[str, Any]:
+    predictor: Predictor, places: str | Path, out: str | Path | None = None, *, station: str | None = None,
+    columns: dict[str, object] | None = None, overwrite: bool = False,
+) -> dict[str, Any]:  # fmt: skip
     """Predict at the places of a file and write the answers; what was guessed is logged.
 
     Args:
@@ -97,18 +92,19 @@ def predict(
             "%s: expect little of the predictions there",
             places, int(far.sum()), len(far), margin, queries.rows[int(np.argmax(far))],
         )  # fmt: skip
-    write(path, queries, predictions, site.kind)
-    facts = {
+    power = site.power_unit(predictor.unit) if site.kind == "rssi" else None
+    write(path, queries, predictions, site.kind, power)
+    facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
         "predict/stations": 0 if predictions.station is None else len(np.unique(predictions.station)),
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
-        "places": str(places), "out": str(path),
+        "places": str(places), "out": str(path), "predict/unit": predictor.unit,
     }  # fmt: skip
-    level = decibels(predictions)[0] if site.kind == "rssi" else np.zeros(0)
-    level = level[np.isfinite(level)]
-    if len(level):
-        facts |= {"predict/lowest_db": float(level.min()), "predict/highest_db": float(level.max())}
+    known = predictions.mean[np.isfinite(predictions.mean)]
+    if power is not None and len(known):
+        ends = {"lowest": float(known.min()), "highest": float(known.max())}
+        facts |= {f"predict/{name}_{suffix(power)}": value for name, value in ends.items()}
     return facts
 
 
@@ -209,15 +205,22 @@ def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
         raise DataError(f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz")
 
 
-def write(path: Path, queries: QueryPlaces, predictions: Answers, kind: Kind) -> None:
-    """Write all predictions, whole or not at all."""
+def suffix(unit: PowerUnit) -> str:
+    """Of columns and figures of powers: `db` of any levels, else the unit."""
+    return "db" if unit.decibels else unit.name
+
+
+def write(
+    path: Path, queries: QueryPlaces, predictions: Answers, kind: Kind, power: PowerUnit | None
+) -> None:
+    """Write all predictions, whole or not at all; NaN for the level of no power."""
     archive = path.suffix.lower() == ".npz"
-    columns = _places(queries, predictions)
+    columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{suffix(power)}"
     if kind == "rssi":
-        named = zip(("rssi_db", "rssi_db_std"), decibels(predictions), strict=True)
-        columns |= {name: values.astype(np.float32) for name, values in named if values is not None}
-    elif predictions.variance is not None:
-        columns[f"{kind}_std"] = np.sqrt(predictions.variance).astype(np.float32)
+        values = predictions.mean[:, 0]
+        columns[name] = np.where(np.isfinite(values), values, np.float32(np.nan))
+    if predictions.variance is not None:
+        columns[f"{name}_std"] = np.sqrt(predictions.variance).astype(np.float32)
     if archive and kind != "rssi":
         columns[kind] = predictions.mean
     elif kind == "csi":
@@ -228,14 +231,6 @@ def write(path: Path, queries: QueryPlaces, predictions: Answers, kind: Kind) ->
         return
     with whole_file(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **columns)
-
-
-def decibels(predictions: Answers) -> tuple[np.ndarray, np.ndarray | None]:
-    """Level and standard deviation (N,) [dB] of powers, NaN where the power is 0; None without a variance."""
-    power = predictions.mean[:, 0].astype(np.float64)
-    variance = np.zeros(len(power)) if predictions.variance is None else predictions.variance
-    level, spread = in_decibels(np.where(power > 0, power, np.nan), variance)
-    return level, None if predictions.variance is None else spread
 
 
 def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]:

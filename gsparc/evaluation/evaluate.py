@@ -185,11 +185,11 @@ def split_facts(split: Split) -> dict[str, Any]:
 
 
 def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:
-    """1 - MSE / MSE(nearest); None without a nearest neighbour or when that one makes no error."""
+    """1 - MSE / MSE(nearest), of powers in decibels; None without a neighbour, or when that one is right."""
     if "nearest" not in others:
         return None
-    bar = float(np.nanmean(others["nearest"].scores.samples["mse"]))
-    return 1 - float(np.nanmean(scores.samples["mse"])) / bar if bar > 0 else None
+    own, bar = (float(np.nanmean(one.squares())) for one in (scores, others["nearest"].scores))
+    return 1 - own / bar if bar > 0 else None
 
 
 def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -> dict[str, Any]:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from scipy.stats import norm
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
+from gsparc.data.units import in_decibels
 from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
-DB = 10 / math.log(10)
 
 
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
@@ -51,11 +49,6 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         "outage/brier": float(np.mean((chance - silent[limited]) ** 2)),
         "outage/brier_rate": rate * (1 - rate),
     }
-
-
-def in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
-    return 10 * np.log10(mean), DB * np.sqrt(variance) / mean
 
 
 def levels(data: Measurements) -> np.ndarray | None:

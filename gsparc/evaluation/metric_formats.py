@@ -42,7 +42,7 @@ FIGURES = {
 TABLES: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),
     "csi": ("nmse", "nmse_scalar", "snr_db"),
-    "rssi": ("rmse_db", "mae_db", "nmse"),
+    "rssi": ("rmse_db", "mae_db"),
 }
 """The columns of a kind's tables; methods, fronts and effects are compared by the first."""
 DECIDING: dict[Kind, str] = {kind: names[0] for kind, names in TABLES.items()}

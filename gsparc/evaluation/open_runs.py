@@ -16,16 +16,16 @@ from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, split_for, split_settings
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, indices_hash
+from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
-from gsparc.prediction.predictor import SAME_PLACE_M
+from gsparc.prediction.query import SAME_PLACE_M
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
-WATTS = {"dBW": 1.0, "dBm": 1e-3}  # that a power of 1 is, by the unit of levels
 SAME_ROW_M = 1e-3  # rows of two files this near are of the same place
 
 
@@ -214,11 +214,12 @@ def aligned(data: Measurements, site: Site) -> Measurements:
     units, rescale = (own.level_unit, site.level_unit), own.target_scale / site.target_scale
     if set(units) <= set(WATTS):  # what is called dB may be either
         rescale *= WATTS[units[0]] / WATTS[units[1]]
-    if not shift.any() and own.target_scale == site.target_scale and rescale == 1:
+    known = own.level_unit == site.level_unit and own.target_scale == site.target_scale
+    if known and not shift.any() and rescale == 1:
         return data
     there = replace(
         own, origin=site.origin, box=own.box + shift, static_position=site.static_position,
-        target_scale=site.target_scale, level_unit=site.level_unit,
+        target_scale=site.target_scale, level_unit=site.level_unit, unit=site.unit,
     )  # fmt: skip
     return replace(
         data, site=there, tx=data.tx + shift, rx_position=data.rx_position + shift,

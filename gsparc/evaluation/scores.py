@@ -43,15 +43,19 @@ class Scores:
         """Flat figures over all folds together."""
         return type(metrics_for(self.kind)).summary(self.samples)
 
+    def squares(self) -> np.ndarray:
+        """Squared errors (S,), of powers in decibels; NaN where nothing was measured."""
+        return self.samples["error_db"] ** 2 if self.kind == "rssi" else self.samples["mse"]
+
     def decided_by(self) -> dict[str, Any]:
         """The row that alone makes more than half of all error or power, and a figure that no row decides.
 
         `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /
-        |h|^2; empty where no row weighs so much, or there are few.
+        |h|^2; empty where no row weighs so much, there are few, or errors are in decibels.
         """
         error, power = self.samples.get("error_power", self.samples["mse"]), self.samples["target_power"]
         known = np.isfinite(error) & (power > 0)
-        if known.sum() < FEW:
+        if self.kind == "rssi" or known.sum() < FEW:
             return {}
         error, power, row = error[known], power[known], self.row[known]
         shares = np.maximum(error / max(error.sum(), TINY), power / power.sum())

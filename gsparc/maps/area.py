@@ -17,7 +17,7 @@ from gsparc.data.limits import finite
 from gsparc.data.schema import Site
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.geojson import read_shapes
-from gsparc.prediction.predictor import usual_heights
+from gsparc.prediction.query import usual_heights
 
 CELLS = 20_000  # of a map whose step nobody chose, about
 LEAST = 1e-4  # of a site's width, of a rectangle: in degrees a site is 1e-5 as wide as in metres

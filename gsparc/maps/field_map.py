@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ class FieldMap:
         places: (n, 2) where was measured, world [m].
         station_place: (T, 2) world [m], NaN where unknown.
         notes: what a reader must know, one line each.
+        unit: of all levels.
     """
 
     grid: Grid
@@ -62,6 +63,7 @@ class FieldMap:
     places: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     station_place: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     notes: tuple[str, ...] = ()
+    unit: str = "dB"
 
     @property
     def refused(self) -> np.ndarray:
@@ -79,6 +81,11 @@ class FieldMap:
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)
 
+    def raised(self, decibels: float, unit: str) -> FieldMap:
+        """The same map with levels so many decibels higher, which is in another unit."""
+        levels = {name: getattr(self, name) + np.float32(decibels) for name in OF_STATIONS[:3]}
+        return replace(self, **levels, threshold_db=self.threshold_db + decibels, unit=unit)
+
     def layer(self, name: str) -> np.ndarray:
         """One of `ARRAYS` (ny, nx), of the strongest station; NaN where refused."""
         if name == "best_server":
@@ -92,7 +99,7 @@ class FieldMap:
             "x": self.grid.x, "y": self.grid.y, "height": np.array(self.grid.height),
             "inside": self.grid.inside, "stations": np.array(self.stations), "share": np.array(self.share),
             "calibrated": np.array(self.calibrated), "threshold_db": np.array(self.threshold_db),
-            **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
+            "unit": np.array(self.unit), **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
         }  # fmt: skip
         with whole_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -112,6 +119,7 @@ class FieldMap:
             grid = Grid(x, y, float(arrays.pop("height")), step, inside)
             names = tuple(str(name) for name in arrays.pop("stations"))
             facts: dict[str, Any] = {name: arrays.pop(name) for name in ARRAYS}
+            facts["unit"] = str(arrays.pop("unit", "dB"))
             for name, kind in (("share", float), ("calibrated", bool), ("threshold_db", float)):
                 facts[name] = kind(arrays.pop(name))
         except FileNotFoundError:
@@ -120,7 +128,7 @@ class FieldMap:
             raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
         return cls(grid=grid, stations=names, extra=arrays, **facts)
 
-    def figures(self) -> dict[str, float | int | None]:
+    def figures(self) -> dict[str, float | int | str | None]:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""
         known = self.grid.inside & ~self.refused
 
@@ -137,7 +145,7 @@ class FieldMap:
             "expected_error_db": of(self.layer("expected_error_db")), "threshold_db": self.threshold_db,
             "outage": of(self.outage), "sinr_db": of(self.sinr_db), "server_unsure": of(1.0 * self.unsure),
         }  # fmt: skip
-        return {f"map/{name}": value for name, value in figures.items()}
+        return {f"map/{name}": value for name, value in figures.items()} | {"map/unit": self.unit}
 
 
 def empty(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:

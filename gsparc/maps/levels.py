@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsparc.data.schema import Kind, Measurements
-from gsparc.evaluation.intervals import DB, in_decibels
+from gsparc.data.units import in_decibels
 from gsparc.models.method import Prediction
 
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
@@ -26,24 +26,17 @@ def predicted(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[n
         The deviation is 1 dB everywhere where the method has no variance.
     """
     mean = prediction.mean.detach().cpu().numpy().reshape(len(prediction.mean), -1)
-    variance = (
-        None
-        if prediction.variance is None
-        else prediction.variance.detach().cpu().double().numpy() * scale**2
-    )
-    level, spread = np.full(len(mean), np.nan), np.full(len(mean), np.nan)
+    variance, error = prediction.variance, np.zeros(len(mean))
+    if variance is not None:
+        error = variance.detach().cpu().double().numpy() * scale**2
     if kind == "rssi":
         power = mean[:, 0].astype(np.float64) * scale
-        good = np.isfinite(power) & (power > 0)
-        variances = np.zeros(len(power)) if variance is None else variance
-        level[good], spread[good] = in_decibels(power[good], variances[good])
     else:
-        power = (np.abs(mean.astype(np.complex128)) ** 2).mean(axis=1) * scale**2
-        error = np.zeros(len(power)) if variance is None else variance
-        good = np.isfinite(power) & (power + error > 0)
-        whole = power[good] + error[good]
-        level[good] = 10 * np.log10(whole)
-        spread[good] = DB * np.sqrt(2 * power[good] * error[good] + error[good] ** 2) / whole
+        own = (np.abs(mean.astype(np.complex128)) ** 2).mean(axis=1) * scale**2
+        power, error = own + error, 2 * own * error + error**2
+    level, spread = np.full(len(mean), np.nan), np.full(len(mean), np.nan)
+    good = np.isfinite(power) & (power > 0)
+    level[good], spread[good] = in_decibels(power[good], error[good])
     if variance is None:
         spread[good] = 1.0
     return level, np.where(spread > 0, spread, np.nan)

@@ -17,6 +17,7 @@ from gsparc.data.instantiate import suggest
 from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
+from gsparc.data.units import PowerUnit
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.field_map import FieldMap, best_server, empty, loads, server_chance, sinr
 from gsparc.maps.floor_plan import FloorPlan
@@ -34,22 +35,13 @@ OTHER_END = "other_end: both ends moved; say where the transmitter stands, other
 
 
 def map_of(
-    predictor: Predictor,
-    area: Any = None,
-    *,
-    height_m: float | None = None,
-    step_m: float | None = None,
-    threshold_db: float = -100.0,
-    stations: Sequence[str | int] | None = None,
-    load: float | Sequence[float] | Mapping[str, float] = 1.0,
-    noise_db: float | None = None,
-    other_end: Sequence[float] | None = None,
-    plan: FloorPlan | None = None,
-    promise: Promise | Literal["stored"] | None = "stored",
-    share: float = 0.9,
-    tolerance_db: float = 0.1,
-    dry: bool = False,
-) -> FieldMap:
+    predictor: Predictor, area: Any = None, *, height_m: float | None = None, step_m: float | None = None,
+    threshold_db: float = -100.0, stations: Sequence[str | int] | None = None,
+    load: float | Sequence[float] | Mapping[str, float] = 1.0, noise_db: float | None = None,
+    other_end: Sequence[float] | None = None, plan: FloorPlan | None = None,
+    promise: Promise | Literal["stored"] | None = "stored", share: float = 0.9, tolerance_db: float = 0.1,
+    unit: str | None = None, dry: bool = False,
+) -> FieldMap:  # fmt: skip
     """Predict every cell of an area.
 
     >>> field = map_of(gsparc.load("model.ckpt"), step_m=0.5)
@@ -69,6 +61,7 @@ def map_of(
         share: of measurements that intervals are to hold.
         tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
             every cell. Known places must be stored with the model.
+        unit: of the map's levels, and of `threshold_db` and `noise_db`: dBm or dBW; None: as measured.
         dry: predict one cell of each station alone: whether everything asked for is possible.
 
     Raises:
@@ -81,6 +74,9 @@ def map_of(
     names, notes = answering(predictor, stations, promise)
     grid = grid_of(site, area, height_m, step_m, plan, len(names))
     load_of = loads(load, names)
+    level = PowerUnit.of(unit, site.level_unit, levels=True)
+    threshold_db -= level.raised_db
+    noise_db = None if noise_db is None else noise_db - level.raised_db
     if dry:
         first = np.zeros_like(grid.inside)
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
@@ -133,7 +129,8 @@ def map_of(
         grid, tuple(names), **values, share=share, calibrated=promise is not None,
         threshold_db=threshold_db, extra=_path_layers(predictor, grid, values["best_server"]),
         places=np.unique(known, axis=0), station_place=_still(site, names), notes=tuple(notes),
-    )  # fmt: skip
+        unit=site.level_unit,
+    ).raised(level.raised_db, level.name)  # fmt: skip
 
 
 def own_deviations(share: float) -> Calibration:
@@ -229,7 +226,7 @@ def levels_at(
     parts = []
     for part in _chunks(places, CHUNK):
         ends = ends_of(predictor.site, part, other, station)
-        parts.append(predicted(predictor.predict(rx=ends.get("rx"), tx=ends.get("tx")), predictor.site.kind))
+        parts.append(predicted(predictor.linear(**ends), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread
 

@@ -92,9 +92,9 @@ class Layer:
         return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
 
 
-def layers(field: FieldMap, unit: str = "dB") -> Iterator[Layer]:
-    """Every layer of a map that says something; of several stations, also the power of each, in `unit`."""
-    several = len(field.stations) > 1
+def layers(field: FieldMap) -> Iterator[Layer]:
+    """Every layer of a map that says something; of several stations, also the power of each."""
+    several, unit = len(field.stations) > 1, field.unit
     of = " of the strongest station" if several else ""
     layer = field.layer("power_db")
     yield Layer("power", layer, Legend.over(f"received power{of} [{unit}]", layer))

@@ -14,6 +14,7 @@ from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
+from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
 from gsparc.models.per_station import for_links
 from gsparc.models.registry import method_class
@@ -26,30 +27,24 @@ VALIDATED = SplitSettings().val_fraction
 
 
 def fit(
-    rx: Any = None,
-    tx: Any = None,
-    *,
-    rssi: Any = None,
-    csi: Any = None,
-    spectrum: Any = None,
-    model: str = "gsparc",
-    budget_s: float | None = None,
-    seed: int = 0,
-    save: str | Path | None = None,
-    settings: dict[str, Any] | None = None,
-    **arrays: Any,
-) -> Predictor:
+    rx: Any = None, tx: Any = None, *, rssi: Any = None, csi: Any = None, spectrum: Any = None,
+    unit: str = "dBm", model: str = "gsparc", budget_s: float | None = None, seed: int = 0,
+    save: str | Path | None = None, settings: dict[str, Any] | None = None, **arrays: Any,
+) -> Predictor:  # fmt: skip
     """A model of all rows, ready to be asked; checks and messages are those of a file of one's own.
 
     >>> predictor = gsparc.fit(rx=places, tx=[12.0, 30.0, 2.6], rssi=powers_dbm)
     >>> predictor.rssi(rx=[[3.0, 4.0, 1.5]]).shape
     (1, 1)
+    >>> predictor.unit, predictor.std(rx=[[3.0, 4.0, 1.5]]).shape
+    ('dBm', (1, 1))
 
     Args:
         rx, tx: (n, 3) places of the receiver and of the transmitter [m], (3,) of the one that stands still.
-        rssi: (n,) received powers [dBm].
+        rssi: (n,) received powers in `unit`; (n, T) of T stations.
         csi: (n,), (n, subcarriers) or (n, antennas, subcarriers) complex channels.
         spectrum: (n, elevations, azimuths) directional spectra.
+        unit: of `rssi`, and of what is answered: dBm, dBW, dB (of a reference nobody knows), W, mW, ...
         model: a name of `gsparc train --help`.
         budget_s: seconds of training; None: the model's own.
         seed: of whatever is random.
@@ -60,17 +55,11 @@ def fit(
 
     Raises:
         DataError: arrays that `gsparc check` would refuse, all problems with array and row.
-        ValueError: no such model, or one that cannot learn these measurements.
+        ValueError: no such model, one that cannot learn these measurements, or no unit of powers.
     """
-    inputs = {
-        "rx_position": rx,
-        "tx_position": tx,
-        "rssi_db": rssi,
-        "csi": csi,
-        "spectrum": spectrum,
-        **arrays,
-    }
-    raw = Raw({name: np.asarray(value) for name, value in inputs.items() if value is not None}, {})
+    inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
+    given = {name: np.asarray(value) for name, value in inputs.items() if value is not None}
+    raw = Raw(given, {}) if rssi is None else _of_powers(given, np.asarray(rssi), unit)
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
@@ -86,6 +75,18 @@ def fit(
     if save is not None:
         checkpoint.save(save, method, extra={"train_s": report.seconds})
     return Predictor(method, data.site)
+
+
+def _of_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:
+    """Arrays of the schema with powers in a unit: watts, or decibels as they are."""
+    unknown = unit in ("dB", LINEAR)  # what they refer to
+    given = PowerUnit.of(unit, "dB" if unknown else "dBW")
+    if given.decibels:
+        return Raw({**arrays, "rssi_db": powers}, {"level_unit": given.name})
+    if "noise_variance" in arrays:
+        arrays = {**arrays, "noise_variance": arrays["noise_variance"] / given.scale**2}
+    about = {"unit": given.name, "level_unit": "dB" if unknown else "dBW"}
+    return Raw({**arrays, "rssi": powers / given.scale}, about)
 
 
 def _learned_from(data: Measurements, share: float, seed: int) -> Fold:

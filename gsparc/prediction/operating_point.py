@@ -103,7 +103,9 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     return ways[best], points[best]
 
 
-def load(path: str | Path, budget_ms: float | None = None, confidence: str | None = None) -> Predictor:
+def load(
+    path: str | Path, budget_ms: float | None = None, confidence: str | None = None, unit: str | None = None
+) -> Predictor:
     """The model in a checkpoint, ready to be asked.
 
     >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5]).shape
@@ -117,18 +119,15 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
         confidence: `learned`, `expected`, `distance` or `gp_variance`; None takes the one that
             `gsparc calibrate` found best on positions set aside and stored with the model, and
             the model's own where it was never calibrated.
+        unit: of powers, like `dBm` or `mW`; None: that of the measurements.
 
     Raises:
         gsparc.models.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
-        ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence.
+        ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence or unit.
     """
     method, stored = loading.load(path)
     trusted = trusted_of(stored.extra)
     if confidence is not None:
         trusted.check(confidence)
-    if budget_ms is None:
-        return Predictor(method, stored.site, trusted=trusted, kind=confidence, extra=stored.extra)
-    chosen, point = within(method, stored, budget_ms)
-    return Predictor(
-        chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence, extra=stored.extra
-    )
+    chosen, point = (method, None) if budget_ms is None else within(method, stored, budget_ms)
+    return Predictor(chosen, stored.site, method, point, trusted, confidence, stored.extra, unit)

@@ -12,7 +12,7 @@ from gsparc.data.instantiate import suggest
 from gsparc.data.links.stations import station_number
 from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import ENDS, End, Site
-from gsparc.prediction.predictor import usual_heights
+from gsparc.prediction.query import usual_heights
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
 SPECK = 1e-3  # of that side: in degrees a site is 1e-5 as wide as in metres, in kilometres 1e-3

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.assemble import FARTHEST
 from gsparc.data.links.stations import station_number
-from gsparc.data.schema import End, Kind, Site
+from gsparc.data.schema import Kind, Site
+from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models.method import Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
-from gsparc.ops.transforms import carries_tangent, mapped, numbers, transforming
+from gsparc.ops.transforms import carries_tangent, mapped, transforming
 from gsparc.prediction.confidence import Trusted
+from gsparc.prediction.query import Queries, Query, read_places, usual_heights
 from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
@@ -25,18 +27,6 @@ if TYPE_CHECKING:
     from gsparc.locate.locator import Located, Locator
     from gsparc.prediction.export import Paths
     from gsparc.prediction.operating_point import Operating
-
-SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
-COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
-
-
-class Query(NamedTuple):
-    """Both ends (B, 3) in local coordinates, whether one position was given, and whether torch was."""
-
-    tx: Tensor
-    rx: Pose
-    single: bool
-    as_torch: bool
 
 
 class Predictor:
@@ -46,13 +36,16 @@ class Predictor:
     lists) in gives NumPy out, torch in gives torch out. The static end may be left out: the model knows
     where it stood.
 
+    Powers and their deviations come back in the unit that they were given in (`unit`), or in the one that
+    `unit=` names: dBm, dBW, W, mW, ..., or `linear` where nobody said what decibels refer to.
+
     With `grad=True` predictions are differentiable by the position of what moves, which is then a tensor:
     autograd in reverse and forward mode and `torch.func` (`grad`, `jacrev`, `jacfwd`, `jvp`, `vjp`) follow
     them. All is computed in float64 and answered in the precision of the positions; `ValueError` where the
     model has no gradients. Which rows are nearest and what a clamp cuts off have none.
 
     >>> at = torch.tensor([2.0, 1.0, 1.5], dtype=torch.float64, requires_grad=True)
-    >>> predictor.rssi(rx=at, grad=True).log10().sum().backward()
+    >>> predictor.rssi(rx=at, grad=True).sum().backward()
     >>> at.grad.shape
     torch.Size([3])
 
@@ -64,23 +57,24 @@ class Predictor:
         extra: what else the checkpoint holds.
         trusted: which confidence is answered, and from when on a prediction is accepted.
         kind: of the confidence; None: as `trusted` says.
+        unit: of powers; None: that of the measurements.
+
+    Raises:
+        ValueError: no unit that these measurements can be turned into.
     """
 
     def __init__(
-        self,
-        method: Method,
-        site: Site,
-        whole: Method | None = None,
-        point: Operating | None = None,
-        trusted: Trusted | None = None,
-        kind: str | None = None,
-        extra: Mapping[str, Any] | None = None,
-    ) -> None:
+        self, method: Method, site: Site, whole: Method | None = None, point: Operating | None = None,
+        trusted: Trusted | None = None, kind: str | None = None, extra: Mapping[str, Any] | None = None,
+        unit: str | None = None,
+    ) -> None:  # fmt: skip
         self.extra = extra or {}
         self.trusted, self.kind = trusted or Trusted(), kind
         self.method, self.site, self.point = method, site, point
         self._whole = whole or method
-        self._still = self._still_pose()
+        self._query = Queries(site).query
+        self._unit = unit
+        self.unit = self._in(None).name  # "1" of channels and spectra
         self._locators: dict[tuple[bytes, Any, float], Locator] = {}  # with what was looked up once
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
 
@@ -111,7 +105,7 @@ class Predictor:
             one.of(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
         )
         site = of_station(self.site, number)
-        return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra)
+        return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, self._unit)
 
     def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
         """World positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
@@ -149,7 +143,7 @@ class Predictor:
             ValueError: measured in metres about an unknown origin, or no positions.
         """
         origin = self._georeference()
-        places = _positions("position", position)
+        places = read_places("position", position)
         latitude, longitude = origin.to_degrees(np.atleast_2d(places)[:, :2])
         if places.ndim == 1:
             return float(latitude[0]), float(longitude[0]), float(places[2])
@@ -162,8 +156,18 @@ class Predictor:
             )
         return self.site.georeference
 
-    def predict(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Prediction:
-        """Mean, variance and confidence (B, ...) at once, as tensors, in the units of the measurements.
+    def _in(self, unit: str | None) -> PowerUnit:
+        """The unit that answers are wanted in."""
+        if self.site.kind == "rssi":
+            return self.site.power_unit(unit or self._unit)
+        if unit or self._unit:
+            raise ValueError(f"unit={unit or self._unit}: goes with powers, not with {self.site.kind}")
+        return PowerUnit("1", False, self.site.target_scale)
+
+    def predict(
+        self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False
+    ) -> Prediction:
+        """Mean, variance and confidence (B, ...) at once, as tensors, in the unit of the measurements.
 
         The confidence is None where the method has none; else the one that `confidence` answers. With `grad`
         it is the method's own, and None where `confidence` answers another.
@@ -171,25 +175,65 @@ class Predictor:
         Raises:
             ValueError: `grad` of a model without gradients, or of positions that are no tensors.
         """
+        wanted = self._in(unit)
         if grad:
-            return self._followed(self._whole, tx, rx)[0]
+            return self._followed(self._whole, tx, rx, wanted)[0]
         query = self._query(tx, rx)
         own = _predicted(self._whole, query)
-        scale = self.site.target_scale
-        # In float64: squares of powers in watts are beyond float32.
-        variance = None if own.variance is None else own.variance.double() * scale**2
-        return Prediction(own.mean * scale, self._confidence(own, query), variance)
+        return replace(_in_unit(own, wanted), confidence=self._confidence(own, query))
+
+    def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
+        """What `predict` says, powers as such: their levels are in `site.level_unit`."""
+        return self.predict(tx, rx, unit=LINEAR if self.site.kind == "rssi" else None)
+
+    def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
+        """Expected root mean square error of an entry, in the unit of the answers and float32.
+
+        Its shape goes with theirs: (B, 1) of powers, (B, T) of several stations, (B, 1, 1) of other kinds.
+
+        Raises:
+            ValueError: the method knows none, or as in `rssi`.
+        """
+
+        def ask(asked: Predictor) -> Any:
+            query = asked._query(tx, rx)
+            said = _in_unit(_predicted(asked._whole, query), asked._in(unit))
+            if said.variance is None:
+                raise ValueError(f"{self.method.name} states no deviations")
+            spread = said.variance.sqrt().float().reshape(-1, *[1] * (said.mean.ndim - 1))
+            return _returned(spread, query.single, query.as_torch)
+
+        return self._of_stations(ask, tx, rx)
+
+    def _of_stations(self, ask: Callable[[Predictor], Any], tx: Any, rx: Any) -> Any:
+        """What one is asked, (B, 1); of several stations, if neither end says which, of all (B, T).
+
+        Stations that the model has no answer for, as they had too few training rows, are NaN.
+        """
+        said = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0) is not None
+        stations = [] if said or self.site.kind != "rssi" else self._stations()
+        if not any(stations):
+            return ask(self)
+        answers = [None if asked is None else ask(asked) for asked in stations]
+        known = next(one for one in answers if one is not None)
+        columns = [known * np.nan if one is None else one for one in answers]
+        return torch.cat(columns, dim=-1) if isinstance(known, Tensor) else np.concatenate(columns, axis=-1)
+
+    def _stations(self) -> list[Predictor | None]:
+        """The same model asked about each station; None where that had too few training rows."""
+        stations: list[Predictor | None] = []
+        for name in () if self.site.stations is None else self.site.stations.name:
+            stations.append(None)
+            with suppress(ValueError):
+                stations[-1] = self.at(name)
+        return stations
 
     def cycling(self, places: np.ndarray) -> Call:
         """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time.
 
         Of several stations the first that the model answers for is asked.
         """
-        predictor = self
-        for name in () if self.site.stations is None else self.site.stations.name:
-            with suppress(ValueError):
-                predictor = self.at(name)
-                break
+        predictor = next(filter(None, self._stations()), self)
         ask = getattr(predictor, self.site.kind)
         return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
 
@@ -203,15 +247,9 @@ class Predictor:
         return self._ask("spectrum", tx, rx, grad)
 
     def csi(
-        self,
-        tx: Any = None,
-        rx: Any = None,
-        *,
-        uplink: Any = None,
-        frequency_hz: Any = None,
-        symbols: int | None = None,
-        grad: bool = False,
-    ) -> Any:
+        self, tx: Any = None, rx: Any = None, *, uplink: Any = None, frequency_hz: Any = None,
+        symbols: int | None = None, grad: bool = False,
+    ) -> Any:  # fmt: skip
         """Channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
 
         Args:
@@ -251,18 +289,28 @@ class Predictor:
         query = self._query(tx, rx)
         return export.placed_paths(self._whole, self.site, query.tx, query.rx)
 
-    def rssi(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
-        """Received power (B, 1) float32, linear, in the physical units of the measurements."""
-        return self._ask("rssi", tx, rx, grad)
+    def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
+        """Received power (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
+
+        Of several stations, if neither end says which, of all (B, T), as they were measured: NaN of those
+        that had too few training rows. A level is -inf where no power is predicted.
+
+        >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5], unit="mW").shape
+        (1,)
+
+        Raises:
+            ValueError: no unit that these powers can be turned into, or as in `spectrum`.
+        """
+        return self._of_stations(lambda one: one._ask("rssi", tx, rx, grad, unit), tx, rx)
 
     def locate(
         self, values: Any, *, silent: Any = None, where: Any = None, phase_known: bool = False,
-        offset_db: float = 0.0, share: float = 0.9,
+        offset_db: float = 0.0, share: float = 0.9, unit: str | None = None,
     ) -> list[Located]:  # fmt: skip
         """Where snapshots were heard, by this model's likelihood, in world coordinates.
 
         >>> city = gsparc.load("city.ckpt")
-        >>> [one.place.shape for one in city.locate([[1e-9, 3e-8]])]  # (n, stations), linear
+        >>> [one.place.shape for one in city.locate([[-90.0, -75.2]])]  # (n, stations) [dBm]
         [(3,)]
 
         Args:
@@ -274,16 +322,19 @@ class Predictor:
             offset_db: standard deviation of an offset that all powers of a snapshot share [dB].
             share: of places that an area is to hold; kept by what `gsparc locate` learned for the same
                 settings and stored with the model, else as the model's own variances say.
+            unit: of powers; None: as they are answered.
 
         Raises:
             ValueError: values of another kind or shape, both ends move, or a model without variance.
         """
         from gsparc.locate import locator, snapshots
 
+        if self.site.kind == "rssi" and not np.iscomplexobj(values):
+            values = self._in(unit).stored(torch.as_tensor(values)) * self.site.target_scale
         heard = snapshots.of_values(self.site, values, silent)
         unknown = locator.Unknown(phase_known, offset_db)
         low_high = self.site.moving_box[:, :3] + self.site.origin
-        places = low_high if where is None else np.atleast_2d(_positions("where", where))
+        places = low_high if where is None else np.atleast_2d(read_places("where", where))
         key = (places.tobytes(), unknown, share)
         if key not in self._locators:
             cells = locator.cover(places - self.site.origin, locator.MOST, where is not None)
@@ -345,22 +396,22 @@ class Predictor:
         places = None if query is None else self.site.moving(query.tx, query.rx).double().numpy()
         return torch.from_numpy(self.trusted.confidence(own, places, self.kind))
 
-    def _ask(self, kind: Kind, tx: Any, rx: Any, grad: bool = False) -> Any:
+    def _ask(self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None) -> Any:
         if self.site.kind != kind:
             raise ValueError(
                 f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
                 f"call .{self.site.kind}(...)"
             )
+        wanted = self._in(unit)
         if grad:
-            moments, single = self._followed(self.method, tx, rx)
+            moments, single = self._followed(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
         query = self._query(tx, rx)
-        mean = _predicted(self.method, query).mean
-        scale = self.site.target_scale
-        return _returned(mean if scale == 1 else mean * scale, query.single, query.as_torch)
+        mean = _in_unit(_predicted(self.method, query), wanted).mean
+        return _returned(mean, query.single, query.as_torch)
 
-    def _followed(self, method: Method, tx: Any, rx: Any) -> tuple[Prediction, bool]:
-        """Moments that autograd follows, and whether one position was given; see the class."""
+    def _followed(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
+        """Moments in a unit that autograd follows, and whether one position was given; see the class."""
         problem = method.gradient_problem()
         if problem is not None:
             raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
@@ -389,74 +440,10 @@ class Predictor:
         dtype = torch.float32
         for value in ends.values():
             dtype = torch.promote_types(dtype, value.dtype)
-        scale, own = self.site.target_scale, (self.kind or self.trusted.kind) in (None, "learned")
-        mean = (moments.mean * scale).to(dtype.to_complex() if moments.mean.is_complex() else dtype)
-        sure = None if moments.confidence is None or not own else moments.confidence.to(dtype)
-        return Prediction(
-            mean, sure, None if moments.variance is None else moments.variance * scale**2
-        ), query.single
-
-    def _query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Query:
-        """Both ends as they were given, checked."""
-        receiver = rx.position if isinstance(rx, Pose) else rx
-        places = {
-            end: _positions(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
-        }
-        moving, static = self.site.moving_end, self.site.static_end or "tx"
-        for needed in (moving,) if self.site.static_end else ("rx", "tx"):
-            if needed not in places:
-                raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
-        single = all(place.ndim == 1 for place in places.values())
-        common = self._still is not None and len(places) == 1 and dtype == torch.float32
-        if self._still is not None and common:  # with nothing to look up
-            sender = _float(np.atleast_2d(places[moving] - self.site.origin))
-            return Query(sender, self._still, single, isinstance(tx, Tensor))
-        local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
-        count = max(len(place) for place in local.values())
-        for end, place in local.items():
-            if len(place) not in (1, count):
-                raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
-        ends = {moving: local[moving], static: self._static(local.get(static))}
-        rotation = self._rotation(rx, count)
-        if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
-            pose = Pose(_float(ends["rx"], dtype), _float(rotation, dtype))
-        else:
-            positions = np.broadcast_to(ends["rx"], (count, 3))
-            turned = np.broadcast_to(rotation, (count, 3, 3))
-            pose = Pose(_float(positions, dtype), _float(turned, dtype))
-        sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, receiver)))
-
-    def _still_pose(self) -> Pose | None:
-        """The pose of a receiver that never moved, made once; None for any other site."""
-        site = self.site
-        if site.static_end != "rx" or site.static_position is None:
-            return None
-        return Pose(_float(site.static_position), _float(self._rotation(None, 1)))
-
-    def _static(self, place: np.ndarray | None) -> np.ndarray:
-        """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
-        known, end = self.site.static_position, self.site.static_end
-        if known is None:
-            if place is not None:
-                return place[0] if len(place) == 1 else place
-            if self.site.stations is not None:
-                raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
-            if self.site.kind == "rssi":  # learned without its transmitter's place
-                return np.full(3, np.nan)
-            raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
-        if place is not None and (np.linalg.norm(place - known, axis=-1) > SAME_PLACE_M).any():
-            stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
-            raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
-        return known
-
-    def _rotation(self, rx: Any, count: int) -> np.ndarray:
-        if isinstance(rx, Pose):
-            rotation = numbers(rx.rotation).astype(np.float64)
-            if rotation.ndim == 3 and len(rotation) not in (1, count):
-                raise ValueError(f"rx= holds {len(rotation)} rotations for {count} positions")
-            return rotation
-        return np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
+        said, own = _in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
+        mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
+        sure = None if said.confidence is None or not own else said.confidence.to(dtype)
+        return Prediction(mean, sure, said.variance), query.single
 
 
 @torch.no_grad()
@@ -465,37 +452,10 @@ def _predicted(method: Method, query: Query) -> Prediction:
         return method.predict(query.tx, query.rx)
 
 
-def usual_heights(site: Site) -> dict[End, float]:
-    """World height [m] of each end that moved and was always at the same height."""
-    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
-    low, high = site.moving_box[:, 2::3]
-    # Rounded: the origin was taken away from it.
-    above = {end: round(float(low[i] + site.origin[2]), 9) for i, end in enumerate(moving)}
-    return {end: above[end] for i, end in enumerate(moving) if low[i] == high[i]}
-
-
-def _positions(end: str, value: Any) -> np.ndarray:
-    """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
-    try:
-        array = numbers(value) if isinstance(value, Tensor) else np.asarray(value)
-        array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")
-    except (TypeError, ValueError):
-        raise ValueError(f"{end}= must be real numbers [m], got {type(value).__name__}") from None
-    if array.ndim not in (1, 2) or array.shape[-1] != 3 or not array.size:
-        raise ValueError(f"{end}= must be (3,) or (B, 3) [m], got shape {array.shape}")
-    if not np.isfinite(array).all():
-        row = "" if array.ndim == 1 else f" in row {int(np.flatnonzero(~np.isfinite(array).all(1))[0])}"
-        raise ValueError(f"{end}= holds NaN or Inf{row}")
-    if np.abs(array).max() > FARTHEST:
-        raise ValueError(f"{end}= holds {np.abs(array).max():.3g}; expected metres, none beyond {FARTHEST:g}")
-    step = float(np.spacing(np.float32(np.abs(array).max())))
-    if getattr(value, "dtype", None) in (np.float32, torch.float32) and step > COARSE_M:
-        raise ValueError(f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64")
-    return array
-
-
-def _float(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
-    return torch.from_numpy(np.array(array, dtype=np.float32 if dtype == torch.float32 else np.float64))
+def _in_unit(own: Prediction, unit: PowerUnit) -> Prediction:
+    """Of stored targets, in a unit."""
+    variance = None if own.variance is None else unit.variance(own.mean, own.variance)
+    return replace(own, mean=unit.values(own.mean).to(own.mean.dtype), variance=variance)
 
 
 def _returned(value: Tensor, single: bool, as_torch: bool) -> Any:

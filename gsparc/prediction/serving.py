@@ -8,6 +8,7 @@ import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from fastapi import FastAPI, HTTPException, Request, Response
@@ -24,13 +25,15 @@ class Batcher:
     """Asks the model about the places of all requests that come within a delay.
 
     Args:
-        predictor: of one end that moves and one station.
+        predictor: of one end that moves, and one station or powers of several.
+        what: is asked, a method of it.
         delay_s: that the first request of a batch waits for others [s].
         most: places of a batch.
     """
 
-    def __init__(self, predictor: Predictor, delay_s: float, most: int) -> None:
-        self.predictor, self.delay_s, self.most = predictor, delay_s, most
+    def __init__(self, predictor: Predictor, what: str, delay_s: float, most: int) -> None:
+        self.method, self.end = getattr(predictor, what), predictor.site.moving_end
+        self.delay_s, self.most = delay_s, most
         self.waiting: asyncio.Queue[tuple[np.ndarray, asyncio.Future]] = asyncio.Queue()
 
     async def ask(self, place: np.ndarray) -> np.ndarray:
@@ -54,8 +57,8 @@ class Batcher:
 
     async def _serve(self, batch: list[tuple[np.ndarray, asyncio.Future]]) -> None:
         try:
-            site, place = self.predictor.site, np.concatenate([place for place, _ in batch])
-            answers = await asyncio.to_thread(getattr(self.predictor, site.kind), **{site.moving_end: place})
+            place = np.concatenate([place for place, _ in batch])
+            answers = await asyncio.to_thread(self.method, **{self.end: place})
             ends = np.cumsum([len(place) for place, _ in batch])[:-1]
             for (_, future), own in zip(batch, np.split(answers, ends), strict=True):
                 if not future.done():
@@ -69,26 +72,32 @@ class Batcher:
 
 
 def application(predictor: Predictor, delay_s: float, most: int, token: str | None) -> FastAPI:
-    """The routes: POST /predict, GET /healthz.
+    """The routes: POST /predict, and /std for its deviations, GET /healthz.
 
     Args:
         predictor, delay_s, most: see `Batcher`; more places in one request are refused (413).
         token: that a request must bear (401); None: none.
     """
-    batcher, site = Batcher(predictor, delay_s, most), predictor.site
+    site = predictor.site
+    routes = {"/predict": site.kind, "/std": "std"}
+    batchers = {route: Batcher(predictor, what, delay_s, most) for route, what in routes.items()}
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
-        work = asyncio.create_task(batcher.run())
+        work = [asyncio.create_task(batcher.run()) for batcher in batchers.values()]
         yield
-        work.cancel()
+        for task in work:
+            task.cancel()
 
     app = FastAPI(title="gsparc", lifespan=life)
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
-        return {"status": "ok", "kind": site.kind, "model": predictor.method.name, "end": site.moving_end}
+        stations = {} if site.stations is None else {"stations": site.stations.name}
+        model = {"model": predictor.method.name, "end": site.moving_end, "unit": predictor.unit, **stations}
+        return {"status": "ok", "kind": site.kind, **model}
 
+    @app.post("/std")
     @app.post("/predict")
     async def predict(request: Request) -> Response:
         header = request.headers.get("authorization", "")
@@ -114,13 +123,16 @@ def application(predictor: Predictor, delay_s: float, most: int, token: str | No
         if len(place) > most:
             raise HTTPException(413, f"at most {most} places")
         try:
-            values = await batcher.ask(place)
+            values = await batchers[request.url.path].ask(place)
         except Exception as error:
             raise HTTPException(422 if isinstance(error, ValueError) else 500, str(error)) from error
         values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
-        shape = {"x-shape": ",".join(map(str, values.shape))}
+        about = {"x-shape": ",".join(map(str, values.shape)), "x-unit": quote(predictor.unit)}
         if raw:
-            return Response(values.astype("<f4").tobytes(), media_type=RAW, headers=shape)
-        return JSONResponse({"shape": values.shape, "values": values.tolist()})
+            return Response(values.astype("<f4").tobytes(), media_type=RAW, headers=about)
+        if not np.isfinite(values).all():  # JSON has no word for the level of silence
+            values, known = values.astype(object), np.isfinite(values)
+            values[~known] = None
+        return JSONResponse({"shape": values.shape, "unit": predictor.unit, "values": values.tolist()})
 
     return app

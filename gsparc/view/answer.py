@@ -72,7 +72,7 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
     mean = np.asarray(getattr(predictor, kind)(**ends))
     query_ms = (time.perf_counter() - start) * 1e3
     query: dict[str, Any] = {end: np.atleast_2d(place) for end, place in ends.items()}
-    prediction = predictor.predict(**query)
+    prediction = predictor.linear(**query)
     still: dict[str, np.ndarray] = {}
     if site.static_end is not None and site.static_position is not None:
         still[site.static_end] = site.static_position + site.origin

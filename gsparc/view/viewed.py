@@ -13,7 +13,7 @@ import torch
 
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import End, Measurements, Site
-from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.open_runs import aligned, open_files
 from gsparc.maps import levels
 from gsparc.maps.making import answering
 from gsparc.models import loading
@@ -189,7 +189,8 @@ def open_viewed(
     except (ValueError, OSError) as error:
         method, stored = loading.load(path)
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
-    site, trusted = stored.site, trusted_of(stored.extra)
+    site, trusted = stored.site.in_levels(unit), trusted_of(stored.extra)
+    data = None if data is None else aligned(data, site)
     points, measured = stored_points(stored.extra)
     ways = []
     for point in sorted((point for point in points if point.settings), key=lambda point: point.p50_ms):
@@ -203,4 +204,4 @@ def open_viewed(
     for note in missing:
         log.warning(note)
     stations = tuple(name or None for name in names)
-    return Viewed(str(path), tuple(ways), data, test, stations, tuple(notes), unit or site.level_unit)
+    return Viewed(str(path), tuple(ways), data, test, stations, tuple(notes), site.level_unit)

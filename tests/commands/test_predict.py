@@ -118,7 +118,7 @@ def test_every_station_of_every_place(town, tmp_path):
     level = column(found, "rssi_db").reshape(-1, 3)
     assert np.abs(level - powers(place)).max() < 6
     for number, name in enumerate(NAMES):
-        expected = 10 * np.log10(town.at(str(name)).rssi(rx=place)[:, 0])
+        expected = town.at(str(name)).rssi(rx=place)[:, 0]
         assert np.allclose(level[:, number], expected, atol=1e-4)
     assert facts["predict/predictions"] == 21 and facts["predict/far_outside"] == 0
 
@@ -220,7 +220,26 @@ def test_degrees_metres_and_arrays_are_one_place(valley, tmp_path):
     for other in found[1:]:
         assert np.allclose(column(other, "rssi_db"), column(found[0], "rssi_db"), atol=1e-3)
     expected = valley.at(0).rssi(rx=metres)
-    assert np.allclose(10 ** (column(found[0], "rssi_db") / 10), expected[:, 0], rtol=1e-3)
+    assert np.allclose(column(found[0], "rssi_db"), expected[:, 0], atol=1e-3)
+
+
+def test_watts_were_answered_in_decibels(tmp_path):
+    arrays = {"tx_position": walk(), "rx_position": POSTS[0], "rssi": 10 ** (powers(walk())[:, 0] / 10)}
+    fitted(arrays, tmp_path)
+    file, level = write_table(tmp_path / "a.csv", "xyz", walk()[:4].tolist()), powers(walk())[:4, 0]
+    watts = 10 ** (level / 10)
+    heads = {None: ("rssi_W", watts), "mW": ("rssi_mW", 1e3 * watts)}
+    heads |= {"dBm": ("rssi_db", level + 30), "dBW": ("rssi_db", level)}
+    for unit, (head, wanted) in heads.items():
+        facts = predict(gsparc.load(tmp_path / "model.ckpt", unit=unit), file, overwrite=True)
+        found = read(facts["out"])
+        assert list(found[0])[3:] == [head, f"{head}_std", "confidence"]
+        assert facts["predict/unit"] == (unit or "W")
+        assert facts[f"predict/highest_{head[5:]}"] == pytest.approx(column(found, head).max())
+        assert np.allclose(column(found, head), wanted, atol=1 if head == "rssi_db" else 0, rtol=0.2)
+    settings = [f"ckpt={tmp_path / 'model.ckpt'}", f"places={file}", "overwrite=true", "unit=dBm"]
+    done = knock(COMMANDS["predict"].run, "predict", [*settings, f"hydra.run.dir={tmp_path}"])
+    assert done.status == 0 and any(" dBm; predictions in" in line for line in done.out), done
 
 
 BAD_TABLES = {

@@ -94,8 +94,35 @@ def test_json_and_raw_bodies_hold_what_the_model_answers(powers, served):
     client = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
     client.request("GET", "/healthz")
     assert json.loads(client.getresponse().read()) == {
-        "status": "ok", "kind": "rssi", "model": "gp", "end": "rx"
+        "status": "ok", "kind": "rssi", "model": "gp", "end": "rx", "unit": "dBm"
     }  # fmt: skip
+
+
+def test_deviations_and_all_stations_in_the_unit_asked_for(powers, served):
+    """Of several stations none was served but by name, and no deviation at all."""
+    client = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
+    client.request("POST", "/std", as_json([[5, 5, 1]]))
+    said = json.loads(client.getresponse().read())
+    assert said["unit"] == "dBm" and said["values"] == powers.std(rx=[[5.0, 5, 1]]).tolist()
+    level = -40 - np.arange(60)[:, None] / 9 - [0, 10]
+    places = np.random.default_rng(0).uniform(0, 20, (60, 3))
+    masts = [[0, 0, 9], [9, 9, 9]]
+    several = gsparc.fit(rx=places, station_position=masts, rssi=level, unit="dBW", model="gp")
+    with Served(gsparc.Predictor(several.method, several.site, unit="mW")) as running:
+        status, body, _ = running.post(as_json(places[:3]))
+        _, raw, headers = running.post(places[:3].astype("<f4").tobytes(), RAW)
+    said, wanted = json.loads(body), several.rssi(rx=places[:3], unit="mW")
+    assert status == 200 and headers["x-unit"] == said["unit"] == "mW" and said["shape"] == [3, 2]
+    np.testing.assert_allclose(said["values"], wanted, rtol=1e-5)
+    np.testing.assert_allclose(np.frombuffer(raw, "<f4"), wanted.ravel(), rtol=1e-4)
+
+
+def test_the_level_of_silence_is_null(monkeypatch):
+    """JSON has no infinity: the answer was an error of the server."""
+    silent = gsparc.fit(rx=np.eye(3), tx=TX, rssi=[-40, -50, -60], model="zero")
+    with Served(silent) as running:
+        status, body, _ = running.post(as_json([[5, 5, 1], [4, 4, 1]]))
+    assert status == 200 and json.loads(body)["values"] == [[None], [None]]
 
 
 def test_channels_are_pairs():

@@ -387,6 +387,14 @@ def test_pictures_name_the_unit_that_levels_were_turned_into(write, head, unit):
     assert data.site.level_unit == unit
 
 
+@pytest.mark.parametrize("head", ["RSRP [dBm]", "RSRP [dBW]", "rssi_mW", "power (W)"])
+def test_powers_of_a_table_come_back_in_its_unit(write, head):
+    data = interpret(understand_table(write(f"x,y,z,{head}\n1,2,3,7\n4,5,6,8.5\n")).raw, "drive").data
+    unit = data.site.power_unit()
+    assert head.strip("])").endswith(unit.name)
+    assert np.allclose(unit.values(data.targets([0, 1])).numpy(), [[7], [8.5]])
+
+
 def test_parquet_without_pyarrow(write, refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     says = r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"

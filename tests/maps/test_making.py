@@ -38,12 +38,30 @@ def test_cells_hold_what_the_model_predicts(predictor):
     place = [found.grid.x[3], found.grid.y[5], 1.5]
     for number, name in enumerate(found.stations):
         assert found.power_db[number, 5, 3] == pytest.approx(
-            10 * np.log10(float(predictor.at(name).rssi(rx=place)[0])), abs=1e-3
+            float(predictor.at(name).rssi(rx=place)[0]), abs=1e-3
         )
     assert (found.lower_db < found.power_db).all() and (found.power_db < found.upper_db).all()
     west, east = found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)], found.best_server[11, 17]
     assert (west, east) == (0, 1)
     assert ((found.outage >= 0) & (found.outage <= 1)).all() and not found.calibrated
+
+
+def test_a_unit_of_maps_changed_their_names_alone(tmp_path):
+    """`unit=dBm` of levels in dBW wrote dBm beside the same numbers and the threshold of the others."""
+    stored = gsparc.load(town_model())
+    predictor = Predictor(stored.method, replace(stored.site, level_unit="dBW"), extra=stored.extra)
+    own = map_of(predictor, step_m=8.0, threshold_db=-90, noise_db=-100)
+    other = map_of(predictor, step_m=8.0, threshold_db=-60, noise_db=-70, unit="dBm")
+    assert (own.unit, other.unit, other.threshold_db) == ("dBW", "dBm", -60)
+    for name in ("power_db", "lower_db", "upper_db"):
+        np.testing.assert_allclose(getattr(other, name), getattr(own, name) + 30, atol=1e-4)
+    for name in ("expected_error_db", "outage", "sinr_db", "server_chance", "best_server"):
+        np.testing.assert_allclose(getattr(other, name), getattr(own, name), atol=1e-6)
+    assert "[dBm]" in next(iter(layers(other))).legend.label
+    other.save(tmp_path / "map.npz")
+    assert FieldMap.read(tmp_path / "map.npz").unit == "dBm" and other.figures()["map/unit"] == "dBm"
+    with pytest.raises(ValueError, match=r"unit=W: of powers in dBW expected dBm, dBW$"):
+        map_of(predictor, unit="W")
 
 
 def test_chunks_do_not_change_a_map(predictor, monkeypatch):

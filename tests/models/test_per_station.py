@@ -72,10 +72,11 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
     predictor = gsparc.load(tmp_path / "m.ckpt")
     place = town.tx[fold.test[0]] + town.site.origin
     number = int(town.station[fold.test[0]])
-    one = predictor.at(number).rssi(tx=place)
+    one = predictor.at(number).rssi(tx=place, unit="linear")
     assert one == pytest.approx(float(method.answer(town.batch(fold.test[:1])).mean) * town.site.target_scale)
+    assert predictor.rssi(tx=place, unit="linear")[number] == one
     with pytest.raises(ValueError, match=r"say which station: \.at\(name\)"):
-        predictor.rssi(tx=place)
+        predictor.confidence(tx=place)
     with pytest.raises(ValueError, match="no station 'roof'; there are 0, 1"):
         predictor.at("roof")
 

@@ -260,5 +260,5 @@ def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, m
         subprocess.run(command, check=True, capture_output=True, timeout=300)
     query = [tmp_path / "query", out / "field.gsparc", "110", "60", "1"]
     said = subprocess.run(query, check=True, capture_output=True, text=True).stdout
-    expected = float(predictor.rssi(rx=[110.0, 60, 1])[0])
+    expected = float(predictor.rssi(rx=[110.0, 60, 1], unit="linear")[0])
     assert float(said.split("first value ")[1].split(",")[0]) == pytest.approx(expected, rel=1e-4)

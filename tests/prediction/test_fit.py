@@ -43,18 +43,91 @@ def test_it_is_the_model_that_the_command_trains(tmp_path):
     found = gsparc.fit(rx=PLACES[known], tx=END, rssi=POWERS[known], model="gp")
     asked = PLACES[fold.test]
     other = gsparc.load(objects.checkpoints[0])
-    assert np.allclose(10 * np.log10(found.rssi(rx=asked) / other.rssi(rx=asked)), 0, atol=0.01)
+    assert np.allclose(found.rssi(rx=asked), other.rssi(rx=asked), atol=0.01)
+    assert (found.unit, other.unit) == ("dBm", "dB")
 
 
 def test_stations_are_learned_as_a_file_has_them():
     ends = np.array([[0.0, 0, 2], [9, 9, 2]])
     powers = -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ends, axis=2))
     found = gsparc.fit(rx=PLACES, station_position=ends, rssi=powers, model="gp")
-    near = found.rssi(rx=PLACES[:5], tx=np.tile(ends[1], (5, 1)))[:, 0]
-    assert np.abs(10 * np.log10(near) - powers[:5, 1]).max() < 3
+    near = found.rssi(rx=PLACES[:5], tx=np.tile(ends[1], (5, 1)))
+    assert np.abs(near[:, 0] - powers[:5, 1]).max() < 3
+    every = found.rssi(rx=PLACES[:5])
+    assert every.shape == found.std(rx=PLACES[:5]).shape == (5, 2)
+    assert np.array_equal(every[:, 1:], near) and found.rssi(rx=PLACES[0]).shape == (2,)
+
+
+UNITS = {"dBm": lambda level: level, "dBW": lambda level: level - 30, "mW": lambda level: 10 ** (level / 10)}
+UNITS |= {"W": lambda level: 10 ** (level / 10 - 3), "pW": lambda level: 10 ** (level / 10 + 9)}
+
+
+@pytest.mark.parametrize("model", ["gp", "gsparc", "kriging"])
+@pytest.mark.parametrize("several", [False, True])
+def test_powers_in_dbm_were_answered_in_milliwatts(model, several, tmp_path):
+    """An error of 57 dB for who takes units to come back: now one field, answered in each unit to 1e-4 dB."""
+    ends = np.array([[0.0, 0, 2], [9, 9, 2]])
+    where = {"station_position": ends} if several else {"tx": END}
+    level = np.c_[POWERS, np.roll(POWERS, 7)] if several else POWERS
+    asked, answers = PLACES[:6] + 0.2, {}
+    for unit, of in UNITS.items():
+        found = gsparc.fit(rx=PLACES, rssi=of(level), unit=unit, model=model, budget_s=1.0,
+                           save=tmp_path / "m.ckpt", **where)  # fmt: skip
+        again = gsparc.load(tmp_path / "m.ckpt")
+        assert found.unit == again.unit == unit and gsparc.load(tmp_path / "m.ckpt", unit="dBm").unit == "dBm"
+        assert np.array_equal(found.rssi(rx=asked), again.rssi(rx=asked))
+        assert np.array_equal(found.std(rx=asked), again.std(rx=asked))
+        answers[unit] = found.rssi(rx=asked), *(ask(rx=asked, unit="dBm") for ask in (found.rssi, found.std))
+        for other, back in UNITS.items():
+            there = found.rssi(rx=asked, unit=other)
+            np.testing.assert_allclose(there, back(answers[unit][1].astype(float)), rtol=3e-5)
+    own, dbm, std = answers["dBm"]
+    assert own.shape == std.shape == (6, 1 + several) and (std > 0).all()
+    assert np.array_equal(own, dbm) and np.abs(own - level[:6].reshape(own.shape)).max() < 12
+    for unit, (_, other, spread) in answers.items():
+        assert np.abs(other - dbm).max() <= 1e-4 and np.abs(spread - std).max() <= 1e-4, unit
+
+
+def test_decibels_of_no_known_reference_and_linear_powers_come_back():
+    found = gsparc.fit(rx=PLACES, tx=END, rssi=POWERS, unit="dB", model="gp")
+    plain = gsparc.fit(rx=PLACES, tx=END, rssi=10 ** (POWERS / 10), unit="linear", model="gp")
+    said = plain.rssi(rx=PLACES[0])
+    assert (found.unit, plain.unit) == ("dB", "linear")
+    assert np.allclose(10 * np.log10(said), found.rssi(rx=PLACES[0]), atol=1e-4)
+    assert np.allclose(said, found.rssi(rx=PLACES[0], unit="linear"), rtol=3e-5)
+    with pytest.raises(ValueError, match="unit=W: of powers in dB expected dBm, dBW, linear"):
+        found.rssi(rx=PLACES[0], unit="W")
+    with pytest.raises(ValueError, match="unit=dBm: goes with powers, not with csi"):
+        gsparc.fit(rx=PLACES, tx=END, model="mean", **KINDS["csi"]).std(rx=PLACES[0], unit="dBm")
+
+
+def test_noise_goes_with_its_unit():
+    noise = np.full(60, 1e-10)
+    scales = [
+        gsparc.fit(rx=PLACES, tx=END, rssi=10 ** (POWERS / 10) * by, unit=unit, noise_variance=noise * by**2,
+                   model="gp").rssi(rx=PLACES[0], unit="dBm")
+        for unit, by in (("mW", 1.0), ("W", 1e-3))
+    ]  # fmt: skip
+    assert abs(scales[0] - scales[1]) < 1e-4
+
+
+def test_a_station_with_too_few_rows_is_nan_among_the_others():
+    powers = np.c_[POWERS, np.where(np.arange(60) == 3, POWERS, np.nan)]
+    ends = np.array([[0.0, 0, 2], [9, 9, 2]])
+    found = gsparc.fit(rx=PLACES, station_position=ends, rssi=powers, model="gp")
+    for answer in (found.rssi(rx=PLACES[:2]), found.std(rx=PLACES[:2])):
+        assert np.isfinite(answer[:, 0]).all() and np.isnan(answer[:, 1]).all()
+
+
+def test_methods_without_deviations_say_so():
+    found = gsparc.fit(rx=PLACES, tx=END, rssi=POWERS, model="nearest")
+    with pytest.raises(ValueError, match="nearest states no deviations"):
+        found.std(rx=PLACES[0])
 
 
 @pytest.mark.parametrize("wrong, said", [
+    ({"rx": PLACES, "rssi": POWERS, "unit": "dBi"}, "unit=dBi"),
+    ({"rx": PLACES, "rssi": POWERS, "unit": "mW"}, "rssi.*linear power, at least 0"),
     ({"rx": PLACES[:5], "rssi": POWERS}, "^gsparc.fit, rx_position: [^;]*found .5, 3.$"),
     ({"rx": PLACES, "rssi": POWERS, "carier_hz": 1e9}, "carier_hz.*carrier_hz"),
     ({"rx": PLACES}, "one of"),

@@ -214,7 +214,9 @@ def sums(predictor: Predictor, at: torch.Tensor) -> dict[str, torch.Tensor]:
     shape, draw = (2, *found.mean.shape[1:]), np.random.default_rng(1)
     weights = torch.complex(*torch.from_numpy(draw.standard_normal(shape)))
     parts = {"mean": torch.real(found.mean * weights).flatten(1).sum(1)}
-    parts |= {name: part for name in ("variance", "confidence") if (part := getattr(found, name)) is not None}
+    # Of a distance law the same decibels everywhere: no slope but of rounding.
+    others = ("confidence",) if predictor.method.name == "distance_law" else ("variance", "confidence")
+    parts |= {name: part for name in others if (part := getattr(found, name)) is not None}
     return parts
 
 

@@ -52,6 +52,8 @@ def test_missing_and_silent_stations_are_no_values(tmp_path):
     power = predictor.rssi(**{predictor.site.moving_end: place[None]})
     loud, quiet = (predictor.locate(power, silent=silent)[0] for silent in (None, [[True]]))
     assert quiet.area > loud.area, "below a level is less than at a level"
+    linear = predictor.locate(10 ** (power.astype(float) / 10), unit="linear")[0]
+    assert np.allclose(linear.place, loud.place) and linear.area == loud.area
 
 
 @pytest.mark.parametrize("values, more, said", [

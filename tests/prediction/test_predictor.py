@@ -180,7 +180,7 @@ def test_utm_places_in_float32_were_half_a_metre_off(abroad):
     site = dataclasses.replace(abroad.site, origin=abroad.site.origin + utm)
     far, place = gsparc.Predictor(abroad.method, site).at(0), abroad.metres(47.004, 11.002)
     there = place + utm
-    assert np.allclose(far.rssi(rx=there), abroad.at(0).rssi(rx=place), rtol=1e-5)
+    assert np.allclose(far.rssi(rx=there), abroad.at(0).rssi(rx=place), atol=1e-4)
     for rough in (torch.tensor(there, dtype=torch.float32), there.astype(np.float32)):
         with pytest.raises(
             ValueError, match=r"rx= is float32, which moves in steps of 0.5 m there; give float64"
@@ -193,7 +193,7 @@ def test_two_stations_at_one_place_have_models_of_their_own(abroad):
     """Both carriers of a mast were answered by the model of the first."""
     place = abroad.metres(47.004, 11.002)
     low, high = (float(abroad.at(number).rssi(rx=place)[0]) for number in (0, 1))
-    assert 25 < 10 * np.log10(low / high) < 35
+    assert 25 < low - high < 35
 
 
 def test_all_at_once_is_what_is_asked_one_by_one(abroad):
@@ -201,5 +201,5 @@ def test_all_at_once_is_what_is_asked_one_by_one(abroad):
     said = one.predict(rx=places)
     assert np.array_equal(said.mean.numpy(), one.rssi(rx=places))
     assert np.array_equal(said.confidence.numpy(), one.confidence(rx=places))
-    spread = 10 / np.log(10) * said.variance.sqrt().numpy() / said.mean[:, 0].double().numpy()
-    assert (np.abs(spread - 1) < 0.5).all()  # a decibel, as the powers were drawn
+    assert np.allclose(said.variance.sqrt()[:, None], one.std(rx=places), rtol=1e-6)
+    assert (np.abs(one.std(rx=places) - 1) < 0.5).all()  # a decibel, as the powers were drawn

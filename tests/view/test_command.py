@@ -12,6 +12,7 @@ from towns import town_model
 
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
+from gsparc.maps.making import levels_at
 from gsparc.models import checkpoint
 from gsparc.view.building import SPLATS, Building, build
 from gsparc.view.viewed import open_viewed
@@ -71,7 +72,21 @@ def test_powers_in_dbm_were_shown_in_db_by_default(monkeypatch):
     monkeypatch.setattr(checkpoint, "read", lambda path: in_dbm(read(path)))
     given = compose("ckpt=x", config="view").unit
     viewed = open_viewed(town_model(), {"file": "gone.npz"}, "west", given)
-    assert viewed.unit == "dBm" and open_viewed(town_model(), {"file": "gone.npz"}, unit="dBW").unit == "dBW"
+    assert viewed.unit == "dBm"
+
+
+def test_a_unit_of_pictures_changed_their_names_alone(monkeypatch):
+    """`unit=dBW` of levels in dBm wrote dBW beside the same numbers."""
+    read, places = checkpoint.read, np.array([[20.0, 30, 1.5], [50, 10, 1.5]])
+    monkeypatch.setattr(checkpoint, "read", lambda path: in_dbm(read(path)))
+    dbm, dbw = (open_viewed(town_model(), unit=unit) for unit in (None, "dBW"))
+    assert (dbm.unit, dbw.unit) == ("dBm", "dBW")
+    level, lower = (levels_at(one.predictor_of("west"), places)[0] for one in (dbm, dbw))
+    np.testing.assert_allclose(lower, level - 30, atol=1e-4)
+    np.testing.assert_allclose(dbw.measured("west").values, dbm.measured("west").values - 30, atol=1e-4)
+    np.testing.assert_allclose(dbw.measured("west").errors, dbm.measured("west").errors, atol=1e-4)
+    with pytest.raises(ValueError, match=r"unit=mW: of powers in dBm expected dBm, dBW$"):
+        open_viewed(town_model(), unit="mW")
 
 
 def in_dbm(stored):

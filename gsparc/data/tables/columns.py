@@ -20,18 +20,15 @@ from gsparc.data.tables.heads import (
     KINDS,
     MANY,
     OTHER_NAMES,
-    SCHEMA,
     STATION_WORDS,
-    UNITS,
     Head,
-    Unit,
-    known,
     suits,
     understand,
     unit_of,
     words_of,
 )
 from gsparc.data.tables.sheet import Sheet
+from gsparc.data.units import SCHEMA, UNITS, Unit, known
 
 LEVELS = ("rssi_db", "rssi")
 CHANNELS = ("csi_re", "csi_im")

@@ -63,9 +63,11 @@ def understand_table(
     builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
     sheet.problems.raise_if_any()
-    level = chosen["rssi_db"][0] if "rssi_db" in chosen else None
-    about = {} if level is None or level.unit is None else {"level_unit": schema_unit(level)}
-    about |= {"level_unit": "dBW"} if "rssi" in chosen else {}
+    power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
+    about = {}
+    if power is not None and power.unit is not None:
+        about = {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
+        about["unit"] = power.unit.name
     return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 

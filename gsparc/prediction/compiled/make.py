@@ -187,11 +187,11 @@ def ends_at(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def answers(predictor: Predictor, places: np.ndarray) -> np.ndarray:
-    """The model's answers (B, ...) in physical units at local places (B, 3) or (B, 6) [m]."""
+    """The model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
     site = predictor.site
-    ask = getattr(predictor, site.kind)
     parts = (ends_at(site, places[i : i + 64]) for i in range(0, len(places), 64))
-    return np.concatenate([ask(**{end: at + site.origin for end, at in part.items()}) for part in parts])
+    asked = [{end: at + site.origin for end, at in part.items()} for part in parts]
+    return np.concatenate([predictor.linear(**ends).mean.numpy() for ends in asked])
 
 
 def answered(predictor: Predictor, places: np.ndarray) -> Measurements:

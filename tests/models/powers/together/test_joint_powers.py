@@ -267,8 +267,8 @@ def test_gsparc_learns_stations_together(tmp_path):
     place, number = data.tx[fold.test[0]] + data.site.origin, int(data.station[fold.test[0]])
     post = POSTS[number]
     one = predictor.at(number).rssi(tx=place)
-    assert np.allclose(one, said.mean[0].numpy() * data.site.target_scale, rtol=1e-3)
-    assert np.allclose(one, predictor.rssi(tx=place, rx=post), rtol=1e-3)
+    assert np.allclose(one, db(said.mean[0] * data.site.target_scale), atol=4e-3)
+    assert np.allclose(one, predictor.rssi(tx=place, rx=post), atol=4e-3)
     assert np.isfinite(predictor.rssi(tx=place, rx=post + np.array([20.0, 20, 0]))).all()  # no station
 
 

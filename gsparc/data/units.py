@@ -1,0 +1,131 @@
+"""Units as people write them, and the only way between stored powers and the unit that they were given in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit as people write it.
+
+    Attributes:
+        name: as messages write it.
+        kind: `length`, `angle`, `frequency`, `power` or `level`; one kind has one unit in the schema.
+        factor: multiplies a value.
+        offset: is added after that.
+    """
+
+    name: str
+    kind: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def convert(self, values: np.ndarray) -> np.ndarray:
+        """Values of this unit in the schema's unit of its kind."""
+        return values if (self.factor, self.offset) == (1.0, 0.0) else values * self.factor + self.offset
+
+    @property
+    def changes(self) -> bool:
+        """Whether `convert` does anything."""
+        return (self.factor, self.offset) != (1.0, 0.0)
+
+
+SCHEMA = {"length": "m", "angle": "deg", "frequency": "Hz", "power": "W", "level": "dBm"}
+_LISTED = [
+    *(Unit(name, "length", factor) for name, factor in (("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("km", 1e3))),
+    *(Unit(name, "length", 0.3048) for name in ("ft", "feet")),
+    *(Unit(name, "length") for name in ("meter", "metre", "meters", "metres")),
+    *(Unit(name, "angle") for name in ("deg", "°", "degree", "degrees")),
+    *(Unit(name, "angle", 180 / np.pi) for name in ("rad", "radians")),
+    *(Unit(n, "frequency", f) for n, f in (("Hz", 1.0), ("kHz", 1e3), ("MHz", 1e6), ("GHz", 1e9))),
+    *(Unit(n, "power", f) for n, f in (("W", 1.0), ("mW", 1e-3), ("uW", 1e-6), ("µW", 1e-6), ("nW", 1e-9))),
+    *(Unit(n, "power", f) for n, f in (("pW", 1e-12), ("fW", 1e-15))),
+    *(Unit("dB", "level"), Unit("dBm", "level"), Unit("dBW", "level", offset=30.0)),
+]
+# Without case: nobody receives megawatts.
+UNITS = {unit.name.lower(): unit for unit in _LISTED} | {"μw": Unit("µW", "power", 1e-6)}
+
+
+def known(kind: str) -> str:
+    """The units of a kind, for messages."""
+    return ", ".join(unit.name for unit in _LISTED if unit.kind == kind)
+
+
+WATTS = {unit.name: unit.factor for unit in _LISTED if unit.kind == "power"}  # that a value of 1 is
+WATTS |= {"dBW": 1.0, "dBm": 1e-3}  # of levels the power of 0
+LINEAR = "linear"  # a power whose level is in the site's unit of levels, whatever that refers to
+DB = 10 / math.log(10)
+
+
+@dataclass(frozen=True)
+class PowerUnit:
+    """Between linear powers as they are stored and values in a unit.
+
+    Attributes:
+        name: of the unit.
+        decibels: whether values are levels.
+        scale: value of a stored power of 1, or the power whose level that value is.
+    """
+
+    name: str
+    decibels: bool
+    scale: float
+
+    @classmethod
+    def of(cls, name: str | None, level_unit: str, scale: float = 1.0, levels: bool = False) -> Self:
+        """The unit of a name, for stored powers that times `scale` have levels in `level_unit`.
+
+        Levels whose reference nobody said (`dB`) are in whatever unit of levels is asked for.
+
+        Args:
+            name: None: that of the levels.
+            level_unit, scale: of the stored powers.
+            levels: whether powers as such are refused.
+
+        Raises:
+            ValueError: no unit of powers, or one that these powers cannot be turned into.
+        """
+        if name in (None, level_unit) or (name == LINEAR and not levels):
+            return cls(name or level_unit, name != LINEAR, scale)
+        unit, own = UNITS.get(str(name).lower()), WATTS.get(level_unit)
+        decibels = unit is not None and unit.kind == "level"
+        if unit is None or unit.name not in WATTS or (not decibels and (levels or own is None)):
+            powers = "" if levels else f", {LINEAR}" if own is None else f", {LINEAR}, {known('power')}"
+            raise ValueError(f"unit={name}: of powers in {level_unit} expected dBm, dBW{powers}")
+        return cls(unit.name, decibels, scale if own is None else scale * own / WATTS[unit.name])
+
+    @property
+    def raised_db(self) -> float:
+        """What is added to the level [dB] of a stored power."""
+        return 10 * math.log10(self.scale)
+
+    def values(self, stored: Tensor) -> Tensor:
+        """Powers in the unit, like `stored`; levels are -inf of silence and NaN of what is less."""
+        if self.decibels:
+            return 10 * stored.double().log10() + self.raised_db
+        return stored if self.scale == 1 else stored * self.scale
+
+    def variance(self, stored: Tensor, variance: Tensor) -> Tensor:
+        """Of `values` (B,) float64, from stored powers (B, 1) or other targets, and their variance (B,).
+
+        In float64: squares of powers in watts are beyond float32.
+        """
+        if self.decibels:
+            return variance.double() * (DB / stored.double()[:, 0]).square()
+        return variance.double() * self.scale**2
+
+    def stored(self, values: Tensor) -> Tensor:
+        """The inverse of `values`, float64."""
+        values = values.double()
+        return 10 ** ((values - self.raised_db) / 10) if self.decibels else values / self.scale
+
+
+def in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
+    return 10 * np.log10(mean), DB * np.sqrt(variance) / mean

@@ -1,0 +1,123 @@
+"""World positions as what a method is asked: in local coordinates, both ends, checked."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.assemble import FARTHEST
+from gsparc.data.schema import End, Site
+from gsparc.ops import Pose
+from gsparc.ops.transforms import numbers
+
+SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
+COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
+
+
+class Query(NamedTuple):
+    """Both ends (B, 3) in local coordinates, whether one position was given, and whether torch was."""
+
+    tx: Tensor
+    rx: Pose
+    single: bool
+    as_torch: bool
+
+
+class Queries:
+    """Queries of one site; see `Predictor`."""
+
+    def __init__(self, site: Site) -> None:
+        self.site, still = site, site.static_position if site.static_end == "rx" else None
+        # The pose of a receiver that never moved, made once.
+        self._still = None if still is None else Pose(_float(still), _float(self._rotation(None, 1)))
+
+    def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Query:
+        """Both ends as they were given, checked."""
+        receiver = rx.position if isinstance(rx, Pose) else rx
+        places = {
+            end: read_places(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
+        }
+        moving, static = self.site.moving_end, self.site.static_end or "tx"
+        for needed in (moving,) if self.site.static_end else ("rx", "tx"):
+            if needed not in places:
+                raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
+        single = all(place.ndim == 1 for place in places.values())
+        common = self._still is not None and len(places) == 1 and dtype == torch.float32
+        if self._still is not None and common:  # with nothing to look up
+            sender = _float(np.atleast_2d(places[moving] - self.site.origin))
+            return Query(sender, self._still, single, isinstance(tx, Tensor))
+        local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
+        count = max(len(place) for place in local.values())
+        for end, place in local.items():
+            if len(place) not in (1, count):
+                raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
+        ends = {moving: local[moving], static: self._static(local.get(static))}
+        rotation = self._rotation(rx, count)
+        if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
+            pose = Pose(_float(ends["rx"], dtype), _float(rotation, dtype))
+        else:
+            positions = np.broadcast_to(ends["rx"], (count, 3))
+            turned = np.broadcast_to(rotation, (count, 3, 3))
+            pose = Pose(_float(positions, dtype), _float(turned, dtype))
+        sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
+        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, receiver)))
+
+    def _static(self, place: np.ndarray | None) -> np.ndarray:
+        """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
+        known, end = self.site.static_position, self.site.static_end
+        if known is None:
+            if place is not None:
+                return place[0] if len(place) == 1 else place
+            if self.site.stations is not None:
+                raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
+            if self.site.kind == "rssi":  # learned without its transmitter's place
+                return np.full(3, np.nan)
+            raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
+        if place is not None and (np.linalg.norm(place - known, axis=-1) > SAME_PLACE_M).any():
+            stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
+            raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
+        return known
+
+    def _rotation(self, rx: Any, count: int) -> np.ndarray:
+        if isinstance(rx, Pose):
+            rotation = numbers(rx.rotation).astype(np.float64)
+            if rotation.ndim == 3 and len(rotation) not in (1, count):
+                raise ValueError(f"rx= holds {len(rotation)} rotations for {count} positions")
+            return rotation
+        return np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
+
+
+def usual_heights(site: Site) -> dict[End, float]:
+    """World height [m] of each end that moved and was always at the same height."""
+    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
+    low, high = site.moving_box[:, 2::3]
+    # Rounded: the origin was taken away from it.
+    above = {end: round(float(low[i] + site.origin[2]), 9) for i, end in enumerate(moving)}
+    return {end: above[end] for i, end in enumerate(moving) if low[i] == high[i]}
+
+
+def read_places(end: str, value: Any) -> np.ndarray:
+    """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
+    try:
+        array = numbers(value) if isinstance(value, Tensor) else np.asarray(value)
+        array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")
+    except (TypeError, ValueError):
+        raise ValueError(f"{end}= must be real numbers [m], got {type(value).__name__}") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != 3 or not array.size:
+        raise ValueError(f"{end}= must be (3,) or (B, 3) [m], got shape {array.shape}")
+    if not np.isfinite(array).all():
+        row = "" if array.ndim == 1 else f" in row {int(np.flatnonzero(~np.isfinite(array).all(1))[0])}"
+        raise ValueError(f"{end}= holds NaN or Inf{row}")
+    if np.abs(array).max() > FARTHEST:
+        raise ValueError(f"{end}= holds {np.abs(array).max():.3g}; expected metres, none beyond {FARTHEST:g}")
+    step = float(np.spacing(np.float32(np.abs(array).max())))
+    if getattr(value, "dtype", None) in (np.float32, torch.float32) and step > COARSE_M:
+        raise ValueError(f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64")
+    return array
+
+
+def _float(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float32 if dtype == torch.float32 else np.float64))
