@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,34 @@ from gsparc.commands.shared.continued import once
 from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings
+from gsparc.data.files import set_aside
 from gsparc.evaluation.experiment.run import Objects, objective_of, run
 from gsparc.evaluation.metric_formats import score_of
 from gsparc.evaluation.summary import remarks, results_table
+from gsparc.models import checkpoint
+
+log = logging.getLogger(__name__)
+
+# What a run leaves; of another one, all of it would be read beside this one's.
+LEFT = (
+    *("summary.json", "split.json", "per_sample.csv", "learning_curve.csv", "render_ms.csv", "test.png"),
+    *("found.png", checkpoint.MODEL, f"fold*/{checkpoint.MODEL}", "fold*/learning_curve.csv"),
+)
 
 
 def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     """Fit a method on every fold of a split and test it, as `run` does; the folder is locked meanwhile.
 
+    What an earlier run left there is set aside first, but for what this one goes on, or starts, from.
+
     Raises:
         ValueError: as `run`; or another run writes there.
     """
     with locked(run_dir):
+        taken = [Path(path) for path in (config.ckpt_path, config.get("init_from")) if path is not None]
+        goes_on = any(run_dir.resolve() in (path.resolve(), *path.resolve().parents) for path in taken)
+        if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
+            log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
         RunSettings.of(config)
         return run(config, run_dir)
 

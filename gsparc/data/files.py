@@ -23,6 +23,11 @@ def platform_cache() -> Path:
     return (Path(root) if root else Path.home() / ".cache") / "gsparc"
 
 
+def is_address(path: object) -> bool:
+    """Whether a file is named by a URL, which reading asks somebody for."""
+    return "://" in str(path)
+
+
 def read_text(path: Path, missing: str, kind: str = "text") -> str:
     """A text in UTF-8; `DataError` says `missing`, or that the file is not readable as `kind`."""
     try:
@@ -106,6 +111,34 @@ def no_room(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, OSError):
         error = error.__cause__ or error.__context__
     return error is not None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+
+
+def set_aside(folder: Path, *patterns: str) -> bool:
+    """Rename files of an earlier run to `NAME.earlier`, over those before; returns whether there were any."""
+    found = [path for pattern in patterns for path in folder.glob(pattern)]
+    for path in found:
+        os.replace(path, path.with_name(path.name + ".earlier"))
+    return bool(found)
+
+
+def sweep(folder: Path) -> None:
+    """Delete what processes that are gone left half written in a folder that nobody else writes to."""
+    below = (folder.glob(f"{parents}.*.partial") for parents in ("", "*/", "*/*/"))
+    for path in [path for paths in below for path in paths]:
+        pid = path.name.split(".")[-2]
+        if pid.isdecimal() and (int(pid) == os.getpid() or not _runs(int(pid))):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _runs(pid: int) -> bool:
+    """Whether there is a process of this number, ours or anybody's."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def _partial(path: Path) -> Path:

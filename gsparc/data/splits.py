@@ -344,9 +344,12 @@ def indices_hash(folds: tuple[Fold, ...]) -> str:
     return digest.hexdigest()
 
 
-def write_split(path: str | Path, split: Split, rows: int, dataset_sha256: str = "") -> None:
-    """Store a split of `rows` rows as a JSON index file (atomically)."""
+def write_split(
+    path: str | Path, split: Split, rows: int, dataset_sha256: str = "", run_id: str | None = None
+) -> None:
+    """Store a split of `rows` rows as a JSON index file (atomically), with the run that made it."""
     facts = {"schema": 1, "name": split.name, "rows": rows, "dataset_sha256": dataset_sha256}
+    facts |= {} if run_id is None else {"run_id": run_id}
     folds = [{name: part.tolist() for name, part in vars(fold).items()} for fold in split.folds]
     content = {**facts, "sha256": split.sha256, "folds": folds}
     with whole_file(path) as partial:

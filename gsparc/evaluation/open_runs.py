@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
+from gsparc.data.files import is_address
 from gsparc.data.load import datamodule, split_for, split_settings
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, indices_hash
@@ -92,6 +93,8 @@ def open_files(
     """
     loaded = [loading.load(path) for path in paths]
     stored = [one for _, one in loaded]
+    if len({one.extra.get("run_id") for one in stored}) > 1:
+        raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
     chosen_class = "_target_" in (dataset or {})
     module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
     data = aligned(module.measurements, stored[0].site)
@@ -107,12 +110,21 @@ def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any
     """The checkpoint's settings of a config group under the ones given now (those that are not null).
 
     Another name or a `_target_` given now replaces all that is stored, classes out of the file with it.
+
+    Raises:
+        ValueError: no name, or an address that only the file names: reading would tell somebody who reads it.
     """
     before = stored.configuration.get(group)
     before = before if isinstance(before, dict) else {}
     now = {key: value for key, value in (overrides or {}).items() if value is not None}
     if "_target_" in now or ("name" in now and now["name"] != before.get("name")):
         before = {}
+    asked = [key for key, value in before.items() if is_address(value) and key not in now]
+    if asked:
+        where = f"{group}.{asked[0]}"
+        raise ValueError(
+            f"{stored.path}: {where} is an address, {before[asked[0]]}; say {where}=... to ask it"
+        )
     settings = {**before, **now}
     if not {"name", "_target_"} & set(settings):
         raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")

@@ -58,8 +58,12 @@ class Stored:
         """The configuration as plain containers; empty when there was none.
 
         Raises:
-            CheckpointError: it is not YAML, or has aliases.
+            CheckpointError: it is not YAML, or has aliases or interpolations.
         """
+        if (
+            "${" in self.config
+        ):  # ours are resolved; another's would fetch what the reader's environment holds
+            raise CheckpointError(f"{self.path}: its configuration has ${{...}}, which gsparc never writes")
         try:
             events = yaml.parse(self.config, yaml.SafeLoader) if "*" in self.config else ()
             if any(isinstance(event, yaml.AliasEvent) for event in events):

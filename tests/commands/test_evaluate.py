@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import re
 import sys
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from typing import ClassVar
 
 import pytest
+import yaml
 from campaigns import channels, compose
-from doors import knock
+from doors import assert_refused, knock
 
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
@@ -87,3 +91,53 @@ def test_folds_need_their_checkpoints(trained, tmp_path):
     checkpoint.save(fold, method, stored.config, {"fold": 4})
     with pytest.raises(ValueError, match="fold 4 was trained, split=random has 1 folds"):
         evaluate_files([fold])
+
+
+class Asked(BaseHTTPRequestHandler):
+    """Notes what it is asked for."""
+
+    paths: ClassVar[list[str]] = []
+
+    def do_GET(self):
+        self.paths.append(self.path)
+        self.send_error(404)
+
+    do_HEAD = do_GET
+
+    def log_message(self, *unused):
+        pass
+
+
+@pytest.fixture
+def stranger():
+    """`(address, paths)` of a server that is somebody else's."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Asked)
+    Asked.paths.clear()
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", Asked.paths
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("secret", "refused"),
+    [("${oc.env:GSPARC_TOKEN}", r"has \$\{\.\.\.\}"), ("plain", r"dataset\.file is an address, http.*; say")],
+)
+def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatch, stranger, secret, refused):
+    """A stored `dataset.file=http://HOST/${oc.env:NAME}.parquet` was asked for, twice."""
+    monkeypatch.setenv("GSPARC_TOKEN", "very-secret")
+    address, asked = stranger
+    method, stored = loading.load(trained)
+    config = yaml.safe_load(stored.config)
+    config["dataset"] |= {"file": f"{address}/{secret}.parquet", "cell_m": 1.0}
+    bad = tmp_path / "bad.ckpt"
+    checkpoint.save(bad, method, yaml.safe_dump(config), dict(stored.extra))
+    for command, more in (("evaluate", []), ("map", ["step_m=1"]), ("calibrate", []), ("locate", [])):
+        given = [f"ckpt={bad}", f"hydra.run.dir={tmp_path / command}", "threads=1", *more]
+        assert_refused(knock(COMMANDS[command].run, command, given), refused)
+    if secret == "plain":  # what the user names is asked
+        with pytest.raises(ValueError, match="damaged or not a Parquet file"):
+            evaluate_files([bad], {"file": f"{address}/mine.parquet"})
+        assert set(asked) == {"/mine.parquet"}
+    else:
+        assert not asked

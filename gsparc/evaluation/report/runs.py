@@ -157,12 +157,25 @@ def _facts(file: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path) -> Run:
-    """The run in a directory."""
+    """The run in a directory.
+
+    Raises:
+        ValueError: its files are of two runs.
+    """
     render = columns(folder / "render_ms.csv").get("render_ms")
+    facts, samples = _facts(folder / "summary.json"), columns(folder / "per_sample.csv")
+    split = folder / "split.json"
+    others = {"per_sample.csv": next(iter(samples.pop("run_id", ())), None)}
+    others |= {split.name: _facts(split).get("run_id")} if split.is_file() else {}
+    for name, run_id in others.items():
+        if run_id is not None and run_id != facts.get("run_id"):
+            raise ValueError(
+                f"{folder}: summary.json and {name} are of two runs; train again in an empty folder"
+            )
     return Run(
         folder,
-        _facts(folder / "summary.json"),
-        columns(folder / "per_sample.csv"),
+        facts,
+        samples,
         {k: v for k, v in columns(folder / "learning_curve.csv").items() if v.dtype.kind == "f"},
         _overrides(folder / ".hydra" / "overrides.yaml"),
         np.zeros(0) if render is None else render,
@@ -219,6 +232,8 @@ def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> 
     for number, run in enumerate(runs):
         try:
             opened = open_files(run.checkpoints[:1])
+            if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
+                raise ValueError("its checkpoint is of another run than its summary")
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
