@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import mmap
+import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
+import tempfile
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -19,9 +25,12 @@ from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
+from numpy.lib.format import read_array_header_1_0 as header_1
+from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import netcdf_file
 
-from gsparc.data.blocks import contents, is_big, on_disk
+from gsparc.data.blocks import BIG, contents, is_big, on_disk
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
@@ -188,11 +197,14 @@ def _read_npz(path: Path) -> Raw:
         # numpy would take anything else for a pickle and speak of that.
         raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     try:
+        refuse_sizes(path, _stated_npz(path))
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
                 if name in arrays:
                     raise KeyError("in the archive twice")
                 arrays[name] = file[name]
+    except DataError:
+        raise
     except DAMAGED as error:
         fault = f"damaged or not an npz file ({reason(error)})"
         if "allow_pickle" in str(error):
@@ -214,6 +226,31 @@ def _read_npz(path: Path) -> Raw:
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
 
 
+def _stated_npz(path: Path) -> dict[str, Stated]:
+    """Of each array that begins as NumPy writes it."""
+    stated = {}
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            # What is damaged is said by name where it is read.
+            with suppress(*DAMAGED), archive.open(entry) as file:
+                file.seek(len(MAGIC_PREFIX))
+                shape, _, dtype = (header_1 if file.read(2)[0] == 1 else header_2)(file)
+                stated[entry.filename.removesuffix(".npy")] = Stated(shape, math.prod(shape) * dtype.itemsize)
+    return stated
+
+
+def _stated_hdf5(file: h5py.File) -> dict[str, Stated]:
+    """Of each dataset; what is large and no text is copied to disk, or stays in the file."""
+    stated = {}
+    for name, item in file.items():
+        if isinstance(item, h5py.Dataset) and item.shape is not None:
+            large = not h5py.check_string_dtype(item.dtype) and is_big(item)
+            stays = large and item.id.get_offset() is not None and item.dtype.isnative
+            size = item.size * item.dtype.itemsize
+            stated[str(_plain(name))] = Stated(item.shape, size, None if stays else large)
+    return stated
+
+
 def _read_hdf5(path: Path) -> Raw:
     arrays, units, name = {}, {}, "the file"
     fault = read_error(path)
@@ -221,6 +258,7 @@ def _read_hdf5(path: Path) -> Raw:
         raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
     try:
         with h5py.File(path, "r") as file:
+            refuse_sizes(path, _stated_hdf5(file))
             for key, item in file.items():
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
@@ -229,6 +267,8 @@ def _read_hdf5(path: Path) -> Raw:
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
+    except DataError:
+        raise
     except DAMAGED as error:
         raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({reason(error)})") from None
     arrays = {k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}
@@ -254,6 +294,56 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
+LARGEST = 2**40  # bytes of a file's arrays, ten times the largest campaign that is published
+MOST_PACKED = 1100  # times a file's bytes, as deflate packs 1,032 to one at best: the rest was never written
+SPARE = 2**30  # bytes of disk or memory that other programs keep
+
+
+class Stated(NamedTuple):
+    """What a file says of an array, which may be untrue.
+
+    Attributes:
+        shape, size: axes, and bytes once it is read.
+        copied: whether it goes to a file in TMPDIR instead of memory; None: it stays where it is.
+    """
+
+    shape: tuple[int, ...]
+    size: int
+    copied: bool | None = False
+
+
+def refuse_sizes(path: Path, stated: Mapping[str, Stated]) -> None:
+    """Raise DataError before an array is read that the file cannot hold, or for which there is no room."""
+    if not stated:
+        return
+    name, largest = max(stated.items(), key=lambda item: item[1].size)
+    rows = Counter(one.shape[0] for one in stated.values() if one.shape)
+    total, packed = sum(one.size for one in stated.values()), path.stat().st_size
+    on_disk, in_memory = (sum(one.size for one in stated.values() if one.copied is c) for c in (True, False))
+    fault = None
+    if total > max(BIG, MOST_PACKED * packed):
+        fault = f"a file of {packed:,} bytes cannot hold that; was it ever written?"
+    elif total > LARGEST:
+        fault = f"at most {LARGEST:,} are read; give a part of the campaign"
+    elif largest.size >= BIG and rows[largest.shape[0]] < 2 and not name.startswith("path_"):
+        fault = f"no other array has {largest.shape[0]:,} rows; expected one for each position"
+    elif on_disk + SPARE > shutil.disk_usage(tempfile.gettempdir()).free:
+        fault = f"{tempfile.gettempdir()} has no room for {on_disk:,}; set TMPDIR to a larger disk"
+    elif in_memory >= BIG and in_memory + SPARE > free_memory():
+        fault = f"too little memory for {in_memory:,}; HDF5 without a mask may stay on disk"
+    if fault is not None:
+        raise DataError(f"{path}, {name}: shape {largest.shape}, {largest.size:,} bytes: {fault}")
+
+
+def free_memory() -> int:
+    """Bytes that a process may still take without others being moved out, where the system says it."""
+    try:
+        text = Path("/proc/meminfo").read_text(encoding="ascii")
+    except OSError:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return int(re.search(r"MemAvailable:\s+(\d+)", text)[1]) * 1024  # type: ignore[index]
+
+
 def numbered_rows(count: int) -> np.ndarray:
     """What rows (count,) are called that their file does not name."""
     return np.array([f"row {i}" for i in range(count)])
@@ -271,7 +361,7 @@ import sys, h5py
 with h5py.File(sys.argv[1], "r") as file:
     for item in file.values():
         if isinstance(item, h5py.Dataset):
-            if item.dtype.hasobject:
+            if item.dtype.hasobject and item.nbytes < 2**28:
                 item[()]
             dict(item.attrs)
     dict(file.attrs)
@@ -341,6 +431,8 @@ def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     if fault is not None:
         raise DataError(f"{path}: damaged ({fault})")
     with h5py.File(path, "r") as file:
+        sizes = {name: one._replace(copied=False) for name, one in _stated_hdf5(file).items()}
+        refuse_sizes(path, sizes)
         items = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
         return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in items}
 
