@@ -5,16 +5,23 @@ from __future__ import annotations
 import csv
 import errno
 import io
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from gsparc.data.errors import DataError, reason
+
+LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
+MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
+LEAST_NODES = 10_000  # of YAML that are not counted
 
 
 def platform_cache() -> Path:
@@ -40,10 +47,51 @@ def read_text(path: Path, missing: str, kind: str = "text") -> str:
 
 def read_csv(path: Path, missing: str) -> list[list[str]]:
     """Cells of each line, between commas; `DataError` as of `read_text`."""
+    text = read_text(path, missing, "CSV text")
     try:
-        return list(csv.reader(io.StringIO(read_text(path, missing, "CSV text"))))
+        return list(csv.reader(map(partial(checked_line, path), count(1), io.StringIO(text))))
     except csv.Error as error:
         raise DataError(f"{path}: not readable as CSV text ({error})") from None
+
+
+def checked_line(path: str | Path, number: int, line: str) -> str:
+    """The line of a table; DataError where it is longer than `LONGEST_LINE`."""
+    if len(line) > LONGEST_LINE:
+        fault = f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
+        raise DataError(f"{path}, line {number}: {fault}")
+    return line
+
+
+class Endless(yaml.YAMLError):
+    """Aliases that repeat without end, or nearly."""
+
+
+def load_yaml(text: str) -> Any:
+    """What a text in YAML holds.
+
+    Raises:
+        yaml.YAMLError: it is none, or `Endless`.
+        ValueError, RecursionError: as PyYAML.
+    """
+    loader = yaml.SafeLoader(text)
+    try:
+        node = loader.get_single_node()
+        sizes: dict[int, float] = {}
+        if node is not None and _expanded(node, sizes) > MOST_GROWTH * len(sizes) + LEAST_NODES:
+            raise Endless("YAML whose aliases repeat without end")
+        return None if node is None else loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _expanded(node: yaml.Node, sizes: dict[int, float]) -> float:
+    """Number of nodes where aliases are written out; `sizes` holds those that are counted, by identity."""
+    if id(node) not in sizes:
+        sizes[id(node)] = math.inf  # of one inside itself
+        inside = [] if isinstance(node, yaml.ScalarNode) else node.value
+        parts = [part for one in inside for part in (one if isinstance(one, tuple) else (one,))]
+        sizes[id(node)] = 1 + sum(_expanded(part, sizes) for part in parts)
+    return sizes[id(node)]
 
 
 def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
@@ -57,7 +105,7 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
         DataError: missing, not readable, or no table.
     """
     try:
-        content = yaml.safe_load(read_text(path, f"missing; expected {missing}", "YAML"))
+        content = load_yaml(read_text(path, f"missing; expected {missing}", "YAML"))
     except DataError:
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -65,6 +113,18 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
     if not isinstance(content, Mapping):
         raise DataError(f"{path}: expected {expected}")
     return content
+
+
+def check_yaml(folder: str | None) -> None:
+    """Refuse (DataError) aliases without end in a folder of configurations, which Hydra would write out."""
+    for path in () if folder is None else sorted(Path(folder).rglob("*.yaml")):
+        try:
+            text = read_text(path, "missing", "YAML")
+            _ = load_yaml(text) if "&" in text and "*" in text else None
+        except Endless as error:
+            raise DataError(f"{path}: {error}") from None
+        except (yaml.YAMLError, ValueError, RecursionError):
+            continue  # Hydra says so, where it reads it
 
 
 @contextmanager

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
+from gsparc.data.files import load_yaml
 from gsparc.data.schema import Kind
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.open_runs import open_files
@@ -201,7 +201,7 @@ def _column(cells: Sequence[str]) -> np.ndarray:
 def _overrides(path: Path) -> tuple[str, ...]:
     if not path.is_file():
         return ()
-    return tuple(str(line) for line in yaml.safe_load(path.read_text(encoding="utf-8")) or ())
+    return tuple(str(line) for line in load_yaml(path.read_text(encoding="utf-8")) or ())
 
 
 def number(value: object) -> float | None:
