@@ -16,7 +16,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import is_address
 from gsparc.data.load import datamodule, split_for, split_settings
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Split, indices_hash
+from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
@@ -42,6 +42,8 @@ class Opened:
         foreign: what differs from what the methods were trained on, one clause; None: nothing.
         learned: test rows that the methods have learned from, of other data those at places that they have
             learned from; None: not known.
+        trained: of other data or rows, what they learned from in their coordinates, and its folds; None where
+            that is gone.
     """
 
     methods: list[Method]
@@ -50,6 +52,7 @@ class Opened:
     split: Split
     foreign: str | None = None
     learned: int | None = 0
+    trained: tuple[Measurements, Split] | None = None
 
     def facts(self) -> dict[str, Any]:
         """`dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
@@ -81,12 +84,15 @@ def open_files(
     paths: Sequence[str | Path],
     dataset: Mapping[str, Any] | None = None,
     split: Mapping[str, Any] | None = None,
+    *,
+    others_whole: bool = False,
 ) -> Opened:
     """Load checkpoints of one run, one per fold, and their data.
 
     Args:
         paths: checkpoint files in the order of their folds.
         dataset, split: settings that replace those stored in the first checkpoint.
+        others_whole: other data than these checkpoints' are test rows throughout, where no split is given.
 
     Raises:
         ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
@@ -98,12 +104,18 @@ def open_files(
     chosen_class = "_target_" in (dataset or {})
     module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
     data = aligned(module.measurements, stored[0].site)
-    whole = split_for(_settings("split", stored[0], split), data)
-    chosen = _folds(whole, stored)
-    foreign, learned = _foreign(stored, data, chosen)
+    other = data.site.sha256 != stored[0].site.sha256
+    if other and others_whole and all(value is None for value in (split or {}).values()):
+        none, every = np.zeros(0, np.int64), np.arange(len(data))
+        folds = (Fold(none, none, every),) * len(stored)
+        chosen = Split("whole", folds, indices_hash(folds))
+    else:
+        chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
+    trained = _trained(stored, data) if other or not trained_on(stored, chosen) else None
+    foreign, learned = _foreign(stored, data, chosen, trained)
     if foreign is not None:
         log.warning("%s was trained on %s", stored[0].path, foreign)
-    return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned)
+    return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
 def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -160,7 +172,10 @@ def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None
 
 
 def _foreign(
-    stored: Sequence[checkpoint.Stored], data: Measurements, chosen: Split
+    stored: Sequence[checkpoint.Stored],
+    data: Measurements,
+    chosen: Split,
+    trained: tuple[Measurements, Split] | None,
 ) -> tuple[str | None, int | None]:
     """What was trained on instead, and how many of these test rows the models have learned from."""
     same = data.site.sha256 == stored[0].site.sha256
@@ -168,7 +183,6 @@ def _foreign(
     if same and known:
         return None, 0
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
-    trained = _trained(stored, data)
     if trained is None:
         what = "rows that it does not name" if same and known is None else what
         return f"{what}; these test rows may have been TRAINED on", None

@@ -138,6 +138,8 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     conditions = []
     if facts.get("split/foreign"):
         conditions.append(f"the model was trained on {facts['split/foreign']}")
+    if facts.get("split/without_baselines"):
+        conditions.append(f"no baselines: {facts['split/without_baselines']}")
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
         conditions.append(
