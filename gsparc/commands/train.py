@@ -20,15 +20,12 @@ from gsparc.data.files import set_aside
 from gsparc.evaluation.experiment.run import Objects, objective_of, run
 from gsparc.evaluation.metric_formats import score_of
 from gsparc.evaluation.summary import remarks, results_table
-from gsparc.models import checkpoint
 
 log = logging.getLogger(__name__)
 
 # What a run leaves; of another one, all of it would be read beside this one's.
-LEFT = (
-    *("summary.json", "split.json", "per_sample.csv", "learning_curve.csv", "render_ms.csv", "test.png"),
-    *("found.png", checkpoint.MODEL, f"fold*/{checkpoint.MODEL}", "fold*/learning_curve.csv"),
-)
+LEFT = ("summary.json", "split.json", "per_sample.csv", "render_ms.csv", "test.png", "found.png")
+LEFT = (*LEFT, *(f"{fold}{name}" for fold in ("", "fold*/") for name in ("model.ckpt", "learning_curve.csv")))
 
 
 def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
@@ -40,8 +37,8 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         ValueError: as `run`; or another run writes there.
     """
     with locked(run_dir):
-        taken = [Path(path) for path in (config.ckpt_path, config.get("init_from")) if path is not None]
-        goes_on = any(run_dir.resolve() in (path.resolve(), *path.resolve().parents) for path in taken)
+        taken = [Path(config[name]).resolve() for name in ("ckpt_path", "init_from") if config.get(name)]
+        goes_on = any(run_dir.resolve() in (path, *path.parents) for path in taken)
         if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
             log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
         RunSettings.of(config)

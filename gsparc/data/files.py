@@ -9,7 +9,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -62,26 +62,20 @@ def checked_line(path: str | Path, number: int, line: str) -> str:
     return line
 
 
-class Endless(yaml.YAMLError):
-    """Aliases that repeat without end, or nearly."""
-
-
-def load_yaml(text: str) -> Any:
+def load_yaml(text: str, source: str | Path) -> Any:
     """What a text in YAML holds.
 
     Raises:
-        yaml.YAMLError: it is none, or `Endless`.
-        ValueError, RecursionError: as PyYAML.
+        DataError: aliases that repeat without end, or nearly.
+        yaml.YAMLError, ValueError, RecursionError: it is none.
     """
-    loader = yaml.SafeLoader(text)
-    try:
-        node = loader.get_single_node()
-        sizes: dict[int, float] = {}
-        if node is not None and _expanded(node, sizes) > MOST_GROWTH * len(sizes) + LEAST_NODES:
-            raise Endless("YAML whose aliases repeat without end")
-        return None if node is None else loader.construct_document(node)
-    finally:
-        loader.dispose()
+    loader, sizes = yaml.SafeLoader(text), dict[int, float]()
+    node = loader.get_single_node()
+    if node is None:
+        return None
+    if _expanded(node, sizes) > MOST_GROWTH * len(sizes) + LEAST_NODES:
+        raise DataError(f"{source}: YAML whose aliases repeat without end")
+    return loader.construct_document(node)
 
 
 def _expanded(node: yaml.Node, sizes: dict[int, float]) -> float:
@@ -105,7 +99,7 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
         DataError: missing, not readable, or no table.
     """
     try:
-        content = load_yaml(read_text(path, f"missing; expected {missing}", "YAML"))
+        content = load_yaml(read_text(path, f"missing; expected {missing}", "YAML"), path)
     except DataError:
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -118,13 +112,9 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
 def check_yaml(folder: str | None) -> None:
     """Refuse (DataError) aliases without end in a folder of configurations, which Hydra would write out."""
     for path in () if folder is None else sorted(Path(folder).rglob("*.yaml")):
-        try:
-            text = read_text(path, "missing", "YAML")
-            _ = load_yaml(text) if "&" in text and "*" in text else None
-        except Endless as error:
-            raise DataError(f"{path}: {error}") from None
-        except (yaml.YAMLError, ValueError, RecursionError):
-            continue  # Hydra says so, where it reads it
+        text = path.read_bytes()
+        with suppress(yaml.YAMLError, UnicodeDecodeError, RecursionError):  # Hydra says so, where it reads it
+            _ = load_yaml(text.decode(), path) if b"&" in text and b"*" in text else None
 
 
 @contextmanager
@@ -176,15 +166,12 @@ def no_room(error: BaseException | None) -> bool:
 def set_aside(folder: Path, *patterns: str) -> bool:
     """Rename files of an earlier run to `NAME.earlier`, over those before; returns whether there were any."""
     found = [path for pattern in patterns for path in folder.glob(pattern)]
-    for path in found:
-        os.replace(path, path.with_name(path.name + ".earlier"))
-    return bool(found)
+    return any([path.replace(f"{path}.earlier") for path in found])
 
 
 def sweep(folder: Path) -> None:
     """Delete what processes that are gone left half written in a folder that nobody else writes to."""
-    below = (folder.glob(f"{parents}.*.partial") for parents in ("", "*/", "*/*/"))
-    for path in [path for paths in below for path in paths]:
+    for path in [path for above in ("", "*/", "*/*/") for path in folder.glob(f"{above}.*.partial")]:
         pid = path.name.split(".")[-2]
         if pid.isdecimal() and (int(pid) == os.getpid() or not _runs(int(pid))):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
@@ -194,10 +181,8 @@ def _runs(pid: int) -> bool:
     """Whether there is a process of this number, ours or anybody's."""
     try:
         os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
+    except (OSError, OverflowError) as error:
+        return isinstance(error, PermissionError)
     return True
 
 

@@ -97,9 +97,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     unit = data.run if settings.name == "runs" else data.station
     place = splits.visits(data.moving, data.place)
     if place is not None and place is not data.place:
-        text = (
-            "split: %d rows are of %d places: those nearer than a hundredth of the usual step stay together"
-        )
+        text = "split: %d rows are of %d places: those within a hundredth of the usual step stay together"
         log.info(text, len(data), len(np.unique(place)))
     # From the lowest place on: where stations stand moves local coordinates, and would move squares.
     where = data.moving - data.moving.min(axis=0)

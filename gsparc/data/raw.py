@@ -6,9 +6,7 @@ import hashlib
 import json
 import math
 import mmap
-import os
 import re
-import shutil
 import struct
 import subprocess
 import sys
@@ -21,6 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from shutil import disk_usage
 from typing import Any, NamedTuple
 
 import h5py
@@ -30,7 +29,7 @@ from numpy.lib.format import read_array_header_1_0 as header_1
 from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import netcdf_file
 
-from gsparc.data.blocks import BIG, contents, is_big, on_disk
+from gsparc.data.blocks import BIG, contents, is_big, memory, on_disk
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
@@ -196,15 +195,13 @@ def _read_npz(path: Path) -> Raw:
     if not archive:
         # numpy would take anything else for a pickle and speak of that.
         raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
+    refuse_sizes(path, _stated_npz(path))
     try:
-        refuse_sizes(path, _stated_npz(path))
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
                 if name in arrays:
                     raise KeyError("in the archive twice")
                 arrays[name] = file[name]
-    except DataError:
-        raise
     except DAMAGED as error:
         fault = f"damaged or not an npz file ({reason(error)})"
         if "allow_pickle" in str(error):
@@ -226,29 +223,24 @@ def _read_npz(path: Path) -> Raw:
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
 
 
-def _stated_npz(path: Path) -> dict[str, Stated]:
-    """Of each array that begins as NumPy writes it."""
+def _stated_npz(path: Path) -> Stated:
     stated = {}
-    with zipfile.ZipFile(path) as archive:
+    with suppress(*DAMAGED), zipfile.ZipFile(path) as archive:  # what is damaged is said where it is read
         for entry in archive.infolist():
-            # What is damaged is said by name where it is read.
             with suppress(*DAMAGED), archive.open(entry) as file:
                 file.seek(len(MAGIC_PREFIX))
                 shape, _, dtype = (header_1 if file.read(2)[0] == 1 else header_2)(file)
-                stated[entry.filename.removesuffix(".npy")] = Stated(shape, math.prod(shape) * dtype.itemsize)
+                stated[entry.filename.removesuffix(".npy")] = shape, math.prod(shape) * dtype.itemsize
     return stated
 
 
-def _stated_hdf5(file: h5py.File) -> dict[str, Stated]:
-    """Of each dataset; what is large and no text is copied to disk, or stays in the file."""
-    stated = {}
-    for name, item in file.items():
-        if isinstance(item, h5py.Dataset) and item.shape is not None:
-            large = not h5py.check_string_dtype(item.dtype) and is_big(item)
-            stays = large and item.id.get_offset() is not None and item.dtype.isnative
-            size = item.size * item.dtype.itemsize
-            stated[str(_plain(name))] = Stated(item.shape, size, None if stays else large)
-    return stated
+def _stated_hdf5(file: h5py.File) -> Stated:
+    """Of each dataset; what lies in one piece takes nothing that is not in the file."""
+    return {
+        str(_plain(name)): (one.shape, 0 if one.id.get_offset() else one.nbytes)
+        for name, one in file.items()
+        if isinstance(one, h5py.Dataset) and one.size is not None
+    }
 
 
 def _read_hdf5(path: Path) -> Raw:
@@ -258,7 +250,7 @@ def _read_hdf5(path: Path) -> Raw:
         raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
     try:
         with h5py.File(path, "r") as file:
-            refuse_sizes(path, _stated_hdf5(file))
+            refuse_sizes(path, _stated_hdf5(file), to_disk=True)
             for key, item in file.items():
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
@@ -296,52 +288,32 @@ def _plain(value: Any) -> Any:
 
 LARGEST = 2**40  # bytes of a file's arrays, ten times the largest campaign that is published
 MOST_PACKED = 1100  # times a file's bytes, as deflate packs 1,032 to one at best: the rest was never written
-SPARE = 2**30  # bytes of disk or memory that other programs keep
+SPARE = 2**30  # bytes of disk that other programs keep; of memory half, for what is made of the arrays
+Stated = dict[str, tuple[tuple[int, ...], int]]  # shapes, and bytes that are taken when they are read
 
 
-class Stated(NamedTuple):
-    """What a file says of an array, which may be untrue.
+def refuse_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
+    """Raise DataError before an array is read that the file cannot hold, or for which there is no room.
 
-    Attributes:
-        shape, size: axes, and bytes once it is read.
-        copied: whether it goes to a file in TMPDIR instead of memory; None: it stays where it is.
+    Args:
+        path: of the file.
+        stated: of its arrays, by the file, which may lie.
+        to_disk: whether large ones are copied to TMPDIR.
     """
-
-    shape: tuple[int, ...]
-    size: int
-    copied: bool | None = False
-
-
-def refuse_sizes(path: Path, stated: Mapping[str, Stated]) -> None:
-    """Raise DataError before an array is read that the file cannot hold, or for which there is no room."""
-    if not stated:
-        return
-    name, largest = max(stated.items(), key=lambda item: item[1].size)
-    rows = Counter(one.shape[0] for one in stated.values() if one.shape)
-    total, packed = sum(one.size for one in stated.values()), path.stat().st_size
-    on_disk, in_memory = (sum(one.size for one in stated.values() if one.copied is c) for c in (True, False))
-    fault = None
-    if total > max(BIG, MOST_PACKED * packed):
-        fault = f"a file of {packed:,} bytes cannot hold that; was it ever written?"
-    elif total > LARGEST:
-        fault = f"at most {LARGEST:,} are read; give a part of the campaign"
-    elif largest.size >= BIG and rows[largest.shape[0]] < 2 and not name.startswith("path_"):
-        fault = f"no other array has {largest.shape[0]:,} rows; expected one for each position"
-    elif on_disk + SPARE > shutil.disk_usage(tempfile.gettempdir()).free:
-        fault = f"{tempfile.gettempdir()} has no room for {on_disk:,}; set TMPDIR to a larger disk"
-    elif in_memory >= BIG and in_memory + SPARE > free_memory():
-        fault = f"too little memory for {in_memory:,}; HDF5 without a mask may stay on disk"
-    if fault is not None:
-        raise DataError(f"{path}, {name}: shape {largest.shape}, {largest.size:,} bytes: {fault}")
-
-
-def free_memory() -> int:
-    """Bytes that a process may still take without others being moved out, where the system says it."""
-    try:
-        text = Path("/proc/meminfo").read_text(encoding="ascii")
-    except OSError:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return int(re.search(r"MemAvailable:\s+(\d+)", text)[1]) * 1024  # type: ignore[index]
+    rows = Counter(shape[0] for shape, _ in stated.values() if shape)
+    name, (shape, size) = max(stated.items(), key=lambda item: item[1][1], default=("", ((), 0)))
+    total, packed, disk = sum(one for _, one in stated.values()), path.stat().st_size, tempfile.gettempdir()
+    copied = sum(one for _, one in stated.values() if one >= BIG) * to_disk
+    most, held = min(max(BIG, MOST_PACKED * packed), LARGEST), total - copied
+    faults = {
+        f"a file of {packed:,} bytes does not hold that": total > most,
+        f"no other array has {shape[:1]} rows": size >= BIG and rows[shape[0]] < 2 and name[:5] != "path_",
+        f"{disk} has no room; set TMPDIR to a larger disk": bool(copied)
+        and copied + SPARE > disk_usage(disk).free,
+        f"too little memory for {held:,}; HDF5 without a mask may stay on disk": BIG < held > memory() / 2,
+    }
+    for fault in (text for text, holds in faults.items() if holds):
+        raise DataError(f"{path}, {name}: shape {shape}, {size:,} bytes: {fault}")
 
 
 def numbered_rows(count: int) -> np.ndarray:
@@ -431,8 +403,7 @@ def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     if fault is not None:
         raise DataError(f"{path}: damaged ({fault})")
     with h5py.File(path, "r") as file:
-        sizes = {name: one._replace(copied=False) for name, one in _stated_hdf5(file).items()}
-        refuse_sizes(path, sizes)
+        refuse_sizes(path, _stated_hdf5(file))
         items = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
         return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in items}
 

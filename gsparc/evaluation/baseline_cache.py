@@ -70,13 +70,9 @@ def program() -> str:
 
 
 def baseline(
-    name: str,
-    data: Measurements,
-    split: Split,
-    eval_on: str = "test",
-    cache: Path | None = None,
+    name: str, data: Measurements, split: Split, eval_on: str = "test", cache: Path | None = None,
     learned: tuple[Measurements, Split] | None = None,
-) -> Fitted:
+) -> Fitted:  # fmt: skip
     """Fit (or find) the baseline `name` with its default settings on each fold, and score it.
 
     Args:
@@ -88,11 +84,10 @@ def baseline(
         learned: other measurements to learn from, and the folds of these; None: `data` and `split`.
     """
     own, before = learned or (data, split)
-    unseen, scored = eval_on == "val" and learned is None, eval_on
+    unseen = eval_on == "val" and learned is None
+    scored = eval_on if learned is None else f"{eval_on}-{identity(data)[:24]}-{split.sha256[:24]}"
     # The same data may be in another model's local coordinates and units, and count its stations.
-    key = _key(own, before)
-    if learned is not None:
-        scored = f"{eval_on}-{_key(data, split)}"
+    key = hashlib.sha256(f"{identity(own)} {before.sha256}".encode()).hexdigest()[:24]
     folder = None if cache is None else Path(cache) / f"baselines-{program()}" / key
     folder = folder and folder / (f"{name}-train" if unseen else name)
     methods, seconds = [], []
@@ -118,10 +113,6 @@ def baseline(
             with whole_file(folder / f"{scored}.npz") as partial, partial.open("wb") as file:
                 np.savez(file, allow_pickle=False, **scores.arrays())
     return Fitted(tuple(methods), scores, tuple(seconds))
-
-
-def _key(data: Measurements, split: Split) -> str:
-    return hashlib.sha256(f"{identity(data)} {split.sha256}".encode()).hexdigest()[:24]
 
 
 def _stored_fit(path: Path) -> tuple[Method, float] | None:

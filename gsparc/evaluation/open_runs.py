@@ -111,8 +111,7 @@ def open_files(
         chosen = Split("whole", folds, indices_hash(folds))
     else:
         chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
-    trained = _trained(stored, data) if other or not trained_on(stored, chosen) else None
-    foreign, learned = _foreign(stored, data, chosen, trained)
+    foreign, learned, trained = _foreign(stored, data, chosen)
     if foreign is not None:
         log.warning("%s was trained on %s", stored[0].path, foreign)
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
@@ -135,7 +134,7 @@ def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any
     if asked:
         where = f"{group}.{asked[0]}"
         raise ValueError(
-            f"{stored.path}: {where} is an address, {before[asked[0]]}; say {where}=... to ask it"
+            f"{stored.path}: {where} is an address, {before[asked[0]]}; say {where}=... yourself"
         )
     settings = {**before, **now}
     if not {"name", "_target_"} & set(settings):
@@ -172,23 +171,21 @@ def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None
 
 
 def _foreign(
-    stored: Sequence[checkpoint.Stored],
-    data: Measurements,
-    chosen: Split,
-    trained: tuple[Measurements, Split] | None,
-) -> tuple[str | None, int | None]:
-    """What was trained on instead, and how many of these test rows the models have learned from."""
+    stored: Sequence[checkpoint.Stored], data: Measurements, chosen: Split
+) -> tuple[str | None, int | None, tuple[Measurements, Split] | None]:
+    """What was trained on instead, how many of these test rows the models learned from, and `_trained`."""
     same = data.site.sha256 == stored[0].site.sha256
     known = trained_on(stored, chosen)
     if same and known:
-        return None, 0
+        return None, 0, None
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
+    trained = _trained(stored, data)
     if trained is None:
         what = "rows that it does not name" if same and known is None else what
-        return f"{what}; these test rows may have been TRAINED on", None
+        return f"{what}; these test rows may have been TRAINED on", None, None
     own, before = trained
     if same and indices_hash(before.folds) == indices_hash(chosen.folds):
-        return None, 0
+        return None, 0, trained
     learned, count = 0, sum(len(fold.test) for fold in chosen.folds)
     for old, fold in zip(before.folds, chosen.folds, strict=True):
         rows = np.concatenate([old.train, old.val])
@@ -197,9 +194,9 @@ def _foreign(
         else:
             gaps, _ = cKDTree(own.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
-    if same:
-        return f"{what} ({before.name}): {learned} of these {count} test rows were TRAINED on", learned
-    return f"{what}: {learned} of these {count} test rows are at places that were TRAINED on", learned
+    what += f" ({before.name})" * same
+    how = "were" if same else "are at places that were"
+    return f"{what}: {learned} of these {count} test rows {how} TRAINED on", learned, trained
 
 
 def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[Measurements, Split] | None:

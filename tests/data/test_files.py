@@ -68,7 +68,7 @@ def test_aliases_of_a_config_folder_did_not_end(tmp_path, text):
             COMMANDS["train"].run, "train", [*option, "dataset=bomb", f"hydra.run.dir={tmp_path / 'r'}"]
         )
         assert_refused(answer, r"bomb\.yaml: YAML whose aliases repeat without end")
-    with pytest.raises(DataError, match="not readable as YAML"):
+    with pytest.raises(DataError, match="YAML whose aliases repeat without end"):
         read_yaml(tmp_path / "mine" / "dataset" / "bomb.yaml", "a table", "a table")
 
 

@@ -332,9 +332,7 @@ def test_places_visited_again_within_a_hundredth_of_the_step_were_split_apart(ap
         for one in (fold, inner):
             known, unseen = (data.moving[part] for part in (np.concatenate([one.train, one.val]), one.test))
             assert np.linalg.norm(known[:, None] - unseen, axis=-1).min() > 0.02
-    assert (
-        f"{60 * visits} rows are of 61 places: those nearer than a hundredth of the usual step" in caplog.text
-    )
+    assert f"{60 * visits} rows are of 61 places: those within a hundredth of the usual step" in caplog.text
 
 
 def test_rows_a_tenth_of_a_step_apart_are_places_of_their_own():

@@ -164,14 +164,10 @@ def read_run(folder: Path) -> Run:
     """
     render = columns(folder / "render_ms.csv").get("render_ms")
     facts, samples = _facts(folder / "summary.json"), columns(folder / "per_sample.csv")
-    split = folder / "split.json"
-    others = {"per_sample.csv": next(iter(samples.pop("run_id", ())), None)}
-    others |= {split.name: _facts(split).get("run_id")} if split.is_file() else {}
-    for name, run_id in others.items():
-        if run_id is not None and run_id != facts.get("run_id"):
-            raise ValueError(
-                f"{folder}: summary.json and {name} are of two runs; train again in an empty folder"
-            )
+    runs = {facts.get("run_id"), *samples.pop("run_id", np.zeros(0))[:1].tolist()}
+    runs |= {_facts(split).get("run_id") for split in folder.glob("split.json")}
+    if len(runs) > 1:
+        raise ValueError(f"{folder}: its summary, samples and split are of two runs; train again elsewhere")
     return Run(
         folder,
         facts,
@@ -201,7 +197,7 @@ def _column(cells: Sequence[str]) -> np.ndarray:
 def _overrides(path: Path) -> tuple[str, ...]:
     if not path.is_file():
         return ()
-    return tuple(str(line) for line in load_yaml(path.read_text(encoding="utf-8")) or ())
+    return tuple(str(line) for line in load_yaml(path.read_text(encoding="utf-8"), path) or ())
 
 
 def number(value: object) -> float | None:

@@ -126,7 +126,7 @@ def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_pa
         train(compose(*given), tmp_path / "other")
         mixed = tmp_path / "other" / name
         mixed.write_bytes((tmp_path / "run" / name).read_bytes())
-        with pytest.raises(ValueError, match=f"summary.json and {name} are of two runs"):
+        with pytest.raises(ValueError, match="its summary, samples and split are of two runs"):
             read_run(tmp_path / "other")
     models = [tmp_path / folder / checkpoint.MODEL for folder in ("run", "other")]
     with pytest.raises(ValueError, match="of different runs; give the folds of one"):
