@@ -24,8 +24,10 @@ from gsparc.evaluation.summary import remarks, results_table
 log = logging.getLogger(__name__)
 
 # What a run leaves; of another one, all of it would be read beside this one's.
-LEFT = ("summary.json", "split.json", "per_sample.csv", "render_ms.csv", "test.png", "found.png")
-LEFT = (*LEFT, *(f"{fold}{name}" for fold in ("", "fold*/") for name in ("model.ckpt", "learning_curve.csv")))
+LEFT = (
+    *("summary.json", "split.json", "per_sample.csv", "render_ms.csv", "test.png", "found.png"),
+    *(f"{fold}{name}" for fold in ("", "fold*/") for name in ("model.ckpt", "learning_curve.csv")),
+)
 
 
 def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
