@@ -30,6 +30,9 @@ def evaluate_files(
 ) -> tuple[Evaluation, Measurements, Split]:
     """Evaluate checkpoints of one run, one per fold.
 
+    Other data than theirs are tested whole where no split is given, beside baselines that learned from the
+    rows that the models learned from.
+
     Args:
         paths, dataset, split: see `open_files`.
         eval_on: `train`, `val` or `test`.
@@ -39,13 +42,17 @@ def evaluate_files(
     Raises:
         ValueError: as `open_files`.
     """
-    run = open_files(paths, dataset, split)
+    run = open_files(paths, dataset, split, others_whole=True)
+    other, without = run.data.site.sha256 != run.stored[0].site.sha256, None
+    if other and run.trained is None and (baselines is None or len(baselines)):
+        baselines, without = (), "the file that the model was trained on is gone, or another"
     seconds = [one.extra.get("train_s") for one in run.stored]
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
     evaluation = evaluate(
-        run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines, cache=cache
-    )
-    evaluation.facts["split/foreign"] = run.foreign
+        run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines, cache=cache,
+        learned=run.trained if other else None,
+    )  # fmt: skip
+    evaluation.facts.update({"split/foreign": run.foreign, "split/without_baselines": without})
     return evaluation, run.data, run.split
 
 

@@ -16,20 +16,33 @@ from gsparc.commands.shared.continued import once
 from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings
+from gsparc.data.files import set_aside
 from gsparc.evaluation.experiment.run import Objects, objective_of, run
 from gsparc.evaluation.metric_formats import score_of
 from gsparc.evaluation.summary import remarks, results_table
 
 log = logging.getLogger(__name__)
 
+# What a run leaves; of another one, all of it would be read beside this one's.
+LEFT = (
+    *("summary.json", "split.json", "per_sample.csv", "render_ms.csv", "test.png", "found.png"),
+    *(f"{fold}{name}" for fold in ("", "fold*/") for name in ("model.ckpt", "learning_curve.csv")),
+)
+
 
 def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     """Fit a method on every fold of a split and test it, as `run` does; the folder is locked meanwhile.
+
+    What an earlier run left there is set aside first, but for what this one goes on, or starts, from.
 
     Raises:
         ValueError: as `run`; or another run writes there.
     """
     with locked(run_dir):
+        taken = [Path(config[name]).resolve() for name in ("ckpt_path", "init_from") if config.get(name)]
+        goes_on = any(run_dir.resolve() in (path, *path.parents) for path in taken)
+        if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
+            log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
         RunSettings.of(config)
         return run(config, run_dir)
 

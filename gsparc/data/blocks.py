@@ -14,6 +14,15 @@ import numpy as np
 
 BIG = 2**28  # bytes of a measurement that stays on disk
 BLOCK = 2**24  # bytes that are in memory at a time
+MEMORY = 2.0**32  # bytes of a machine that does not say it
+
+
+def memory() -> float:
+    """Of the machine [bytes]."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return MEMORY
 
 
 def is_big(array: Any) -> bool:

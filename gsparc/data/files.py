@@ -5,10 +5,13 @@ from __future__ import annotations
 import csv
 import errno
 import io
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +19,20 @@ import yaml
 
 from gsparc.data.errors import DataError, reason
 
+LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
+MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
+LEAST_NODES = 10_000  # of YAML that are not counted
+
 
 def platform_cache() -> Path:
     """Where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "gsparc"
+
+
+def is_address(path: object) -> bool:
+    """Whether a file is named by a URL, which reading asks somebody for."""
+    return "://" in str(path)
 
 
 def read_text(path: Path, missing: str, kind: str = "text") -> str:
@@ -35,10 +47,45 @@ def read_text(path: Path, missing: str, kind: str = "text") -> str:
 
 def read_csv(path: Path, missing: str) -> list[list[str]]:
     """Cells of each line, between commas; `DataError` as of `read_text`."""
+    text = read_text(path, missing, "CSV text")
     try:
-        return list(csv.reader(io.StringIO(read_text(path, missing, "CSV text"))))
+        return list(csv.reader(map(partial(checked_line, path), count(1), io.StringIO(text))))
     except csv.Error as error:
         raise DataError(f"{path}: not readable as CSV text ({error})") from None
+
+
+def checked_line(path: str | Path, number: int, line: str) -> str:
+    """The line of a table; DataError where it is longer than `LONGEST_LINE`."""
+    if len(line) > LONGEST_LINE:
+        fault = f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
+        raise DataError(f"{path}, line {number}: {fault}")
+    return line
+
+
+def load_yaml(text: str, source: str | Path) -> Any:
+    """What a text in YAML holds.
+
+    Raises:
+        DataError: aliases that repeat without end, or nearly.
+        yaml.YAMLError, ValueError, RecursionError: it is none.
+    """
+    loader, sizes = yaml.SafeLoader(text), dict[int, float]()
+    node = loader.get_single_node()
+    if node is None:
+        return None
+    if _expanded(node, sizes) > MOST_GROWTH * len(sizes) + LEAST_NODES:
+        raise DataError(f"{source}: YAML whose aliases repeat without end")
+    return loader.construct_document(node)
+
+
+def _expanded(node: yaml.Node, sizes: dict[int, float]) -> float:
+    """Number of nodes where aliases are written out; `sizes` holds those that are counted, by identity."""
+    if id(node) not in sizes:
+        sizes[id(node)] = math.inf  # of one inside itself
+        inside = [] if isinstance(node, yaml.ScalarNode) else node.value
+        parts = [part for one in inside for part in (one if isinstance(one, tuple) else (one,))]
+        sizes[id(node)] = 1 + sum(_expanded(part, sizes) for part in parts)
+    return sizes[id(node)]
 
 
 def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
@@ -52,7 +99,7 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
         DataError: missing, not readable, or no table.
     """
     try:
-        content = yaml.safe_load(read_text(path, f"missing; expected {missing}", "YAML"))
+        content = load_yaml(read_text(path, f"missing; expected {missing}", "YAML"), path)
     except DataError:
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -60,6 +107,14 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
     if not isinstance(content, Mapping):
         raise DataError(f"{path}: expected {expected}")
     return content
+
+
+def check_yaml(folder: str | None) -> None:
+    """Refuse (DataError) aliases without end in a folder of configurations, which Hydra would write out."""
+    for path in () if folder is None else sorted(Path(folder).rglob("*.yaml")):
+        text = path.read_bytes()
+        with suppress(yaml.YAMLError, UnicodeDecodeError, RecursionError):  # Hydra says so, where it reads it
+            _ = load_yaml(text.decode(), path) if b"&" in text and b"*" in text else None
 
 
 @contextmanager
@@ -106,6 +161,29 @@ def no_room(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, OSError):
         error = error.__cause__ or error.__context__
     return error is not None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+
+
+def set_aside(folder: Path, *patterns: str) -> bool:
+    """Rename files of an earlier run to `NAME.earlier`, over those before; returns whether there were any."""
+    found = [path for pattern in patterns for path in folder.glob(pattern)]
+    return any([path.replace(f"{path}.earlier") for path in found])
+
+
+def sweep(folder: Path) -> None:
+    """Delete what processes that are gone left half written in a folder that nobody else writes to."""
+    for path in [path for above in ("", "*/", "*/*/") for path in folder.glob(f"{above}.*.partial")]:
+        pid = path.name.split(".")[-2]
+        if pid.isdecimal() and (int(pid) == os.getpid() or not _runs(int(pid))):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _runs(pid: int) -> bool:
+    """Whether there is a process of this number, ours or anybody's."""
+    try:
+        os.kill(pid, 0)
+    except (OSError, OverflowError) as error:
+        return isinstance(error, PermissionError)
+    return True
 
 
 def _partial(path: Path) -> Path:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data import splits
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import CORNERS, FileSettings, Fold, SplitSettings, make_split
@@ -71,6 +72,7 @@ def inner_folds(
         DataError: fewer than 2 places to cut.
     """
     known = np.sort(np.concatenate([fold.train, fold.val]))
+    positions, place = positions - positions.min(axis=0), splits.visits(positions, place)
     number = np.arange(len(known)) if place is None else np.unique(place[known], return_inverse=True)[1]
     _, first, which = np.unique(number, return_index=True, return_inverse=True)
     which, where = which.reshape(-1), positions[known][first]
@@ -128,7 +130,7 @@ def _inside(positions: np.ndarray, fold: Fold, split: SplitSettings | FileSettin
     if split.name == "sparse":  # as dense as what is learned from: thinned again it would be another task
         whole["name"] = "random"
     if split.name == "blocks" and split.side_m is None:
-        whole["side_m"] = max(float(np.ptp(positions[:, :2], axis=0).max()) / 10, np.finfo(float).tiny)
+        whole["side_m"] = max(splits.tenth(positions[:, :2]), np.finfo(float).tiny)
     if split.name == "grouped":  # stretches as long as those of the test
         whole["folds"] = max(split.folds - 1, 2)
     return replace(split, **whole)  # type: ignore[arg-type]
@@ -172,8 +174,7 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.
             except DataError:
                 side /= 2
                 continue
-            squares = np.unique(np.floor(where[:, :2] / side), axis=0, return_inverse=True)[1]
-            return InnerFolds("blocks", folds, squares.reshape(-1))
+            return InnerFolds("blocks", folds, splits.square_of(where[:, :2], side))
     corners = [settings.corner]
     if settings.name == "corner":
         others = [corner for corner in CORNERS if corner != settings.corner]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 import re
 from collections.abc import Mapping
 from importlib.resources import files
@@ -14,6 +15,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data import splits
 from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, nearest
@@ -21,6 +23,8 @@ from gsparc.data.instantiate import find, from_settings, refuse_foreign, suggest
 from gsparc.data.limits import SettingError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
+
+log = logging.getLogger(__name__)
 
 # A dataset is a file or a folder: who says the one may mean the other.
 PATHS = {"file": "root", "root": "file"}
@@ -91,7 +95,13 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         absent = left_out(settings.leave_out, wrong, len(data))
         return without(split, absent) if len(absent) else split
     unit = data.run if settings.name == "runs" else data.station
-    return make_split(data.moving, settings, data.release_split, wrong, data.place, unit)
+    place = splits.visits(data.moving, data.place)
+    if place is not None and place is not data.place:
+        text = "split: %d rows are of %d places: those within a hundredth of the usual step stay together"
+        log.info(text, len(data), len(np.unique(place)))
+    # From the lowest place on: where stations stand moves local coordinates, and would move squares.
+    where = data.moving - data.moving.min(axis=0)
+    return make_split(where, settings, data.release_split, wrong, place, unit)
 
 
 def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:

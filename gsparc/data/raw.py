@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import mmap
 import re
 import struct
 import subprocess
 import sys
+import tempfile
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from shutil import disk_usage
 from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
+from numpy.lib.format import read_array_header_1_0 as header_1
+from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import netcdf_file
 
-from gsparc.data.blocks import contents, is_big, on_disk
+from gsparc.data.blocks import BIG, contents, is_big, memory, on_disk
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
@@ -187,6 +195,7 @@ def _read_npz(path: Path) -> Raw:
     if not archive:
         # numpy would take anything else for a pickle and speak of that.
         raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
+    refuse_sizes(path, _stated_npz(path))
     try:
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
@@ -214,6 +223,26 @@ def _read_npz(path: Path) -> Raw:
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
 
 
+def _stated_npz(path: Path) -> Stated:
+    stated = {}
+    with suppress(*DAMAGED), zipfile.ZipFile(path) as archive:  # what is damaged is said where it is read
+        for entry in archive.infolist():
+            with suppress(*DAMAGED), archive.open(entry) as file:
+                file.seek(len(MAGIC_PREFIX))
+                shape, _, dtype = (header_1 if file.read(2)[0] == 1 else header_2)(file)
+                stated[entry.filename.removesuffix(".npy")] = shape, math.prod(shape) * dtype.itemsize
+    return stated
+
+
+def _stated_hdf5(file: h5py.File) -> Stated:
+    """Of each dataset; what lies in one piece takes nothing that is not in the file."""
+    return {
+        str(_plain(name)): (one.shape, 0 if one.id.get_offset() else one.nbytes)
+        for name, one in file.items()
+        if isinstance(one, h5py.Dataset) and one.size is not None
+    }
+
+
 def _read_hdf5(path: Path) -> Raw:
     arrays, units, name = {}, {}, "the file"
     fault = read_error(path)
@@ -221,6 +250,7 @@ def _read_hdf5(path: Path) -> Raw:
         raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
     try:
         with h5py.File(path, "r") as file:
+            refuse_sizes(path, _stated_hdf5(file), to_disk=True)
             for key, item in file.items():
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
@@ -229,6 +259,8 @@ def _read_hdf5(path: Path) -> Raw:
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
+    except DataError:
+        raise
     except DAMAGED as error:
         raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({reason(error)})") from None
     arrays = {k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}
@@ -254,6 +286,36 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
+LARGEST = 2**40  # bytes of a file's arrays, ten times the largest campaign that is published
+MOST_PACKED = 1100  # times a file's bytes, as deflate packs 1,032 to one at best: the rest was never written
+SPARE = 2**30  # bytes of disk that other programs keep; of memory half, for what is made of the arrays
+Stated = dict[str, tuple[tuple[int, ...], int]]  # shapes, and bytes that are taken when they are read
+
+
+def refuse_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
+    """Raise DataError before an array is read that the file cannot hold, or for which there is no room.
+
+    Args:
+        path: of the file.
+        stated: of its arrays, by the file, which may lie.
+        to_disk: whether large ones are copied to TMPDIR.
+    """
+    rows = Counter(shape[0] for shape, _ in stated.values() if shape)
+    name, (shape, size) = max(stated.items(), key=lambda item: item[1][1], default=("", ((), 0)))
+    total, packed, disk = sum(one for _, one in stated.values()), path.stat().st_size, tempfile.gettempdir()
+    copied = sum(one for _, one in stated.values() if one >= BIG) * to_disk
+    most, held = min(max(BIG, MOST_PACKED * packed), LARGEST), total - copied
+    faults = {
+        f"a file of {packed:,} bytes does not hold that": total > most,
+        f"no other array has {shape[:1]} rows": size >= BIG and rows[shape[0]] < 2 and name[:5] != "path_",
+        f"{disk} has no room; set TMPDIR to a larger disk": bool(copied)
+        and copied + SPARE > disk_usage(disk).free,
+        f"too little memory for {held:,}; HDF5 without a mask may stay on disk": BIG < held > memory() / 2,
+    }
+    for fault in (text for text, holds in faults.items() if holds):
+        raise DataError(f"{path}, {name}: shape {shape}, {size:,} bytes: {fault}")
+
+
 def numbered_rows(count: int) -> np.ndarray:
     """What rows (count,) are called that their file does not name."""
     return np.array([f"row {i}" for i in range(count)])
@@ -271,7 +333,7 @@ import sys, h5py
 with h5py.File(sys.argv[1], "r") as file:
     for item in file.values():
         if isinstance(item, h5py.Dataset):
-            if item.dtype.hasobject:
+            if item.dtype.hasobject and item.nbytes < 2**28:
                 item[()]
             dict(item.attrs)
     dict(file.attrs)
@@ -341,6 +403,7 @@ def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     if fault is not None:
         raise DataError(f"{path}: damaged ({fault})")
     with h5py.File(path, "r") as file:
+        refuse_sizes(path, _stated_hdf5(file))
         items = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
         return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in items}
 

@@ -11,11 +11,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
+from gsparc.data.links.stations import numbered
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +28,13 @@ CORNERS = ("--", "-+", "+-", "++")
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
+NEAR = 0.01  # of the usual step: places nearer than this are visits of one
+FEWEST_PLACES, SAMPLE = 10, 10_000  # that tell a usual step; more tell nothing more
+# Large odd factors: cells become numbers, which sort much faster than rows.
+MIXING = 2**62 + np.array(
+    [0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x3C6EF372FE94F82B, 7919, 104729**3, 3**38]
+)
+EDGE = 1e-6  # of a square: places on its edge are in it, however they were rounded
 
 
 @dataclass(frozen=True)
@@ -156,7 +167,7 @@ def make_split(
     """Split rows by the positions of the moving end; what is held out is so for all stations.
 
     Args:
-        positions: (S, 3) [m] of the moving end, or (S, 6) of both.
+        positions: (S, 3) [m] of the moving end, or (S, 6) of both; squares are counted from zero.
         settings: how.
         release_split: (train, test) rows that the release names; used by `random` only.
         outliers: (n,) rows that `leave_out=outliers` means.
@@ -205,6 +216,64 @@ def _pairs(
     order = np.random.default_rng(settings.seed).permutation(rows)
     train_count = rows - min(max(round(test_share * rows), 1), max(rows - 1, 0))
     return [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
+
+
+def usual_step(positions: np.ndarray) -> float:
+    """Median distance [m] from a place (n, D) to the nearest other; 0 where too few places tell it.
+
+    Looked for from coarse to fine, as all places may have been visited again: what lies in a cell is one, and
+    the first step that is ten cells long stands.
+    """
+    side = extent = float(np.ptp(positions, axis=0).max())
+    while side > 1e-12 * extent:
+        places, step = positions[np.unique(_joined(positions, side, side / 2), return_index=True)[1]], 0.0
+        if len(places) >= FEWEST_PLACES:
+            some = places[evenly(len(places), SAMPLE)]
+            step = float(np.median(cKDTree(places).query(some, k=2)[0][:, 1]))
+        if step >= 10 * side:
+            return step
+        side = min(step or side, side) / 10
+    return 0.0
+
+
+def visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray | None:
+    """The place (S,) int64 of each row where those nearer than `NEAR` usual steps count as one.
+
+    Args:
+        positions: (S, D) [m].
+        place: (S,) of rows known to be of one place; returned as it is where no others are.
+    """
+    first = which = np.arange(len(positions))
+    if place is not None:
+        _, first, which = np.unique(place, return_index=True, return_inverse=True)
+    places = positions[first]
+    reach = NEAR * usual_step(places)
+    if reach == 0:
+        return place
+    joined = _joined(places, reach / 4 / np.sqrt(places.shape[1]), 1.5 * reach)  # all nearer than `reach`
+    return place if len(np.unique(joined)) == len(places) else numbered(joined[which.reshape(-1), None])
+
+
+def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
+    """A number (n,) that places (n, D) share in a cell, or where one of each cell is within `reach` [m].
+
+    Cells first: thousands of visits of one place would be millions of pairs.
+    """
+    corner = np.floor((places - places.min(axis=0)) / cell).astype(np.int64)
+    _, first, which = np.unique(corner @ MIXING[: corner.shape[1]], return_index=True, return_inverse=True)
+    one, two = cKDTree(places[first]).query_pairs(reach, output_type="ndarray").T
+    graph = coo_array((np.ones(len(one)), (one, two)), (len(first), len(first)))
+    return np.asarray(connected_components(graph)[1][which.reshape(-1)])
+
+
+def tenth(floor: np.ndarray) -> float:
+    """Side [m] of squares of which ten hold the longer side of places (n, 2)."""
+    return float(np.ptp(floor, axis=0).max()) / 10 * (1 + 2 * EDGE)
+
+
+def square_of(floor: np.ndarray, side: float) -> np.ndarray:
+    """The number (n,) of the square of `side` [m] that each place (n, 2) is in, counted from zero."""
+    return np.unique(np.floor(floor / side + EDGE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def left_out(
@@ -275,9 +344,12 @@ def indices_hash(folds: tuple[Fold, ...]) -> str:
     return digest.hexdigest()
 
 
-def write_split(path: str | Path, split: Split, rows: int, dataset_sha256: str = "") -> None:
-    """Store a split of `rows` rows as a JSON index file (atomically)."""
+def write_split(
+    path: str | Path, split: Split, rows: int, dataset_sha256: str = "", run_id: str | None = None
+) -> None:
+    """Store a split of `rows` rows as a JSON index file (atomically), with the run that made it."""
     facts = {"schema": 1, "name": split.name, "rows": rows, "dataset_sha256": dataset_sha256}
+    facts |= {} if run_id is None else {"run_id": run_id}
     folds = [{name: part.tolist() for name, part in vars(fold).items()} for fold in split.folds]
     content = {**facts, "sha256": split.sha256, "folds": folds}
     with whole_file(path) as partial:
@@ -340,10 +412,10 @@ def _blocks(
 ) -> np.ndarray:
     """Those of `rows` in whole squares of floor, drawn until they are a `share` of `rows` at least."""
     floor = positions[:, :2]
-    side = settings.side_m or float(np.ptp(floor, axis=0).max()) / 10
+    side = settings.side_m or tenth(floor)
     if not side > 0:
         raise DataError("split=blocks: all positions are one above the other, there are no squares of floor")
-    square = np.unique(np.floor(floor[rows] / side), axis=0, return_inverse=True)[1].reshape(-1)
+    square = square_of(floor[rows], side)
     order = np.random.default_rng(seed).permutation(square.max() + 1)
     sizes = np.cumsum(np.bincount(square)[order])
     count = int(np.searchsorted(sizes, share * len(rows))) + 1

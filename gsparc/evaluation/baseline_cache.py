@@ -70,8 +70,9 @@ def program() -> str:
 
 
 def baseline(
-    name: str, data: Measurements, split: Split, eval_on: str = "test", cache: Path | None = None
-) -> Fitted:
+    name: str, data: Measurements, split: Split, eval_on: str = "test", cache: Path | None = None,
+    learned: tuple[Measurements, Split] | None = None,
+) -> Fitted:  # fmt: skip
     """Fit (or find) the baseline `name` with its default settings on each fold, and score it.
 
     Args:
@@ -80,20 +81,23 @@ def baseline(
         split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
         eval_on: `train`, `val` or `test`.
         cache: folder of earlier results; None keeps nothing.
+        learned: other measurements to learn from, and the folds of these; None: `data` and `split`.
     """
-    unseen = eval_on == "val"
+    own, before = learned or (data, split)
+    unseen = eval_on == "val" and learned is None
+    scored = eval_on if learned is None else f"{eval_on}-{identity(data)[:24]}-{split.sha256[:24]}"
     # The same data may be in another model's local coordinates and units, and count its stations.
-    key = hashlib.sha256(f"{identity(data)} {split.sha256}".encode()).hexdigest()[:24]
+    key = hashlib.sha256(f"{identity(own)} {before.sha256}".encode()).hexdigest()[:24]
     folder = None if cache is None else Path(cache) / f"baselines-{program()}" / key
     folder = folder and folder / (f"{name}-train" if unseen else name)
     methods, seconds = [], []
-    for number, fold in enumerate(split.folds):
+    for number, fold in enumerate(before.folds):
         fit = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
         if fit is None:
-            method = for_links(method_class(name), data)
+            method = for_links(method_class(name), own)
             known = replace(fold, val=fold.val[:0]) if unseen else fold
             spent = time.process_time()
-            report = method.fit(data, known, FitContext(folder or Path()))
+            report = method.fit(own, known, FitContext(folder or Path()))
             spent = time.process_time() - spent  # wall time on a busy machine would mislead
             for note in report.notes:
                 log.info("fold %d: %s", number, note)
@@ -102,11 +106,11 @@ def baseline(
                 checkpoint.save(folder / f"fold{number}.ckpt", method, extra={"train_s": report.seconds})
         methods.append(fit[0])
         seconds.append(fit[1])
-    scores = None if folder is None else _stored_scores(folder / f"{eval_on}.npz")
+    scores = None if folder is None else _stored_scores(folder / f"{scored}.npz")
     if scores is None:
         scores = score(methods, data, split, eval_on)
         if folder is not None:
-            with whole_file(folder / f"{eval_on}.npz") as partial, partial.open("wb") as file:
+            with whole_file(folder / f"{scored}.npz") as partial, partial.open("wb") as file:
                 np.savez(file, allow_pickle=False, **scores.arrays())
     return Fitted(tuple(methods), scores, tuple(seconds))
 

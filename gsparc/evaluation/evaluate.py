@@ -51,6 +51,7 @@ def evaluate(
     baselines: Sequence[str] | None = None,
     cache: Path | None = None,
     clock: ClockSettings | None = None,
+    learned: tuple[Measurements, Split] | None = None,
 ) -> Evaluation:
     """Score and time a method beside the baselines.
 
@@ -63,6 +64,7 @@ def evaluate(
         baselines: names in `gsparc.models.registry.METHODS`; None: all plain ones that serve these rows.
         cache: folder where baselines are kept between runs; None keeps nothing.
         clock: how long to measure latencies.
+        learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
 
     Returns:
         `test/*`, `baseline/<name>/*`, `paired/gp/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
@@ -76,8 +78,8 @@ def evaluate(
     if seconds is not None and len(seconds) != len(methods):
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     scores = score(methods, data, split, eval_on)
-    names = fitting(data, split) if baselines is None else baselines
-    others = {name: baseline(name, data, split, eval_on, cache) for name in names}
+    names = fitting(*(learned or (data, split))) if baselines is None else baselines
+    others = {name: baseline(name, data, split, eval_on, cache, learned) for name in names}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
     alone = [method.field_alone() for method in methods]

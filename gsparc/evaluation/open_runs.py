@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
+from gsparc.data.files import is_address
 from gsparc.data.load import datamodule, split_for, split_settings
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Split, indices_hash
+from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.models import checkpoint, loading
@@ -41,6 +42,8 @@ class Opened:
         foreign: what differs from what the methods were trained on, one clause; None: nothing.
         learned: test rows that the methods have learned from, of other data those at places that they have
             learned from; None: not known.
+        trained: of other data or rows, what they learned from in their coordinates, and its folds; None where
+            that is gone.
     """
 
     methods: list[Method]
@@ -49,6 +52,7 @@ class Opened:
     split: Split
     foreign: str | None = None
     learned: int | None = 0
+    trained: tuple[Measurements, Split] | None = None
 
     def facts(self) -> dict[str, Any]:
         """`dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
@@ -80,39 +84,58 @@ def open_files(
     paths: Sequence[str | Path],
     dataset: Mapping[str, Any] | None = None,
     split: Mapping[str, Any] | None = None,
+    *,
+    others_whole: bool = False,
 ) -> Opened:
     """Load checkpoints of one run, one per fold, and their data.
 
     Args:
         paths: checkpoint files in the order of their folds.
         dataset, split: settings that replace those stored in the first checkpoint.
+        others_whole: other data than these checkpoints' are test rows throughout, where no split is given.
 
     Raises:
         ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
     """
     loaded = [loading.load(path) for path in paths]
     stored = [one for _, one in loaded]
+    if len({one.extra.get("run_id") for one in stored}) > 1:
+        raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
     chosen_class = "_target_" in (dataset or {})
     module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
     data = aligned(module.measurements, stored[0].site)
-    whole = split_for(_settings("split", stored[0], split), data)
-    chosen = _folds(whole, stored)
-    foreign, learned = _foreign(stored, data, chosen)
+    other = data.site.sha256 != stored[0].site.sha256
+    if other and others_whole and all(value is None for value in (split or {}).values()):
+        none, every = np.zeros(0, np.int64), np.arange(len(data))
+        folds = (Fold(none, none, every),) * len(stored)
+        chosen = Split("whole", folds, indices_hash(folds))
+    else:
+        chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
+    foreign, learned, trained = _foreign(stored, data, chosen)
     if foreign is not None:
         log.warning("%s was trained on %s", stored[0].path, foreign)
-    return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned)
+    return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
 def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
     """The checkpoint's settings of a config group under the ones given now (those that are not null).
 
     Another name or a `_target_` given now replaces all that is stored, classes out of the file with it.
+
+    Raises:
+        ValueError: no name, or an address that only the file names: reading would tell somebody who reads it.
     """
     before = stored.configuration.get(group)
     before = before if isinstance(before, dict) else {}
     now = {key: value for key, value in (overrides or {}).items() if value is not None}
     if "_target_" in now or ("name" in now and now["name"] != before.get("name")):
         before = {}
+    asked = [key for key, value in before.items() if is_address(value) and key not in now]
+    if asked:
+        where = f"{group}.{asked[0]}"
+        raise ValueError(
+            f"{stored.path}: {where} is an address, {before[asked[0]]}; say {where}=... yourself"
+        )
     settings = {**before, **now}
     if not {"name", "_target_"} & set(settings):
         raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")
@@ -149,20 +172,20 @@ def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None
 
 def _foreign(
     stored: Sequence[checkpoint.Stored], data: Measurements, chosen: Split
-) -> tuple[str | None, int | None]:
-    """What was trained on instead, and how many of these test rows the models have learned from."""
+) -> tuple[str | None, int | None, tuple[Measurements, Split] | None]:
+    """What was trained on instead, how many of these test rows the models learned from, and `_trained`."""
     same = data.site.sha256 == stored[0].site.sha256
     known = trained_on(stored, chosen)
     if same and known:
-        return None, 0
+        return None, 0, None
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
     trained = _trained(stored, data)
     if trained is None:
         what = "rows that it does not name" if same and known is None else what
-        return f"{what}; these test rows may have been TRAINED on", None
+        return f"{what}; these test rows may have been TRAINED on", None, None
     own, before = trained
     if same and indices_hash(before.folds) == indices_hash(chosen.folds):
-        return None, 0
+        return None, 0, trained
     learned, count = 0, sum(len(fold.test) for fold in chosen.folds)
     for old, fold in zip(before.folds, chosen.folds, strict=True):
         rows = np.concatenate([old.train, old.val])
@@ -171,9 +194,9 @@ def _foreign(
         else:
             gaps, _ = cKDTree(own.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
-    if same:
-        return f"{what} ({before.name}): {learned} of these {count} test rows were TRAINED on", learned
-    return f"{what}: {learned} of these {count} test rows are at places that were TRAINED on", learned
+    what += f" ({before.name})" * same
+    how = "were" if same else "are at places that were"
+    return f"{what}: {learned} of these {count} test rows {how} TRAINED on", learned, trained
 
 
 def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[Measurements, Split] | None:

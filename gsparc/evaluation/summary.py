@@ -9,9 +9,11 @@ import platform
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from rich.table import Table
@@ -48,6 +50,11 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows([_cell(v) for v in row] for row in zip(*columns.values(), strict=True))
+
+
+def new_run_id() -> str:
+    """What all files of a run carry, so that those of two are not read together; sorts by time."""
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
 
 
 def provenance() -> dict[str, str | None]:
@@ -135,6 +142,8 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     conditions = []
     if facts.get("split/foreign"):
         conditions.append(f"the model was trained on {facts['split/foreign']}")
+    if facts.get("split/without_baselines"):
+        conditions.append(f"no baselines: {facts['split/without_baselines']}")
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
         conditions.append(

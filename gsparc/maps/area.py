@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from matplotlib.path import Path as Outline
 
 from gsparc.data.assemble import FARTHEST
+from gsparc.data.blocks import memory
 from gsparc.data.errors import DataError
 from gsparc.data.limits import finite
 from gsparc.data.schema import Site
@@ -25,7 +25,6 @@ HEIGHT = 1.5  # of a hand, where nothing says another [m]
 BYTES = 4 * 4  # of a cell and station: power, both ends of the interval, expected error
 BYTES_MORE = 8 * 8  # of a cell besides: what pictures and files hold for a while
 SHARE_OF_MEMORY = 0.5  # of the machine's, that a map may take
-MEMORY = 4 << 30  # where the system does not tell [bytes]
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def grid_of(
         raise DataError(f"step_m={step_m}: the side of a cell, above 0 metres, is needed")
     count = np.ceil(width / step - 1e-9)
     needed = float(count.prod()) * (BYTES * stations + BYTES_MORE)
-    if needed > SHARE_OF_MEMORY * _memory():
+    if needed > SHARE_OF_MEMORY * memory():
         raise DataError(
             f"step_m={step:g}: {count.prod():.3g} cells of {stations} station(s) need {needed / 2**30:.3g} "
             f"GiB, more than half of this machine's memory; take a larger step or a smaller area"
@@ -164,11 +163,3 @@ def _height(site: Site | None, height_m: float | None) -> float:
         return known
     low, high = site.moving_box[:, -1] + site.origin[2]
     return float((low + high) / 2)
-
-
-def _memory() -> float:
-    """Of the machine [bytes]."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):
-        return float(MEMORY)

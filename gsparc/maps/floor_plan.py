@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, reason
 from gsparc.data.limits import finite
 
 LEAST_PIXELS = 2.0  # between the reference points: nearer ones tell no scale
@@ -73,7 +73,12 @@ def read_plan(path: str | Path, points: Sequence[Sequence[float]] | None) -> Flo
             shrink = max(1.0, max(picture.size) / LARGEST)
             size = tuple(max(1, round(side / shrink)) for side in picture.size)
             image = np.asarray(picture.convert("RGB").resize(size))  # type: ignore[arg-type]
-    except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
+    except Image.DecompressionBombError as error:
+        most = f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels are read, {LARGEST} a side are kept"
+        raise DataError(
+            f"plan={path}: too large an image ({reason(error).partition(' exceeds')[0]}); {most}"
+        ) from None
+    except (UnidentifiedImageError, OSError, ValueError):
         raise DataError(f"plan={path}: not an image that can be read; expected PNG or JPEG") from None
     if points is None:
         raise DataError(f"plan={path}: has no scale; {SHOW}")

@@ -14,7 +14,8 @@ import torch
 import yaml
 from torch import Tensor
 
-from gsparc.data.files import whole_file
+from gsparc.data.errors import DataError
+from gsparc.data.files import load_yaml, whole_file
 from gsparc.data.raw import stored_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method
@@ -58,17 +59,16 @@ class Stored:
         """The configuration as plain containers; empty when there was none.
 
         Raises:
-            CheckpointError: it is not YAML, or has aliases.
+            CheckpointError: it is not YAML, or has interpolations, or aliases without end.
         """
+        if (
+            "${" in self.config
+        ):  # ours are resolved; another's would fetch what the reader's environment holds
+            raise CheckpointError(f"{self.path}: its configuration has ${{...}}, which gsparc never writes")
         try:
-            events = yaml.parse(self.config, yaml.SafeLoader) if "*" in self.config else ()
-            if any(isinstance(event, yaml.AliasEvent) for event in events):
-                raise CheckpointError(
-                    f"{self.path}: its configuration has YAML aliases, which gsparc never writes"
-                )
-            loaded = yaml.safe_load(self.config) or {}
-        except CheckpointError:
-            raise
+            loaded = load_yaml(self.config, self.path)
+        except DataError as error:
+            raise CheckpointError(str(error)) from None
         except (yaml.YAMLError, RecursionError, ValueError):
             damaged = f"{self.path}: its configuration is not YAML; the file is damaged"
             raise CheckpointError(damaged) from None

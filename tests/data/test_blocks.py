@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import pickle
+import zipfile
 
 import h5py
 import numpy as np
@@ -12,8 +13,9 @@ import pytest
 from opened import say
 from releases import write_release
 
-from gsparc.data import blocks
+from gsparc.data import blocks, raw
 from gsparc.data.assemble import content_hash
+from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.own import load_own, write_own
 from gsparc.models.target_rows import training_targets
@@ -123,3 +125,67 @@ def test_a_process_that_is_started_opens_the_file_itself(tmp_path):
     said = (tmp_path / "said").read_text().splitlines()
     assert said == [f"{own} {one.tolist()}" for own, one in zip((True, True, False), arrays, strict=True)]
     assert np.array_equal(pickle.loads(pickle.dumps(nameless)), nameless)  # elsewhere a copy, as ever
+
+
+def unwritten(path, rows=10**12, **more):
+    """Chunks of an array that nobody wrote."""
+    with h5py.File(path, "w") as file:
+        for name, one in arrays().items():
+            if name not in more:
+                file[name] = one
+        for name, kind in (more or {"csi": "c8"}).items():
+            file.create_dataset(name, shape=(rows,), dtype=kind, chunks=(2**16,))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rows", "more", "says"),
+    [
+        (
+            10**12,
+            {"csi": "c8"},
+            r"csi: shape .1000000000000,., 8,000,000,000,000 bytes: a file of .* does not hold",
+        ),
+        (10**11, {"csi": "f4", "rx_position": "f8"}, "rx_position: shape .* does not hold that"),
+        (10**11, {"row_name": h5py.string_dtype()}, "row_name: shape .* does not hold that"),
+        (
+            10**8,
+            {f"extra{n}": "u1" for n in range(40)},
+            "shape .100000000,., 100,000,000 bytes: .* does not hold",
+        ),
+    ],
+)
+@pytest.mark.parametrize("name", ["own.h5", "own.nc"])
+def test_an_array_that_was_never_written_filled_the_disk(
+    tmp_path, monkeypatch, refused, rows, more, says, name
+):
+    """A file of 7 kB: 73 GB in 8 s, until other programs died."""
+    monkeypatch.setattr(blocks, "scratch", lambda *unused: pytest.fail("written before it was refused"))
+    monkeypatch.setattr(
+        h5py.Dataset, "__getitem__", lambda *unused: pytest.fail("read before it was refused")
+    )
+    refused(says, read_any, unwritten(tmp_path / name, rows, **more))
+
+
+def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch, refused):
+    zeros = {**arrays(), "csi": np.zeros((2**20, 40), np.complex64)}  # 320 MiB in half a megabyte
+    np.savez_compressed(tmp_path / "own.npz", **zeros)
+    monkeypatch.setattr(np, "load", lambda *unused, **named: pytest.fail("read before it was refused"))
+    refused("csi: shape .* no other array has .1048576,. rows", load_own, tmp_path / "own.npz")
+    zeros |= {"rx_position": np.zeros((2**20, 3))}
+    np.savez_compressed(tmp_path / "own.npz", **zeros)
+    monkeypatch.setattr(raw, "memory", lambda: 2**29)
+    refused("csi: .* too little memory for 360,", load_own, tmp_path / "own.npz")
+    with zipfile.ZipFile(tmp_path / "lies.npz", "w") as archive, archive.open("csi.npy", "w") as entry:
+        head = {"descr": "<c8", "fortran_order": False, "shape": (10**15,)}
+        np.lib.format.write_array_header_1_0(entry, head)
+    refused("csi: shape .* does not hold that", load_own, tmp_path / "lies.npz")
+
+
+def test_a_copy_leaves_room_on_the_disk(tmp_path, small, monkeypatch, refused):
+    monkeypatch.setattr(raw, "SPARE", 2**60)
+    monkeypatch.setattr(raw, "BIG", 1024)
+    with h5py.File(tmp_path / "own.h5", "w") as file:
+        for name, one in arrays().items():
+            file.create_dataset(name, data=one, chunks=one.ndim > 1 or None)
+    refused("csi: .* has no room; set TMPDIR to a larger disk", load_own, tmp_path / "own.h5")

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from doors import assert_refused, knock
 
-from gsparc.data.files import whole_file, whole_folder
+from gsparc.commands.listing import COMMANDS
+from gsparc.data.errors import DataError
+from gsparc.data.files import check_yaml, read_yaml, whole_file, whole_folder
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
@@ -44,3 +47,34 @@ def test_of_two_makers_of_a_folder_the_first_wins(tmp_path):
         path.mkdir()
         (path / "one").write_text("theirs")
     assert (path / "one").read_text() == "theirs" and list(tmp_path.iterdir()) == [path]
+
+
+BOMBS = {
+    "billion": "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    + "".join(
+        f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+    ),
+    "inside": "a: &a\n  b: *a\n",
+    "merged": "a: &a {x: 1}\nb: &b [*a, *a]\nc: &c [*b, *b, *c]\n",
+}
+
+
+@pytest.mark.parametrize("text", BOMBS.values(), ids=BOMBS)
+def test_aliases_of_a_config_folder_did_not_end(tmp_path, text):
+    (tmp_path / "mine" / "dataset").mkdir(parents=True)
+    (tmp_path / "mine" / "dataset" / "bomb.yaml").write_text(text)
+    for option in (["--config-dir", str(tmp_path / "mine")], [f"-cd={tmp_path / 'mine'}"]):
+        answer = knock(
+            COMMANDS["train"].run, "train", [*option, "dataset=bomb", f"hydra.run.dir={tmp_path / 'r'}"]
+        )
+        assert_refused(answer, r"bomb\.yaml: YAML whose aliases repeat without end")
+    with pytest.raises(DataError, match="YAML whose aliases repeat without end"):
+        read_yaml(tmp_path / "mine" / "dataset" / "bomb.yaml", "a table", "a table")
+
+
+def test_aliases_that_share_settings_are_read(tmp_path):
+    (tmp_path / "a.yaml").write_text("a: &a {x: 1, y: [2, 3]}\nb: [*a, *a]\nc: {<<: *a, z: 4}\n")
+    check_yaml(str(tmp_path))
+    assert read_yaml(tmp_path / "a.yaml", "", "")["c"] == {"x": 1, "y": [2, 3], "z": 4}
+    (tmp_path / "b.yaml").write_bytes(b"\xff&*")
+    check_yaml(str(tmp_path))

@@ -27,7 +27,7 @@ def settings_of(name: str, **more) -> SplitSettings:
 
 def both(name: str, positions: np.ndarray, count: int = 3, seed: int = 0, **more):
     settings = settings_of(name, **more)
-    outer = make_split(positions, settings).folds[0]
+    outer = make_split(positions - positions.min(axis=0), settings).folds[0]
     return outer, inner_folds(positions, outer, settings, count, seed)
 
 
@@ -74,7 +74,8 @@ def test_random_folds_share_no_row_where_they_need_not():
 def test_blocks_are_the_same_squares_of_floor():
     positions = floor()
     outer, inner = both("blocks", positions, share=0.15)
-    square = np.unique(np.floor(positions[:, :2] / SIDE), axis=0, return_inverse=True)[1].reshape(-1)
+    low = positions[:, :2] - positions[:, :2].min(axis=0)
+    square = np.unique(np.floor(low / SIDE), axis=0, return_inverse=True)[1].reshape(-1)
     for fold in (outer, *inner.folds):
         assert not np.isin(square[fold.test], square[np.union1d(fold.train, fold.val)]).any()
     tested = np.concatenate([fold.test for fold in inner.folds])
@@ -87,10 +88,11 @@ def test_blocks_are_the_same_squares_of_floor():
 def test_the_side_of_squares_is_the_outer_one_where_it_was_not_said():
     positions = floor()
     settings = SplitSettings("blocks")  # a tenth of the site
-    outer = make_split(positions, settings).folds[0]
+    outer = make_split(positions - positions.min(axis=0), settings).folds[0]
     inner = inner_folds(positions, outer, settings, 3, 0)
-    side = np.ptp(positions[:, :2], axis=0).max() / 10
-    square = np.unique(np.floor(positions[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
+    side = np.ptp(positions[:, :2], axis=0).max() / 10 * (1 + 2e-6)
+    low = positions[:, :2] - positions[:, :2].min(axis=0)
+    square = np.unique(np.floor(low / side), axis=0, return_inverse=True)[1].reshape(-1)
     for fold in inner.folds:
         assert not np.isin(square[fold.test], square[fold.train]).any()
 

@@ -1,9 +1,13 @@
 """Text of tables: comments, heads in comments, spaces of other kinds."""
 
+import time
+
 import numpy as np
 import pytest
 
+from gsparc.data.files import read_csv
 from gsparc.data.own import interpret
+from gsparc.data.tables import sheet
 from gsparc.data.tables.read import understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
@@ -68,3 +72,33 @@ def test_thousands_between_semicolons_were_decimals_without_a_question(write, x,
 def test_a_comment_mark_after_an_empty_cell_was_a_crash(write, refused):
     table = write("x\ty\trssi\n1\t2\t-70\n\t# 3\t-70\n", "a.tsv")
     refused(r"line 3: begins with '# 3.*: a row, or a comment\?", understand_table, table)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (
+            "x,y,z,rssi_db\n1,2,3," + "4" * 3_000_000,
+            "line 2: 3,000,006 characters; expected at most 1,048,576",
+        ),
+        ("#" * 3_000_000 + "\nx,y,z,rssi_db\n1,2,3,-4\n", "line 1: 3,000,000 characters"),
+        ("x,y,z,rssi_db" + "," * 1_000_000 + "\n1,2,3,-4", "1,000,004 columns of 2 lines; at most 10,000"),
+        (
+            "x,y,z,rssi_db\n" + "1,2,3,-4\n" * 9_999,
+            "4 columns of 10,000 lines; at most 10,000 and 30,000 cells",
+        ),
+    ],
+    ids=["cell", "comment", "heads", "cells"],
+)
+def test_lines_and_heads_without_end_took_all_memory(write, refused, monkeypatch, content, says):
+    """A line of 200 MB took 10.4 GiB; 1e8 cells of a head did not end in a minute."""
+    monkeypatch.setattr(sheet, "MOST_CELLS", 30_000)
+    start = time.process_time()
+    refused(says, understand_table, write(content))
+    assert time.process_time() - start < 5
+    monkeypatch.setattr(sheet, "MOST_BYTES", 1000)
+    refused("a table of text of more than 1,000 bytes; write it as Parquet", understand_table, write(content))
+
+
+def test_other_tables_of_text_have_lines_as_long(write, refused):
+    refused("line 2: .* characters; expected at most", read_csv, write("a,b\n" + "," * 2_000_000), "missing")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -115,6 +117,19 @@ def test_spoilt_plans(tmp_path, said, points, content):
     if content:
         path.write_text(content)
     refused(said, read_plan, path, points)
+
+
+def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
+    with (tmp_path / "p.png").open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, content in (
+            (b"IHDR", struct.pack(">IIBBBBB", 50_000, 50_000, 8, 0, 0, 0, 0)),
+            (b"IDAT", b"x"),
+        ):
+            file.write(struct.pack(">I", len(content)) + kind + content)
+            file.write(struct.pack(">I", zlib.crc32(kind + content)))
+    said = r"too large an image .Image size .2500000000 pixels..; at most 178,956,970 pixels are read"
+    refused(said, read_plan, tmp_path / "p.png", None)
 
 
 @pytest.mark.parametrize("said, how", [

@@ -14,6 +14,7 @@ from types import FrameType
 
 import hydra
 import yaml
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -22,6 +23,7 @@ from rich.console import Console
 from gsparc.commands.shared import job_name  # noqa: F401  # configurations name folders by it
 from gsparc.commands.shared.plugins import offer, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release
+from gsparc.data.files import check_yaml
 from gsparc.data.instantiate import GROUPS, plugins
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, choices, config_folder, one_line
 from gsparc.models import registry
@@ -57,11 +59,14 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         sys.argv[1:] = with_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
+    given = get_args_parser().parse_known_args(sys.argv[1:])[0]
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
     logging.raiseExceptions = False  # a log that a full disk cannot take: results say so themselves
     interrupts: list[int] = []
     try:
         with _noting(interrupts):
+            for folder in (given.config_dir, given.config_path):
+                check_yaml(folder)
             main()
     except BrokenPipeError:  # of Hydra's own lists: gsparc/__main__.py ends quietly
         raise

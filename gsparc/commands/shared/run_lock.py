@@ -16,7 +16,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-LOCK, HOLDER = ".lock", ".held-by"
+from gsparc.data.files import set_aside, sweep
+
+LOCK, HOLDER, SUMMARY = ".lock", ".held-by", "summary.json"
 _locks: list[FileLock] = []  # by the command that is running
 
 
@@ -28,12 +30,17 @@ class RunLock(Callback):
     """Hydra calls it before the folder of a run or a multirun is written to; `release` ends it."""
 
     def on_run_start(self, config: DictConfig, **unused: Any) -> None:
-        """Hold the run's folder."""
-        hold(_folder(config, "hydra.run.dir"))
+        """Hold the run's folder, in which an earlier summary would be that of other files."""
+        folder = _folder(config, "hydra.run.dir")
+        hold(folder)
+        if config.hydra.output_subdir is not None:  # it writes there
+            set_aside(folder, SUMMARY)
 
     def on_multirun_start(self, config: DictConfig, **unused: Any) -> None:
         """Hold the multirun's folder, and with it those of its jobs."""
-        hold(_folder(config, "hydra.sweep.dir"), jobs=True)
+        folder = _folder(config, "hydra.sweep.dir")
+        hold(folder, jobs=True)
+        set_aside(folder, SUMMARY)
 
 
 def _folder(config: DictConfig, key: str) -> Path:
@@ -59,6 +66,7 @@ def hold(folder: Path, jobs: bool = False) -> None:
     for other in near + (sorted(folder.rglob(HOLDER)) if jobs else []):
         if other.exists() and other.parent != folder:
             _lock(other.parent).release()
+    sweep(folder)
 
 
 @contextmanager

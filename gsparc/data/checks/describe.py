@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.checks import outliers
 from gsparc.data.errors import some
 from gsparc.data.schema import ENDS, Measurements, Site
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.splits import SplitSettings, make_split, visits
 from gsparc.ops import SphereGrid
 
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
@@ -206,7 +206,8 @@ def held_out(data: Measurements, side: float) -> np.ndarray:
     """Rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
         settings = SplitSettings("blocks", side_m=side)
-        split = make_split(data.moving, settings, None, np.zeros(0, np.int64), data.place, data.station)
+        where, place = data.moving - data.moving.min(axis=0), visits(data.moving, data.place)
+        split = make_split(where, settings, None, np.zeros(0, np.int64), place, data.station)
         split.check()
     except ValueError:
         return np.zeros(0, np.int64)

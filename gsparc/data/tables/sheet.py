@@ -16,6 +16,7 @@ import pandas as pd
 from fsspec.core import url_to_fs
 
 from gsparc.data.errors import DataError, Problems, reason
+from gsparc.data.files import checked_line
 from gsparc.data.tables import TABLE_SUFFIXES
 from gsparc.data.tables.heads import understand
 
@@ -160,6 +161,11 @@ OTHERS = {
 }
 
 
+MOST_BYTES = 2**30  # of a table of text
+MOST_COLUMNS = 10_000  # read in two seconds; a hundred thousand in a minute
+MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
+
+
 Lines = dict[int, str]  # those with something in them, by their numbers from 1
 
 
@@ -173,7 +179,7 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     text, encoding = _decoded(path)
     if encoding != "UTF-8":
         notes.append(f"read as {encoding}")
-    lines, comment = _lines(text)
+    lines, comment = _lines(text, source)
     if not lines:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
     excel = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
@@ -184,6 +190,12 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     if delimiter is None or not lines:
         fault = f"line 1 ({lines[min(lines)][:40]!r}) is a single column" if lines else "no heads"
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
+    width = len(_cells(lines[min(lines)], delimiter))
+    if width > MOST_COLUMNS or width * len(lines) > MOST_CELLS:
+        fault = (
+            f"{width:,} columns of {len(lines):,} lines; at most {MOST_COLUMNS:,} and {MOST_CELLS:,} cells"
+        )
+        raise DataError(f"{source}: {fault} are read: write Parquet, with dataset.cell_m where rows are many")
     lines = _with_heads(lines, comment, delimiter, source)
     lines, comment_notes = _without_comments(lines, delimiter, source)
     notes += comment_notes
@@ -207,6 +219,8 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
 
 def _decoded(path: Path) -> tuple[str, str]:
     """The text of a file and the name of its encoding."""
+    if path.stat().st_size > MOST_BYTES:
+        raise DataError(f"{path}: a table of text of more than {MOST_BYTES:,} bytes; write it as Parquet")
     content = path.read_bytes()
     for start, what in OTHERS.items():
         if content.lstrip().startswith(start):
@@ -227,13 +241,13 @@ def _decoded(path: Path) -> tuple[str, str]:
         return content.decode("cp1252", errors="replace"), "Windows-1252, as it is not UTF-8"
 
 
-def _lines(text: str) -> tuple[Lines, str]:
+def _lines(text: str, source: str) -> tuple[Lines, str]:
     """The lines, and the last comment before the first of them."""
     lines: Lines = {}
     comment = ""
     # Not str.splitlines, which also ends lines at characters that may stand in a cell.
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
-        stripped = line.strip()
+        stripped = checked_line(source, number, line).strip()
         if stripped.startswith(COMMENTS) and not lines:
             comment = stripped.lstrip("#%/ ")
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.datamodule import DataModule
-from gsparc.data.files import platform_cache
+from gsparc.data.files import is_address, platform_cache
 from gsparc.data.instantiate import suggest
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Kind, Measurements
@@ -27,7 +27,7 @@ from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
-from gsparc.evaluation.summary import provenance, result_rows, write_samples, write_summary
+from gsparc.evaluation.summary import new_run_id, provenance, result_rows, write_samples, write_summary
 from gsparc.models import checkpoint, parts
 from gsparc.models.method import Method, TrainsByGradient
 from gsparc.models.registry import build
@@ -79,7 +79,8 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     known = None if walls is None else read_walls(walls)
     split = split_for(plain(config.split), data)
     split.check()  # none without rows to learn from or to test on
-    write_split(run_dir / "split.json", split, len(data), data.site.sha256)
+    run_id = new_run_id()
+    write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
     count = len(split.folds)
     folders = [run_dir] if count == 1 else [run_dir / f"fold{number}" for number in range(count)]
     files = tuple(folder / "model.ckpt" for folder in folders)
@@ -92,7 +93,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         if not curve.read(folders[number]):  # a method that trains in one piece
             context(number).curve(report.seconds, method.name, report.error)
         marks = parts.marks(report, data, split.folds[number], context(number))
-        extra = {**marks, "fold": number, "split_sha256": split.sha256}
+        extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
         checkpoint.save(files[number], method, yaml, extra)
 
     with tracking.opened(config) as loggers:
@@ -120,7 +121,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             eval_on=config.eval_on, baselines=config.baselines, cache=platform_cache(),
         )  # fmt: skip
         facts: dict[str, Any] = {
-            **evaluation.facts, **provenance(),
+            **evaluation.facts, **provenance(), "run_id": run_id,
             "seed": int(config.seed), "model/limited_by_clock": fitted.limited_by,
         }  # fmt: skip
         if fitted.cost.stages:
@@ -142,7 +143,8 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         if len(objects):
             draw_found(data, objects, run_dir / "found.png", known)
             tracking.picture(loggers, "found", run_dir / "found.png")
-    write_samples(run_dir / "per_sample.csv", evaluation.columns)
+    samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
+    write_samples(run_dir / "per_sample.csv", samples)
     write_summary(run_dir / "summary.json", facts)
     return facts, Objects(methods, files, data, split, evaluation)
 
@@ -155,7 +157,8 @@ def _data(config: DictConfig) -> DataModule:
     module = datamodule(config.dataset)
     module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
-        if not OmegaConf.is_missing(config.dataset, key) and config.dataset.get(key):
+        given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
+        if given and not is_address(given):
             config.dataset[key] = str(Path(config.dataset[key]).resolve())
     if start is not None:
         try:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
+from gsparc.data.files import load_yaml
 from gsparc.data.schema import Kind
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.open_runs import open_files
@@ -172,12 +172,21 @@ def _facts(file: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path) -> Run:
-    """The run in a directory."""
+    """The run in a directory.
+
+    Raises:
+        ValueError: its files are of two runs.
+    """
     render = columns(folder / "render_ms.csv").get("render_ms")
+    facts, samples = _facts(folder / "summary.json"), columns(folder / "per_sample.csv")
+    runs = {facts.get("run_id"), *samples.pop("run_id", np.zeros(0))[:1].tolist()}
+    runs |= {_facts(split).get("run_id") for split in folder.glob("split.json")}
+    if len(runs) > 1:
+        raise ValueError(f"{folder}: its summary, samples and split are of two runs; train again elsewhere")
     return Run(
         folder,
-        _facts(folder / "summary.json"),
-        columns(folder / "per_sample.csv"),
+        facts,
+        samples,
         {k: v for k, v in columns(folder / "learning_curve.csv").items() if v.dtype.kind == "f"},
         _overrides(folder / ".hydra" / "overrides.yaml"),
         _config(folder / ".hydra" / "config.yaml"),
@@ -204,7 +213,7 @@ def _column(cells: Sequence[str]) -> np.ndarray:
 def _overrides(path: Path) -> tuple[str, ...]:
     if not path.is_file():
         return ()
-    return tuple(str(line) for line in yaml.safe_load(path.read_text(encoding="utf-8")) or ())
+    return tuple(str(line) for line in load_yaml(path.read_text(encoding="utf-8"), path) or ())
 
 
 def _config(path: Path) -> dict[str, Any]:
@@ -241,6 +250,8 @@ def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> 
     for number, run in enumerate(runs):
         try:
             opened = open_files(run.checkpoints[:1])
+            if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
+                raise ValueError("its checkpoint is of another run than its summary")
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import os
 import subprocess
 import sys
 
 import pytest
+from campaigns import compose, powers
 from doors import assert_refused, knock
 from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, hold, locked, release
-from gsparc.commands.train import train
+from gsparc.commands.train import LEFT, train
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.report.runs import read_run
+from gsparc.models import checkpoint
 
 HOLDS = "import sys, time; from gsparc.commands.shared.run_lock import hold; from pathlib import Path; "
 HOLDS += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
@@ -94,3 +100,70 @@ def test_a_folder_that_cannot_be_locked_is_not_written_to(taken, tmp_path, recwa
         (folder / taken).rmdir()
         hold(folder)  # the lock was not left behind
         release()
+
+
+def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_path, monkeypatch):
+    """Split and settings were of the new run, summary and model of the old one, and all readers took them."""
+    file = powers(tmp_path / "own.npz")
+    given = "dataset=own", f"dataset.file={file}", "model=idw", "baselines=[]", "logger=none", "threads=1"
+    train(compose(*given), tmp_path / "run")
+    first = json.loads((tmp_path / "run" / "summary.json").read_text())["run_id"]
+    assert json.loads((tmp_path / "run" / "split.json").read_text())["run_id"] == first
+    assert checkpoint.read(tmp_path / "run" / "model.ckpt").extra["run_id"] == first
+    assert read_run(tmp_path / "run").facts["run_id"] == first
+    with monkeypatch.context() as broken, pytest.raises(RuntimeError):
+        broken.setattr(
+            "gsparc.evaluation.experiment.run.evaluate", lambda *a, **b: (_ for _ in ()).throw(RuntimeError)
+        )
+        train(compose(*given, "split.seed=5", "model=gp"), tmp_path / "run")
+    left = {path.name for path in (tmp_path / "run").iterdir()}
+    assert not {"summary.json", "per_sample.csv", "test.png"} & left
+    assert {"summary.json.earlier", "model.ckpt.earlier", "split.json.earlier"} <= left
+    train(compose(*given, "split.seed=5"), tmp_path / "run")
+    assert read_run(tmp_path / "run").facts["run_id"] != first
+
+    for name in ("split.json", "per_sample.csv"):  # as a kill, or a copy by hand, may leave it
+        train(compose(*given), tmp_path / "other")
+        mixed = tmp_path / "other" / name
+        mixed.write_bytes((tmp_path / "run" / name).read_bytes())
+        with pytest.raises(ValueError, match="its summary, samples and split are of two runs"):
+            read_run(tmp_path / "other")
+    models = [tmp_path / folder / checkpoint.MODEL for folder in ("run", "other")]
+    with pytest.raises(ValueError, match="of different runs; give the folds of one"):
+        open_files(models)
+
+
+def test_a_command_that_is_refused_leaves_no_summary_of_the_one_before(tmp_path):
+    (tmp_path / "summary.json").write_text("{}")
+    given = ["ckpt=none.ckpt", f"hydra.run.dir={tmp_path}"]
+    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), "no such checkpoint")
+    assert not (tmp_path / "summary.json").exists() and (tmp_path / "summary.json.earlier").exists()
+
+
+def test_what_a_run_goes_on_from_is_not_set_aside(tmp_path):
+    for name in LEFT[:3]:
+        (tmp_path / name).write_text("{}")
+    with pytest.raises(ValueError):
+        train(compose(f"ckpt_path={tmp_path / 'model.ckpt'}"), tmp_path)
+    assert {path.name for path in tmp_path.glob("*.json*")} == {"summary.json.earlier", "split.json"}
+
+
+def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):
+    """`.NAME.PID.partial` of a process that is gone is deleted, of one that runs it is not."""
+    here = tmp_path / "run"
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for name in (
+        f".model.ckpt.{gone.pid}.partial",
+        f"fold0/refit/.a.csv.{gone.pid}.partial",
+        ".b.999999999999.partial",
+    ):
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
+        (here / name).write_text("half")
+    (here / f"fold0/.map.{gone.pid}.partial").mkdir()
+    kept = [here / f".c.json.{os.getppid()}.partial", here / ".mine.partial", here / ".d.e.partial"]
+    for path in kept:
+        path.write_text("half")
+    hold(here)
+    release()
+    assert sorted(here.rglob("*.partial")) == sorted(kept)
