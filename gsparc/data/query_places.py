@@ -14,7 +14,7 @@ from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import ENDS, End
 from gsparc.data.tables import is_table
-from gsparc.data.tables.columns import Chosen, choose
+from gsparc.data.tables.columns import Chosen, choose, station_names
 from gsparc.data.tables.heads import AXES
 from gsparc.data.tables.places import Places, places
 from gsparc.data.tables.read import NOTHING
@@ -137,8 +137,7 @@ def _missing(sheet: Sheet, end: End, both: bool) -> str:
 def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
     if role not in chosen:
         return None
-    head = chosen[role][0].head or ""
-    words = sheet.words(head)
+    head, words = chosen[role][0].head or "", station_names(sheet, chosen[role])
     sheet.refuse_rows(head, np.flatnonzero(words == ""), f"no {role}; expected its name")
     return words
 

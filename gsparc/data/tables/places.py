@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +11,7 @@ from gsparc.data.tables.columns import Chosen, as_station, choose
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
+ON_EARTH = ((-90, 90), (-180, 360))  # degrees of latitude and longitude
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,45 @@ def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np
     return values
 
 
+# Numbers that are no decimal degrees: what they are, and whether latitudes and longitudes (n,) can be so.
+NOTATIONS: tuple[tuple[str, Callable[[np.ndarray, np.ndarray], bool]], ...] = (
+    (
+        "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; convert to degrees",
+        lambda lat, lon: bool(
+            (np.abs(lat) <= 9e3).all()
+            and (np.abs(lon) <= 1.8e4).all()
+            and (np.abs(np.concatenate([lat, lon])) % 100 < 60).all()
+        ),
+    ),
+    (
+        "degrees times ten million; divide them",
+        lambda lat, lon: bool(
+            ((np.abs(lat) >= 1e7) & (np.abs(lat) <= 9e8)).all() and (np.abs(lon) <= 1.8e9).all()
+        ),
+    ),
+    ("metres of a projection", lambda lat, lon: True),
+)
+
+
 def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray) -> None:
-    for i, (role, low, high) in enumerate(zip(roles, (-90, -180), (90, 360), strict=True)):
-        bad = np.flatnonzero((across[:, i] < low) | (across[:, i] > high))
-        swapped = i == 0 and len(bad) and (np.abs(across[:, 1]) <= 90).all()
-        hint = "; are latitude and longitude swapped?" if swapped else ""
-        rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in bad)
-        sheet.problems.add_rows(
-            sheet.where(chosen[role][0].head or ""), rows, f"{role} is outside {low} to {high} degrees{hint}"
-        )
+    outside = [
+        np.flatnonzero((across[:, i] < low) | (across[:, i] > high)) for i, (low, high) in enumerate(ON_EARTH)
+    ]
+    swapped = len(outside[0]) > 0 and (np.abs(across[:, 1]) <= 90).all()
+    heads = [chosen[role][0].head or "" for role in roles]
+    if 2 * len(outside[0]) > len(across) and not swapped:
+        fault = next(what for what, fits in NOTATIONS if fits(*across[np.isfinite(across).all(axis=1)].T))
+        if fault == NOTATIONS[-1][0]:
+            end = roles[0].removesuffix("latitude")
+            fault += f"? say dataset.columns.{end}x={heads[1]} dataset.columns.{end}y={heads[0]}"
+        example = f"{across[outside[0][0], 0]:.10g} in {sheet.rows[outside[0][0]]}"
+        return sheet.refuse(f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}")
+    for i, (role, (low, high)) in enumerate(zip(roles, ON_EARTH, strict=True)):
+        hint = "; are latitude and longitude swapped?" if i == 0 and swapped else ""
+        rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in outside[i])
+        fault = f"{role} is outside {low} to {high} degrees{hint}"
+        sheet.problems.add_rows(sheet.where(heads[i]), rows, fault)
+    return None
 
 
 def one_each(
@@ -98,8 +129,9 @@ def one_each(
         ask: say whether it is so, and note nothing.
     """
     values = row_places.all()
-    first = np.array([int(np.argmax(station == t)) for t in range(len(names))])
-    moved = np.flatnonzero((values != values[first[station]]).any(axis=1))
+    fixed = (values[:, :2] != 0).any(axis=1)  # 0, 0 in some of a station's rows: no fix there
+    first = np.array([int(np.argmax((station == t) * (1 + fixed))) for t in range(len(names))])
+    moved = np.flatnonzero((values != values[first[station]]).any(axis=1) & fixed)
     if len(moved) == 0:
         return row_places.take(first)
     if not ask:

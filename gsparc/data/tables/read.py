@@ -10,12 +10,25 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
-from gsparc.data.errors import nearest
+from gsparc.data.checks.outliers import two_groups
+from gsparc.data.errors import Caution, nearest, some
 from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS
 from gsparc.data.tables.cells import LOOKED_AT, merged
-from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
+from gsparc.data.tables.columns import (
+    CHANNELS,
+    JOINED,
+    LEVELS,
+    POLAR,
+    Chosen,
+    Column,
+    choose,
+    schema_unit,
+    station_names,
+)
+from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, about, words_of
 from gsparc.data.tables.places import (
     PER_STATION,
     UNKNOWN_HEIGHT,
@@ -69,6 +82,30 @@ def understand_table(
     return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
+MOST_GROUPS = 12  # values of a column that may tell stations apart
+LEAST_APART_DB = 6.0  # beyond what levels of one group differ by between neighbours
+LEAST_PAIRS = 20
+
+
+def groups_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> float:
+    """How much more levels (n,) [dB] differ between neighbours (n, 2) of two groups than of one, median."""
+    same, other = np.full((2, len(level)), np.inf), np.full((2, len(level)), np.inf)
+    for value in np.unique(group):
+        inside, outside = np.flatnonzero(group == value), np.flatnonzero(group != value)
+        if len(inside) < LEAST_PAIRS or len(outside) < LEAST_PAIRS:
+            continue
+        near, which = cKDTree(places[inside]).query(places[inside], k=2)
+        same[:, inside] = near[:, 1], np.abs(level[inside] - level[inside[which[:, 1]]])
+        near, which = cKDTree(places[outside]).query(places[inside])
+        other[:, inside] = near, np.abs(level[inside] - level[outside[which]])
+    beside = np.isfinite(same[0]) & (other[0] <= 2 * np.maximum(same[0], np.median(same[0])))
+    if beside.sum() < LEAST_PAIRS:
+        return 0.0
+    return float(np.median(other[1, beside]) - np.median(same[1, beside]))
+
+
+TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
+NOT_HEARD = "below the weakest level; dataset.not_heard says otherwise"
 HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
 
 
@@ -97,12 +134,14 @@ class Builder:
 
     def _measurement(self) -> str | None:
         """Add the measurement; its quantity."""
-        role = next((name for name in (*LEVELS, *CHANNELS) if name in self.chosen), None)
+        role = next((name for name in (*LEVELS, *CHANNELS, *POLAR) if name in self.chosen), None)
         if role is None:
             fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
-            return self.refuse(f"{fault}; say dataset.columns.rssi_db=COLUMN")
-        if role in CHANNELS:
-            self._channels()
+            loss = next((h for h in self.sheet.heads if {"loss", "pathloss"} & set(words_of(h))), None)
+            hint = "COLUMN" if loss is None else f"{loss}*-1 takes losses for levels"
+            return self.refuse(f"{fault}; say dataset.columns.rssi_db={hint}")
+        if role not in LEVELS:
+            self._channels(CHANNELS if role in CHANNELS else POLAR)
             return role
         columns = self.chosen[role]
         levels = [column.numbers(self.sheet) for column in columns]
@@ -111,31 +150,43 @@ class Builder:
         values = np.stack([v for v in levels if v is not None], axis=1)
         if np.isnan(values).all():
             self.refuse("no value in any row", columns[0].head or "")
+        for text, count in self.sheet.marks.items():
+            self.notes.append(
+                Caution(f"{count} of {values.size} levels are {text!r}: taken as not heard, {NOT_HEARD}")
+            )
         first = columns[0]
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
             choices = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
-            self.refuse(f"no value below 0: dBm or W? say {choices}", first.head or "")
+            fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
+            self.refuse(f"{fault}, or dataset.columns.rssi_db={first.head}*-1", first.head or "")
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
 
-    def _channels(self) -> None:
-        pairs = [self._tones(part) for part in CHANNELS]
+    def _channels(self, names: tuple[str, str]) -> None:
+        """Add channels of columns of real and imaginary parts, or of amplitudes and phases."""
+        pairs = [self._tones(part) for part in names]
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
         parts: list[list[np.ndarray]] = [[], []]
         for tone in self.tones.tolist():
-            for part, columns, other in zip(CHANNELS, pairs, pairs[::-1], strict=True):
+            for i, columns, other in zip((0, 1), pairs, pairs[::-1], strict=True):
                 if tone not in columns:
-                    self.refuse(
-                        f"{other[tone].head!r} has no {part} beside it; say dataset.columns.{part}=COLUMN"
-                    )
+                    fault = f"{other[tone].head!r} has no {names[i]} beside it"
+                    self.refuse(f"{fault}; say dataset.columns.{names[i]}=COLUMN")
                     continue
                 values = columns[tone].numbers(self.sheet)
                 if values is not None:
-                    parts[CHANNELS.index(part)].append(values)
+                    parts[i].append(values)
         if self.sheet.problems:
             return
-        csi = np.stack(parts[0], axis=1) + 1j * np.stack(parts[1], axis=1)
+        first, second = (np.stack(part, axis=1) for part in parts)
+        if names == POLAR:
+            degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
+            if pairs[1][self.tones[0]].unit is None:
+                self.notes.append(f"phases are taken as {'degrees' if degrees else 'radians'}")
+            turn = np.exp(1j * (np.radians(second) if degrees else second))
+            first, second = first * turn.real, first * turn.imag
+        csi = first + 1j * second
         csi = csi[:, 0] if csi.shape[1] == 1 else csi
         self.arrays["csi"] = csi
         if np.isnan(csi).any():
@@ -174,11 +225,57 @@ class Builder:
             return
         stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
+        self._groups(where)
         if stations is not None:
             self._add_stations(stations, where.degrees)
+        self._splitting(measured, where, None if stations is None else stations.index)
         self._add_places(moving, where)
         for other in ends.values():  # the end that is left, where there are no stations
             self._add_other("tx" if moving == "rx" else "rx", other, where)
+
+    def _unused(self) -> dict[str, np.ndarray]:
+        """Text (S,) of the columns that are not used, those of one value left out."""
+        used = {column.head for columns in self.chosen.values() for column in columns}
+        words = {head: self.sheet.words(head) for head in self.sheet.heads if head and head not in used}
+        return {head: text for head, text in words.items() if (text != text[0]).any()}
+
+    def _groups(self, where: Places) -> None:
+        """Warn of two groups of places far apart, and say which column tells them apart."""
+        groups = None if where.degrees else two_groups(where.across)
+        if groups is None:
+            return
+        for head, words in self._unused().items():
+            values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
+            if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
+                said = (
+                    f"two groups of places {groups[1] / 1e3:.4g} km apart, as column {head!r} says: zones of "
+                )
+                self.notes.append(Caution(said + "a projection? give degrees, or a file for each"))
+
+    def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
+        """Warn of unused columns whose groups have levels of their own at the places of one station."""
+        if measured not in LEVELS or self.arrays[measured].ndim > 1:
+            return
+        level, scale = self.arrays[measured], np.ones(2)
+        if where.degrees:
+            scale[1] = np.cos(np.radians(np.nanmedian(where.across[:, 0])))
+        for head, words in self._unused().items():
+            if about(head) or {*NO_LEVEL, *LEVEL_WORDS} & set(words_of(head)):
+                continue
+            values, group = np.unique(words, return_inverse=True)
+            if len(values) > MOST_GROUPS:
+                continue
+            for t in (0,) if station is None else range(int(station.max()) + 1):
+                of = np.isfinite(level) & (words != "") & (True if station is None else station == t)
+                apart = groups_apart(where.across[of] * scale, level[of], group.reshape(-1)[of])
+                if apart > LEAST_APART_DB:
+                    columns = [c.head or "" for c in self.chosen.get("station", ())]
+                    said = (
+                        f"column {head!r} is not used, and levels at equal places differ by {apart:.0f} dB "
+                    )
+                    how = f"between its values: dataset.columns.station={'+'.join([*columns, head])}"
+                    self.notes.append(Caution(f"{said}{how} tells them apart"))
+                    break
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
@@ -206,9 +303,9 @@ class Builder:
         for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
             self.refuse(f"two columns of the station {label!r}; rename one")
         if len(labels) > 1:
-            return self._wide(labels, where)
-        column = self.chosen.get("station", (None,))[0]
-        if column is None:
+            return self._wide(labels, where, next(iter(end_places.values())).degrees)
+        columns = self.chosen.get("station", ())
+        if not columns:
             if self.listed is not None and len(self.listed.names) == 1:
                 return self._by_list(np.array(self.listed.names * len(self.sheet.rows)))
             if self.listed is not None:
@@ -218,10 +315,14 @@ class Builder:
             if where is None:
                 where = self._second_in_degrees(end_places)
             return None if where is None else self._unnamed(where)
-        words = self.sheet.words(column.head or "")
-        self.sheet.refuse_rows(column.head, np.flatnonzero(words == ""), "no station; expected its name")
+        words, head = station_names(self.sheet, columns), columns[0].head or ""
+        if columns[0].label == JOINED and columns[0].word and self.listed is not None:
+            plain = self.sheet.words(head)
+            words = plain if set(plain) <= set(self.listed.names) else words
+        self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
+        self._rounded(words, head)
         if self.listed is not None:
-            self._all_listed(words, column.head or "")
+            self._all_listed(words, head)
             return None if self.sheet.problems else self._by_list(words)
         index, distinct = pd.factorize(words)  # in the order of their first rows
         names = tuple(map(str, distinct))
@@ -240,19 +341,29 @@ class Builder:
             one_each(self.sheet, end_places[ends[0]], index, names)
             return None
         if measured in LEVELS:
-            nowhere = np.full((len(names), 3), np.nan)
-            degrees = next(iter(end_places.values())).degrees
-            self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
-            return StationList(names, Places(nowhere[:, :2], nowhere[:, 2], degrees), index=index)
+            return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
 
-    def _wide(self, labels: tuple[str, ...], where: Places | None) -> StationList | None:
+    def _rounded(self, words: np.ndarray, head: str) -> None:
+        """Warn of names that a spreadsheet has rounded: several stations may have become one."""
+        lost = sorted({w for w in words.tolist() if re.fullmatch(r"\d(?:[.,]\d+)?E\+\d+|\d{15}0{2,}", w)})
+        if lost:
+            said = f"column {head!r}: {some(lost, 3)}: rounded by a spreadsheet, stations may have become one"
+            self.notes.append(Caution(f"{said}; export the column as text"))
+
+    def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
+        """Stations at places that nobody gave."""
+        nowhere = np.full((len(names), 3), np.nan)
+        self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
+        return StationList(names, Places(nowhere[:, :2], nowhere[:, 2], degrees), index=index)
+
+    def _wide(self, labels: tuple[str, ...], where: Places | None, degrees: bool) -> StationList | None:
+        if self.listed is None and where is not None:
+            fault = f"{len(labels)} columns of stations in one place for all columns"
+            return self.refuse(f"{fault}; say dataset.stations_file=FILE (name, x, y, z)")
         if self.listed is None:
-            hint = "in one place for all columns" if where is not None else "without places"
-            return self.refuse(
-                f"{len(labels)} columns of stations {hint}; say dataset.stations_file=FILE (name, x, y, z)"
-            )
+            return self._nowhere(labels, degrees)
         self._all_listed(np.array(labels), None)
         silent = [name for name in self.listed.names if name not in labels]
         used = {column.head for columns in self.chosen.values() for column in columns}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,15 +16,36 @@ import numpy as np
 import pandas as pd
 from fsspec.core import url_to_fs
 
-from gsparc.data.errors import DataError, Problems, reason
+from gsparc.data.errors import Caution, DataError, Problems, lines_of, reason
 from gsparc.data.tables import TABLE_SUFFIXES
-from gsparc.data.tables.heads import understand
+from gsparc.data.tables.heads import PERCENT, UNITS, Unit, understand
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
 # What stands for no value, in small letters.
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "#n/a", "null", "none", "nil", "?", ".")
+# What stands for "not heard" in a cell of a level, however rare; other text does where it repeats.
+NOT_HEARD = (
+    "np",
+    "nd",
+    "n.d.",
+    "nh",
+    "oor",
+    "ns",
+    "-inf",
+    "not heard",
+    "no signal",
+    "not detected",
+    "no service",
+)
+REPEATS = 3
+MEASURED = re.compile(r"\s*([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)\s*", re.IGNORECASE)
+SEXAGESIMAL = re.compile(
+    r"\s*([nsew]?)\s*([-+]?)(\d{1,3}(?:\.\d+)?)(?:\s*[°º:d\s]\s*(?:(\d{1,2}(?:\.\d+)?)"
+    r"(?:\s*['′’:m\s]\s*(?:(\d{1,2}(?:\.\d+)?)\s*(?:[\"″”s]|''|′′)?)?)?)?)?\s*([nsew]?)\s*",
+    re.IGNORECASE,
+)
 DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
 DECIMAL_POINT = r"\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*"
 
@@ -39,6 +61,7 @@ class Sheet:
         rows: what a message calls each row: `line 2`, `row 0`.
         decimal: `.` or `,`, of numbers that are text.
         problems: takes what is wrong.
+        marks: texts that stand for "not heard" among levels that were read, and how often each does.
     """
 
     source: str
@@ -47,6 +70,7 @@ class Sheet:
     rows: tuple[str, ...]
     decimal: str = "."
     problems: Problems = field(default_factory=lambda: Problems(""))
+    marks: Counter[str] = field(default_factory=Counter)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -77,23 +101,51 @@ class Sheet:
         empty = missing | np.isin(np.char.lower(text.astype(str)), MISSING)
         return np.where(empty, "", text).astype(str)
 
-    def numbers(self, head: str) -> np.ndarray | None:
-        """Numbers (S,) float64 of a column, NaN for no value; None, and noted, where a cell is text."""
+    def numbers(
+        self,
+        head: str,
+        unit: Unit | None = None,
+        suits: Callable[[Unit], bool] = lambda unit: False,
+        levels: bool = False,
+    ) -> np.ndarray | None:
+        """Numbers (S,) float64 of a column, NaN for no value; None, and noted, where a cell is text.
+
+        Args:
+            head: of the column.
+            unit: that its head says; values are in the schema's.
+            suits: whether cells may hold a unit.
+            levels: whether text that repeats may stand for "not heard": minus infinity.
+        """
         column = self.columns[self.heads.index(head)]
         if pd.api.types.is_bool_dtype(column.dtype):
             return self.refuse("holds True and False; expected numbers", head)
+        read: dict[str, float | None] = {}
+        quiet: set[str] = set()
         if pd.api.types.is_numeric_dtype(column.dtype):
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
-            bad = np.isinf(values)
+            bad = (values == np.inf) | (np.isinf(values) & (not levels))
         else:
             cells = [str(cell) for cell in column]
             if self.decimal == ",":
                 # A point in such a file is a second sort of mark, or stands between thousands: refused.
-                cells = ["x" if "." in cell else cell.replace(",", ".") for cell in cells]
+                cells = ["x0" if "." in cell else cell.replace(",", ".") for cell in cells]
             values = pd.to_numeric(np.array(cells, dtype=object), errors="coerce").astype(np.float64)
             bad = ~np.isfinite(values)
             if bad.any():
                 bad[bad] = self.words(head)[bad] != ""
+                counts = Counter(cells[i] for i in np.flatnonzero(bad))
+                before = len(self.problems)
+                read = {text: self._read(text, suits, head) for text in counts}
+                if len(self.problems) > before:
+                    return None
+                quiet = {text for text, count in counts.items() if levels and _silent(text, count)}
+                self.marks.update({text.strip(): counts[text] for text in quiet})
+        values = values if unit is None else unit.convert(values)
+        if read:
+            of_text = {**read, **dict.fromkeys(quiet, -np.inf)}
+            understood = [i for i in np.flatnonzero(bad) if of_text[cells[i]] is not None]
+            values[understood] = [of_text[cells[i]] for i in understood]
+            bad[understood] = False
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
             texts = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
@@ -103,6 +155,29 @@ class Sheet:
             what = f"is no finite number{hint}; or leave it empty"
             return self.problems.add_rows(self.where(head), rows, what)
         return values
+
+    def _read(self, text: str, suits: Callable[[Unit], bool], head: str) -> float | None:
+        """The number of a cell with a unit, or of degrees, minutes and seconds; None where it is none."""
+        measured = MEASURED.fullmatch(text)
+        unit = UNITS.get(measured[2].lower()) if measured and measured[2] else Unit("", "")
+        if measured and unit is not None and (not measured[2] or suits(unit)):
+            return float(unit.convert(np.array(float(measured[1]))))
+        if measured and unit is not None and unit.kind == "quality" and suits(UNITS["dbm"]):
+            fault = f"{self.where(head)}: cells are in %: {PERCENT}"
+            self.problems.extend([] if fault in self.problems else [fault])
+            return np.nan  # said once, not of every row
+        parts = SEXAGESIMAL.fullmatch(text) if suits(UNITS["deg"]) else None
+        if parts is None:
+            return None
+        first, sign, *numbers, last = parts.groups()
+        degrees = sum(float(number or 0) / 60**k for k, number in enumerate(numbers))
+        return -degrees if sign == "-" or (first or last).lower() in ("s", "w") else degrees
+
+
+def _silent(text: str, count: int) -> bool:
+    """Whether a text that is no number stands for "not heard" where `count` levels should."""
+    plain = text.strip().lower()
+    return plain in NOT_HEARD or (count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain)))
 
 
 @contextmanager
@@ -173,9 +248,11 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     text, encoding = _decoded(path)
     if encoding != "UTF-8":
         notes.append(f"read as {encoding}")
-    lines, comment = _lines(text)
+    lines, comment = _lines(MINUS.sub("-", text))
     if not lines:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
+    lines, banner_notes = _without_banner(lines)
+    notes += banner_notes
     excel = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
     if excel:  # Excel's own hint
         del lines[min(lines)]
@@ -186,7 +263,8 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
     lines = _with_heads(lines, comment, delimiter, source)
     lines, comment_notes = _without_comments(lines, delimiter, source)
-    notes += comment_notes
+    lines, again_notes = _heads_once(lines, delimiter, source)
+    notes += comment_notes + again_notes
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
     for i, head in enumerate(heads):
@@ -239,6 +317,47 @@ def _lines(text: str) -> tuple[Lines, str]:
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
             lines[number] = line
     return lines, comment
+
+
+MINUS = re.compile(r"(?<![^\s,;|\"'])[\u2212\u2013\u2010\u2011\ufe63\uff0d](?=\s?[\d.,])")
+MOST_ABOVE = 10  # lines above the heads
+
+
+def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
+    """The lines from the heads on, where lines above them that hold something else leave no doubt; a note."""
+    numbers = list(lines)[:LOOKED_AT]
+    for delimiter in DELIMITERS:
+        cells = [_cells(lines[n], delimiter) for n in numbers]
+        usual = Counter(map(len, cells)).most_common(1)[0][0]
+        roles = [sum(understand(cell).role is not None for cell in row) for row in cells[:MOST_ABOVE]]
+        first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
+        above = [
+            len(row) != usual or 2 * sum(map(bool, map(str.strip, row))) <= usual for row in cells[:first]
+        ]
+        if usual > 1 and first and all(above) and not any(roles[:first]):
+            kept = {n: line for n, line in lines.items() if n >= numbers[first]}
+            return kept, [
+                f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
+            ]
+    return lines, []
+
+
+def _heads_once(lines: Lines, delimiter: str, source: str) -> tuple[Lines, list[str]]:
+    """The lines without those that repeat the heads, as in files joined, and a note."""
+    first, *below = lines
+    line, heads = lines[first].strip(), sorted(_cells(lines[first], delimiter))
+    again = [n for n in below if lines[n].strip("\ufeff \t") == line]
+    begin = [n for n in below if lines[n].startswith(tuple(filter(None, heads))) and n not in set(again)]
+    turned = [n for n in begin if sorted(_cells(lines[n], delimiter)) == heads]
+    if turned:
+        raise DataError(
+            f"{source}, line {turned[0]}: heads again, in another order; read the files one by one"
+        )
+    if not again:
+        return lines, []
+    where = lines_of([f"line {n}" for n in again])
+    what = f"{where}: the heads again; left out: are these files joined that belong together?"
+    return {n: text for n, text in lines.items() if n not in set(again)}, [Caution(what)]
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
