@@ -34,6 +34,7 @@ class QueryPlaces:
         station: (n,) names; None where the file names none.
         name: (n,) what a user calls each, where a column says so; else None.
         notes: what was guessed or not used, one line each.
+        table: the columns of a table in order: head, quantity that was read out of it or None, text (n,).
     """
 
     source: str
@@ -42,6 +43,7 @@ class QueryPlaces:
     station: np.ndarray | None = None
     name: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    table: tuple[tuple[str, str | None, np.ndarray], ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -122,7 +124,9 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     station = _words(sheet, chosen, "station")
     sheet.problems.raise_if_any()
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
-    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, name, (*notes, *guessed)))
+    role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
+    table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads if head)
+    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, name, (*notes, *guessed), table))
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:

@@ -177,6 +177,12 @@ CASES = {
         "rounded by a spreadsheet",
         "",
     ),
+    "a receiver in saturation": (
+        long("t", range(ROWS), level=np.minimum(LEVELS[:, 0], -72)),
+        {},
+        "levels are exactly -72, the most,",
+        "",
+    ),
     "a banner": ("App 2,site 7\nexported 2024\n" + wide(-999), {}, "the heads stand in line 3", "refused"),
     "joined files": (wide("") + wide(""), {}, "line 242: the heads again; left out", "refused"),
     "a proper minus sign": (long("t", range(ROWS)).replace("-", "\N{MINUS SIGN}"), {}, "good", "refused"),

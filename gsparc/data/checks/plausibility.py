@@ -18,6 +18,7 @@ from gsparc.data.errors import some
 from gsparc.data.schema import Measurements
 
 NAMED = 5  # wild rows that a station may have, however few its rows
+SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
 REPEATS = 3
@@ -61,16 +62,18 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         return []
     if not np.ptp(values):
         return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
-    least = float(values.min())
-    pile = values == least
-    rest = values[~pile]
     warnings = []
-    if pile.sum() > max(PILE * len(values), 10) and _piled(values, least):
-        share = f"{int(pile.sum())} of {len(values)} levels are exactly {round(least, 6) + 0:g}"
+    different, counts = np.unique(values, return_counts=True)
+    least, most = (f"{round(float(value), 6) + 0:g}" for value in different[[0, -1]])
+    if counts[-1] > max(SATURATED * len(values), 10, 5 * counts[-2]):
+        share = f"{counts[-1]} of {len(values)} levels are exactly {most}, the most"
         warnings.append(
-            f"{share}, the least: not heard? leave them empty and give sensitivity_db={round(least, 6) + 0:g}"
+            f"{share}: a receiver in saturation? the field is stronger there; leave these rows out"
         )
-        values = rest
+    if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, 5 * float(np.median(counts))):
+        share = f"{counts[0]} of {len(values)} levels are exactly {least}"
+        warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
+        values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
     if low >= 0 and high <= 1:
         warnings.append(
@@ -86,12 +89,6 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     elif low >= 0 and (values % 1 == 0).all():
         warnings.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
     return warnings
-
-
-def _piled(values: np.ndarray, level: float) -> bool:
-    """Whether several times as many of values (n,) are exactly `level` as any other level usually has."""
-    different, counts = np.unique(values, return_counts=True)
-    return len(different) > 3 and int(counts[different == level][0]) > 5 * float(np.median(counts))
 
 
 def not_heard(values: np.ndarray) -> list[float]:

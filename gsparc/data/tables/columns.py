@@ -52,7 +52,9 @@ PLAIN = {
     *("uwb", "serving", "dl"),
 }
 STATION = re.compile(
-    r"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|" + "|".join(STATION_WORDS) + r")?[\W_]*\d+)[\W_]*$"
+    r"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|"
+    + "|".join(sorted(STATION_WORDS))
+    + r")?[\W_]*\d+)[\W_]*$"
 )
 REPEATED = 4  # rows for each name of a column that may hold stations
 
@@ -177,7 +179,7 @@ def station_names(sheet: Sheet, columns: Iterable[Column]) -> np.ndarray:
 def _identity(sheet: Sheet, candidates: list[Column]) -> list[Column]:
     """A station's column and those that tell it from others of its name; the same where it needs none."""
     for first in candidates:
-        parts = set(TOGETHER.get(first.word, ()))
+        parts = TOGETHER.get(first.word, set())
         bare = {head: set(words_of(head)) - {*LABELS, *PLAIN} for head in sheet.heads if head != first.head}
         more = [head for head, words in bare.items() if words and words <= parts]
         if not parts or not all(column is first or column.head in more for column in candidates):
@@ -193,7 +195,7 @@ def _identity(sheet: Sheet, candidates: list[Column]) -> list[Column]:
 
 
 MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
-NAMED = re.compile(rf"(?i)^[\W_]*({'|'.join(STATION_WORDS)})[\W_]*[a-z]?\d+[\W_]*$")
+NAMED = re.compile(rf"(?i)^[\W_]*({'|'.join(sorted(STATION_WORDS))})[\W_]*[a-z]?\d+[\W_]*$")
 
 
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
@@ -227,7 +229,7 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
         groups = len({name for name, _ in pairs}) if wanted != "z" else 1
         if len(pairs) > groups and (wanted is not None or len(pairs) <= len(sheet) // REPEATED):
             joined = "+".join([*(column.head or "" for column in stations), head])
-            how = TOPICS[topic][1].format(head=head, joined=joined)
+            how = TOPICS[topic].format(head=head, joined=joined)
             notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
     return notes
 

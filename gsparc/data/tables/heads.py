@@ -75,91 +75,66 @@ OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "heigh
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
 END_WORDS = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
-STATION_WORDS = (
-    *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "gtw", "bs", "cell", "enb", "enodeb"),
-    *("gnb", "ap", "wap", "anchor", "pci", "psc", "bsic", "bssid", "netid", "cid", "eci"),
-    *("nci", "cgi", "sector", "beacon"),
+
+
+def _words(text: str) -> set[str]:
+    return set(text.split())
+
+
+def _by_word(table: dict[str, str]) -> dict[str, str]:
+    """Which entry of a table each word of its texts stands for."""
+    return {word: meaning for meaning, words in table.items() for word in words.split()}
+
+
+STATION_WORDS = _words(
+    "station site tower mast sensor gateway gw gtw bs cell enb enodeb gnb ap wap anchor pci psc bsic bssid "
+    "netid cid eci nci cgi sector beacon"
 )
 LESS = ("mac", "eui")  # of a station where nothing else names it
 # Columns whose values together name a station: the first is unique only beside one of the second.
 TOGETHER = {
-    **dict.fromkeys(
-        ("pci", "psc", "bsic"),
-        ("earfcn", "arfcn", "uarfcn", "nrarfcn", "dlarfcn", "channel", "freq", "frequency"),
-    ),
-    **dict.fromkeys(("cell", "cid", "sector"), ("lac", "tac", "area", "enb", "enodeb", "gnb", "site")),
-    **dict.fromkeys(("bssid", "mac", "ap", "netid"), ("band",)),
+    word: set(parts.split())
+    for words, parts in (
+        ("pci psc bsic", "earfcn arfcn uarfcn nrarfcn dlarfcn channel freq frequency"),
+        ("cell cid sector", "lac tac area enb enodeb gnb site"),
+        ("bssid mac ap netid", "band"),
+    )
+    for word in words.split()
 }
-_AXIS = {"x": "x", "easting": "x", "y": "y", "northing": "y", "z": "z"}
-_AXIS |= dict.fromkeys(("height", "hgt", "alt", "altitude", "elevation", "elev"), "z")
-_AXIS |= dict.fromkeys(("lat", "latitude"), "latitude")
-_AXIS |= dict.fromkeys(("lon", "lng", "long", "longitude"), "longitude")
-_PLACE = (
-    *("position", "pos", "coordinate", "coord", "location", "loc", "gps", "gnss", "local", "wgs84", "utm"),
-    *("current", "device", "user", "phone", "reading", "measured", "decimal"),
+_AXIS = _by_word({"x": "x easting", "y": "y northing", "z": "z height hgt alt altitude elevation elev"})
+_AXIS |= _by_word({"latitude": "lat latitude", "longitude": "lon lng long longitude"})
+_PLACE = _words(
+    "position pos coordinate coord location loc gps gnss local wgs84 utm current device user phone reading "
+    "measured decimal"
 )
 # Above what: heights that differ by a constant.
-_ABOVE = (
-    *(
-        "msl",
-        "amsl",
-        "asl",
-        "agl",
-        "above",
-        "sea",
-        "sealevel",
-        "level",
-        "ground",
-        "takeoff",
-        "relative",
-        "rel",
-    ),
-    *("baro", "barometric", "ellipsoid", "ellipsoidal", "geoid", "orthometric", "mean"),
+_ABOVE = _words(
+    "msl amsl asl agl above sea sealevel level ground takeoff relative rel baro barometric ellipsoid "
+    "ellipsoidal geoid orthometric mean"
 )
 # What an unused column may speak of, and what to do with it.
 TOPICS = {
-    "a floor": (
-        ("floor", "floorid", "storey", "story", "etage"),
-        "z={head}*3.2 takes 3.2 m a floor, .station={joined} a station for each",
-    ),
-    "a height": (tuple(word for word, axis in _AXIS.items() if axis == "z"), "z={head} takes it"),
-    "a station": (
-        (*STATION_WORDS, *LESS, "earfcn", "arfcn", "uarfcn", "nrarfcn", "lac", "tac", "band"),
-        "station={joined} tells them apart",
-    ),
-    "a carrier": (("frequency", "freq", "carrier", "channel"), "carrier_hz={head} takes it, in Hz"),
+    "a floor": "z={head}*3.2 takes 3.2 m a floor, .station={joined} a station for each",
+    "a height": "z={head} takes it",
+    "a station": "station={joined} tells them apart",
+    "a carrier": "carrier_hz={head} takes it, in Hz",
 }
+_TOPIC = dict.fromkeys((*STATION_WORDS, *LESS, "earfcn", "lac", "tac", "band"), "a station")
+_TOPIC |= {word: "a height" for word, axis in _AXIS.items() if axis == "z"}
+_TOPIC |= _by_word({"a carrier": "frequency freq carrier channel", "a floor": "floor storey etage"})
+_ACCURACY = {"accuracy", "error", "std", "dop", "valid", "quality", "count"}
 LEVEL_WORDS = ("rssi", "rsrp", "rss", "rxlev", "power", "level", "signal", "prx", "rscp")
-_ABOUT_LEVEL = (
-    *("rx", "received", "receive", "strength", "signal", "mean", "avg", "average", "median"),
-    *("measured", "value"),
+_ABOUT_LEVEL = _words("rx received receive strength signal mean avg average median measured value")
+NO_LEVEL = _words(
+    "tx transmit transmitted eirp noise std stdev var min max count loss delay angle interference quality "
+    "headroom class control delta diff difference change error residual offset threshold limit predicted "
+    "prediction estimated expected simulated gain battery supply pathloss attenuation bars rsrq snr sinr cqi "
+    "lsnr ber"
 )
-NO_LEVEL = (
-    *("tx", "transmit", "transmitted", "eirp", "noise", "std", "stdev", "var", "min", "max"),
-    *("count", "loss", "delay", "angle", "interference", "quality", "headroom", "class", "control"),
-    *("delta", "diff", "difference", "change", "error", "residual", "offset", "threshold", "limit"),
-    *("predicted", "prediction", "estimated", "expected", "simulated", "gain", "battery", "supply"),
-    *("pathloss", "attenuation", "bars", "rsrq", "snr", "sinr", "cqi", "lsnr", "ber"),
-)
-LABELS = (
-    "name",
-    "id",
-    "ids",
-    "nr",
-    "no",
-    "number",
-    "index",
-    "mac",
-    "eui",
-    "address",
-    "addr",
-    "label",
-    "code",
-)
+LABELS = _words("name id ids nr no number index mac eui address addr label code")
 _CHANNEL = ("csi", "h", "channel", "cfr")
-_PART = {"re": "csi_re", "real": "csi_re", "i": "csi_re", "im": "csi_im", "imag": "csi_im", "q": "csi_im"}
-_PART |= dict.fromkeys(("amp", "amplitude", "mag", "magnitude", "abs"), "csi_amp")
-_PART |= dict.fromkeys(("phase", "arg"), "csi_phase")
+_PART = _by_word({"csi_re": "re real i", "csi_im": "im imag q", "csi_phase": "phase arg"})
+_PART |= _by_word({"csi_amp": "amp amplitude mag magnitude abs"})
 
 
 @dataclass(frozen=True)
@@ -186,9 +161,7 @@ class Head:
 def about(head: str) -> str | None:
     """Of which of `TOPICS` a head speaks; None: of none."""
     words = words_of(unit_of(head)[0])
-    found = [word for word in words if word not in LABELS]
-    accuracy = {"accuracy", "error", "std", "dop", "valid", "quality", "count"} & set(words)
-    return next((t for t, (known, _) in TOPICS.items() if set(found) & set(known) and not accuracy), None)
+    return None if _ACCURACY & set(words) else next((_TOPIC[word] for word in words if word in _TOPIC), None)
 
 
 def understand(text: str) -> Head:
