@@ -258,24 +258,20 @@ def _read_hdf5(path: Path) -> Raw:
 def _read_mat(path: Path) -> Raw:
     """Arrays of a MATLAB file without their axes of length 1, text as attributes."""
     if h5py.is_hdf5(path):  # version 7.3 writes HDF5, the axes of arrays in reverse
-        raw = _read_hdf5(path)
-        arrays = {name: array.T for name, array in raw.arrays.items()}
+        arrays = {name: array.T for name, array in _read_hdf5(path).arrays.items()}
         with h5py.File(path, "r") as file:
             text = {name for name in arrays if _plain(file[name].attrs.get("MATLAB_class")) == "char"}
-        words = {name: "".join(map(chr, arrays.pop(name).ravel(order="F"))) for name in text}
+        arrays |= {name: np.array([*map(chr, arrays[name].ravel())]) for name in text}
     else:
         try:
             content = loadmat(path)
-        except (*DAMAGED, NotImplementedError, IndexError) as error:
+        except (*DAMAGED, IndexError) as error:
             raise DataError(f"{path}: damaged or not a MATLAB file ({reason(error)})") from None
         arrays = {name: array for name, array in content.items() if not name.startswith("__")}
-        words = {
-            name: "".join(arrays.pop(name).ravel())
-            for name in [n for n in arrays if arrays[n].dtype.kind == "U"]
-        }
+    words = {name: "".join(array.ravel()) for name, array in arrays.items() if array.dtype.kind == "U"}
     for name in [name for name, array in arrays.items() if array.dtype.kind in "OV"]:
         raise DataError(f"{path}, {name}: cells or structures; expected plain arrays of numbers")
-    return Raw({name: array.squeeze() for name, array in arrays.items()}, words)
+    return Raw({name: array.squeeze() for name, array in arrays.items() if name not in words}, words)
 
 
 def _values(item: h5py.Dataset, fixed: bool = False) -> np.ndarray:

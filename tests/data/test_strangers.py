@@ -178,9 +178,9 @@ CASES = {
         "",
     ),
     "a receiver in saturation": (
-        long("t", range(ROWS), level=np.minimum(LEVELS[:, 0], -72)),
+        long("t", range(ROWS), level=np.minimum(LEVELS[:, 0], -76)),
         {},
-        "levels are exactly -72, the most,",
+        "levels are exactly -76, the most: a receiver in saturation?",
         "",
     ),
     "a banner": ("App 2,site 7\nexported 2024\n" + wide(-999), {}, "the heads stand in line 3", "refused"),

@@ -106,7 +106,7 @@ def test_every_guess_is_said_and_what_is_not_used(write):
 def test_many_transmitters_did_not_become_one_without_a_word(write):
     rows = "".join(f"A{i % 3},{i},{i * i},2,-{60 + i % 7}\n" for i in range(24))
     notes = understand_table(write("Transmitter ID,x,y,z,rssi\n" + rows)).notes
-    assert sum("'Transmitter ID' holds 3 names again and again: stations?" in note for note in notes) == 1
+    assert sum("'Transmitter ID' speaks of a station and is not used" in note for note in notes) == 1
     other = understand_table(write("Operator ID,x,y,z,rssi\n" + rows)).notes
     assert not any("stations?" in note for note in other)
 
@@ -265,7 +265,7 @@ SPOILT = {
     "a misspelt column": (PLAIN, {"rssi_db": "rsi"}, "dataset.columns.rssi_db=rsi: drive.csv has no such column; "
                           "did you mean 'rssi'?"),
     "a misspelt quantity": (PLAIN, {"rsi_db": "rssi"}, "no such quantity; did you mean rssi_db?"),
-    "a unit that does not suit": (PLAIN.replace("rssi", "p [mW]"), {"rssi_db": "p"}, "is in mW; rssi_db needs"),
+    "a unit that does not suit": (PLAIN.replace("rssi", "p [mW]"), {"rssi_db": "p"}, "is in mW: rssi_db needs"),
     "latitude beyond the pole": ("lat,lon,rssi\n40,8,-80\n140,8,-81\n", {}, "column 'lat', line 3: 140: latitude"),
     "latitude and longitude swapped": (
         "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",

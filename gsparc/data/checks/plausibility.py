@@ -107,24 +107,21 @@ def not_heard(values: np.ndarray) -> list[float]:
         spans = (different[-1] - different[1], different[-2] - different[0])
         usual = max(GAP_DB, 5 * float(np.median(steps)))
         piled = counts[0] > max(PILE * len(rest), 10) and counts[0] > 5 * float(np.median(counts))
-        found = [
-            float(different[end])
-            for end, gap, span in zip((0, -1), steps[[0, -1]], spans, strict=True)
-            if (gap > max(APART_DB, 0.3 * span) and counts[end] >= REPEATS)
-            or (end == 0 and piled and gap >= usual)
-        ]
+        piled = piled and steps[0] >= usual
+        enough = (steps[[0, -1]] > np.maximum(APART_DB, 0.3 * np.array(spans))) & (counts[[0, -1]] >= REPEATS)
+        found = different[[0, -1]][enough | [piled, False]].tolist()
         if not found:
             return marks
         marks += found
         rest = rest[~np.isin(rest, found)]
 
 
-# What a list of stations may be in by mistake, beside rows in metres: words, and the same in metres.
-RIVALS = (
-    ("in feet", lambda place: 0.3048 * place),
-    ("in metres, the rows in feet", lambda place: place / 0.3048),
-    ("with x and y exchanged", lambda place: place[:, [1, 0, *range(2, place.shape[1])]]),
-)
+# What a list of stations may be in by mistake, beside rows in metres, and what turns it right.
+RIVALS: dict[str, tuple[float, list[int]]] = {
+    "in feet": (0.3048, [0, 1, 2]),
+    "in metres, the rows in feet": (1 / 0.3048, [0, 1, 2]),
+    "with x and y exchanged": (1.0, [1, 0, 2]),
+}
 BETTER, STEEP = 0.3, -0.6  # in the correlation, and the correlation itself
 
 
@@ -132,10 +129,12 @@ def direction_warnings(levels: LinkLevels) -> list[str]:
     """Levels that rise with the distance from their station, or fall far better from another place."""
     if levels.station_position is None:
         return []
-    axes = min(levels.position.shape[1], levels.station_position.shape[1])
-    places = levels.station_position[:, :axes]
+    places = levels.station_position
     declared = _correlation(levels, places)
-    rivals = {words: _correlation(levels, turned(places)) for words, turned in RIVALS}
+    rivals = {
+        words: _correlation(levels, factor * places[:, axes[: places.shape[1]]])
+        for words, (factor, axes) in RIVALS.items()
+    }
     best = min(rivals, key=lambda words: rivals[words])
     if rivals[best] < min(STEEP, declared - BETTER):
         return [
@@ -176,35 +175,28 @@ def stuck(levels: LinkLevels) -> list[str]:
             if len(run) < STILL_ROWS or np.diff(np.percentile(level, [5, 95]))[0] < MOVES_DB:
                 continue
             if np.corrcoef(level[:-1], level[1:])[0, 1] > TREND:
-                found.append((run, float(np.ptp(level))))
-    return [
-        f"{levels.rows[run[0]]} to {levels.rows[run[-1]]}: the place stands still for {len(run)} rows while "
-        f"levels move by {range_db:.0f} dB: a stuck fix? leave these rows out"
-        for run, range_db in found
-    ]
+                what = (
+                    f"the place stands still for {len(run)} rows while levels move by {np.ptp(level):.0f} dB"
+                )
+                rows = f"{levels.rows[run[0]]} to {levels.rows[run[-1]]}"
+                found.append(f"{rows}: {what}: a stuck fix? leave these rows out")
+    return found
 
 
 MOST_OF_A_KIND = 3
+NAMES = r"'[^']*'|\b(?:stations?|line|row) [^:, ]+(?:, )?|[^a-z ]"  # what differs between warnings of a kind
 
 
 def gathered(warnings: Sequence[str]) -> list[str]:
-    """Warnings of which more than a few of one kind, which differ in names and numbers, are one, counted."""
+    """Warnings of which more than a few of one kind are one, counted."""
     kinds: dict[str, list[str]] = defaultdict(list)
     for text in warnings:
-        plain = re.sub(r"'[^']*'|\b(?:stations?|line|row) [^:, ]+(?:, )?|[-+]?\d[\d.,]*", "", text)
-        kinds[re.sub(r"[\W\d]+", " ", plain)[:GENERAL]].append(text)
-    return [
-        text
-        for kind in kinds.values()
-        for text in (
-            kind
-            if len(kind) <= MOST_OF_A_KIND
-            else [f"{kind[0]} (and {len(kind) - 1} more warnings of this kind)"]
-        )
-    ]
-
-
-GENERAL = 60  # characters by which kinds differ
+        kinds[" ".join(re.sub(NAMES, " ", text).split())[:60]].append(text)
+    gathered: list[str] = []
+    for texts in kinds.values():
+        more = f"{texts[0]} (and {len(texts) - 1} more warnings of this kind)"
+        gathered += texts if len(texts) <= MOST_OF_A_KIND else [more]
+    return gathered
 
 
 def copies(levels: LinkLevels) -> list[str]:

@@ -160,28 +160,27 @@ def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
 def _without_fix(check: Checker, measured: str) -> None:
     """Leave out rows at exactly 0, 0 where all others are elsewhere; stations there are at unknown places."""
     arrays = check.raw.arrays
-    rows = len(arrays[measured]) if arrays[measured].ndim else 0
-    places: dict[str, np.ndarray] = {name: arrays[name] for name in check.given("rx_position", "tx_position")}
-    degrees = [arrays[name] for name in check.given("latitude", "longitude")]
-    if [part.shape for part in degrees] == 2 * [(rows,)]:
-        places["latitude"] = np.stack(degrees, axis=-1)
-    for name, place in places.items():
-        if place.ndim != 2 or len(place) != rows or place.dtype.kind not in "iuf":
+    degrees = "latitude" in arrays
+    for name in ("latitude",) if degrees else check.given("rx_position", "tx_position"):
+        pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
+        rows = len(arrays[measured]) if arrays[measured].ndim else 0
+        if any(
+            part.shape[:1] != (rows,) or part.ndim != 2 - degrees or part.dtype.kind not in "iuf"
+            for part in pair
+        ):
             continue
-        null = (place[:, :2] == 0).all(axis=1)
-        on_earth, rest = name == "latitude", place[~null, :2]
-        least = NO_FIX_DEG if on_earth else max(NO_FIX_M, 3 * float(np.ptp(rest, axis=0).max(initial=0.0)))
-        if not len(rest) or np.abs(np.median(rest, axis=0)).max() <= least:
+        place = np.column_stack(pair)[:, :2]
+        null = (place == 0).all(axis=1)
+        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(place[~null], axis=0).max(initial=0.0))
+        if null.all() or np.abs(np.median(place[~null], axis=0)).max() <= least:
             continue  # 0, 0 is a place, too, for who measures there
-        _unknown_at_zero(check, on_earth)
+        _unknown_at_zero(check, degrees)
         if null.any():
             which = lines_of([str(name) for name in arrays["row_name"][null]])
-            what = "latitude and longitude are" if on_earth else "x and y are"
-            check.notes.append(
-                Caution(f"{which}: {what} 0: no fix; these {int(null.sum())} of {rows} rows are left out")
-            )
+            what = f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"
+            check.notes.append(Caution(f"{which}: {what}; these {null.sum()} of {rows} rows are left out"))
             check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(~null), rows))
-            arrays, rows = check.raw.arrays, int((~null).sum())
+            arrays = check.raw.arrays
 
 
 def _unknown_at_zero(check: Checker, degrees: bool) -> None:
@@ -190,15 +189,13 @@ def _unknown_at_zero(check: Checker, degrees: bool) -> None:
     names = ("station_latitude", "station_longitude") if degrees else ("station_position",)
     if not set(names) <= set(arrays):
         return
-    known = np.column_stack([arrays[name] for name in names])[:, :2]
-    at_zero = np.flatnonzero((known == 0).all(axis=1))
-    if not len(at_zero):
-        return
+    at_zero = np.flatnonzero((np.column_stack([arrays[name] for name in names])[:, :2] == 0).all(axis=1))
     for name in names:
         arrays[name] = arrays[name].astype(np.float64)
         arrays[name][at_zero] = np.nan
-    who = some([arrays["station_name"][i] if "station_name" in arrays else i for i in at_zero])
-    check.notes.append(Caution(f"stations at 0, 0: {who}: no fix; their places are unknown"))
+    if len(at_zero):
+        who = some([arrays["station_name"][i] if "station_name" in arrays else i for i in at_zero])
+        check.notes.append(Caution(f"stations at 0, 0: {who}: no fix; their places are unknown"))
 
 
 def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:

@@ -78,15 +78,10 @@ class Column(Head):
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not suits(self.role, self.unit):
-            return sheet.refuse(f"is in {self.unit.name}{_needed(self.role, self.unit)}", self.head)
+            wanted = f"one of {known(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
+            remedy = PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
+            return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
         return sheet.numbers(self.head, self.unit, lambda unit: suits(self.role, unit), self.role in LEVELS)
-
-
-def _needed(role: str, unit: Unit) -> str:
-    """What a column in `unit` must be in, for messages."""
-    kind = KINDS[role]
-    wanted = f"one of {known(kind)}" if kind in SCHEMA else "no unit"
-    return f": {PERCENT}" if unit.kind == "quality" else f"; {role} needs {wanted}"
 
 
 Chosen = dict[str, tuple[Column, ...]]
@@ -161,8 +156,6 @@ def choose(
     unused = [repr(head) for head in sheet.heads if head and head not in used]
     if unused:
         notes.append(f"not used: column{'s' * (len(unused) > 1)} {some(unused, 8)}")
-    if "station" not in chosen and not any(columns[0].label for columns in chosen.values()):
-        notes += _perhaps_stations(sheet, used)
     return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]
 
 
@@ -215,7 +208,8 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
     names = station_names(sheet, stations) if stations else np.zeros(len(sheet), str)
     have = {"a floor": "z", "a height": "z", "a carrier": "carrier_hz"}
     for head in sheet.heads:
-        topic = about(head) if head else None
+        lone = "station" not in chosen and not any(columns[0].label for columns in chosen.values())
+        topic = about(head) or ("a station" if lone and set(words_of(head)) & set(END_WORDS) else None)
         if topic is None or head in used:
             if topic == "a floor" and any(c.head == head and c.unit is None for c in chosen.get("z", ())):
                 say = f"dataset.columns.z={head}*3.2 takes 3.2 m each"
@@ -231,20 +225,6 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
             joined = "+".join([*(column.head or "" for column in stations), head])
             how = TOPICS[topic].format(head=head, joined=joined)
             notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
-    return notes
-
-
-def _perhaps_stations(sheet: Sheet, used: Container[str | None]) -> list[str]:
-    """Columns that repeat few words and are called an end: without them all transmitters would be one."""
-    notes = []
-    ends = [head for head in sheet.heads if head not in used and set(words_of(head)) & set(END_WORDS)]
-    for head in ends:
-        distinct = len(set(sheet.words(head).tolist()) - {""})
-        if 2 <= distinct <= len(sheet) // REPEATED:
-            notes.append(
-                f"column {head!r} holds {distinct} names again and again: stations? say "
-                f"dataset.columns.station={head!r}, with their places in dataset.stations_file"
-            )
     return notes
 
 

@@ -123,7 +123,7 @@ _TOPIC = dict.fromkeys((*STATION_WORDS, *LESS, "earfcn", "lac", "tac", "band"), 
 _TOPIC |= {word: "a height" for word, axis in _AXIS.items() if axis == "z"}
 _TOPIC |= _by_word({"a carrier": "frequency freq carrier channel", "a floor": "floor storey etage"})
 _ACCURACY = {"accuracy", "error", "std", "dop", "valid", "quality", "count"}
-LEVEL_WORDS = ("rssi", "rsrp", "rss", "rxlev", "power", "level", "signal", "prx", "rscp")
+LEVEL_WORDS = _words("rssi rsrp rss rxlev power level signal prx rscp")
 _ABOUT_LEVEL = _words("rx received receive strength signal mean avg average median measured value")
 NO_LEVEL = _words(
     "tx transmit transmitted eirp noise std stdev var min max count loss delay angle interference quality "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,37 +75,23 @@ def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np
     return values
 
 
-# Numbers that are no decimal degrees: what they are, and whether latitudes and longitudes (n,) can be so.
-NOTATIONS: tuple[tuple[str, Callable[[np.ndarray, np.ndarray], bool]], ...] = (
-    (
-        "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; convert to degrees",
-        lambda lat, lon: bool(
-            (np.abs(lat) <= 9e3).all()
-            and (np.abs(lon) <= 1.8e4).all()
-            and (np.abs(np.concatenate([lat, lon])) % 100 < 60).all()
-        ),
-    ),
-    (
-        "degrees times ten million; divide them",
-        lambda lat, lon: bool(
-            ((np.abs(lat) >= 1e7) & (np.abs(lat) <= 9e8)).all() and (np.abs(lon) <= 1.8e9).all()
-        ),
-    ),
-    ("metres of a projection", lambda lat, lon: True),
-)
+def _notation(lat: np.ndarray, lon: np.ndarray) -> str | None:
+    """What numbers (n,) that are no decimal degrees are instead; None: metres, it seems."""
+    if max(np.abs(lat).max() / 90, np.abs(lon).max() / 180) <= 100 and (np.abs([lat, lon]) % 100 < 60).all():
+        return "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; convert them"
+    whole = np.abs(lat).min() >= 1e7 and np.abs(lat).max() <= 9e8 and np.abs(lon).max() <= 1.8e9
+    return "degrees times ten million; divide them" if whole else None
 
 
 def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray) -> None:
-    outside = [
-        np.flatnonzero((across[:, i] < low) | (across[:, i] > high)) for i, (low, high) in enumerate(ON_EARTH)
-    ]
+    limits = zip(across.T, ON_EARTH, strict=True)
+    outside = [np.flatnonzero((values < low) | (values > high)) for values, (low, high) in limits]
     swapped = len(outside[0]) > 0 and (np.abs(across[:, 1]) <= 90).all()
     heads = [chosen[role][0].head or "" for role in roles]
     if 2 * len(outside[0]) > len(across) and not swapped:
-        fault = next(what for what, fits in NOTATIONS if fits(*across[np.isfinite(across).all(axis=1)].T))
-        if fault == NOTATIONS[-1][0]:
-            end = roles[0].removesuffix("latitude")
-            fault += f"? say dataset.columns.{end}x={heads[1]} dataset.columns.{end}y={heads[0]}"
+        end = roles[0].removesuffix("latitude")
+        metres = f"metres? say dataset.columns.{end}x={heads[1]} dataset.columns.{end}y={heads[0]}"
+        fault = _notation(*across[np.isfinite(across).all(axis=1)].T) or metres
         example = f"{across[outside[0][0], 0]:.10g} in {sheet.rows[outside[0][0]]}"
         return sheet.refuse(f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}")
     for i, (role, (low, high)) in enumerate(zip(roles, ON_EARTH, strict=True)):

@@ -84,28 +84,20 @@ def understand_table(
 
 MOST_GROUPS = 12  # values of a column that may tell stations apart
 LEAST_APART_DB = 6.0  # beyond what levels of one group differ by between neighbours
-LEAST_PAIRS = 20
+NEAR, LEAST_ROWS = 4, 10  # neighbours looked at; rows of pairs within and between groups
 
 
 def groups_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> float:
     """How much more levels (n,) [dB] differ between neighbours (n, 2) of two groups than of one, median."""
-    same, other = np.full((2, len(level)), np.inf), np.full((2, len(level)), np.inf)
-    for value in np.unique(group):
-        inside, outside = np.flatnonzero(group == value), np.flatnonzero(group != value)
-        if len(inside) < LEAST_PAIRS or len(outside) < LEAST_PAIRS:
-            continue
-        near, which = cKDTree(places[inside]).query(places[inside], k=2)
-        same[:, inside] = near[:, 1], np.abs(level[inside] - level[inside[which[:, 1]]])
-        near, which = cKDTree(places[outside]).query(places[inside])
-        other[:, inside] = near, np.abs(level[inside] - level[outside[which]])
-    beside = np.isfinite(same[0]) & (other[0] <= 2 * np.maximum(same[0], np.median(same[0])))
-    if beside.sum() < LEAST_PAIRS:
+    if len(level) <= NEAR:
         return 0.0
-    return float(np.median(other[1, beside]) - np.median(same[1, beside]))
+    near = cKDTree(places).query(places, k=NEAR + 1)[1][:, 1:]
+    apart, same = np.abs(level[near] - level[:, None]), group[near] == group[:, None]
+    few = min(same.sum(), (~same).sum()) < NEAR * LEAST_ROWS
+    return 0.0 if few else float(np.median(apart[~same]) - np.median(apart[same]))
 
 
 TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
-NOT_HEARD = "below the weakest level; dataset.not_heard says otherwise"
 HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
 
 
@@ -151,9 +143,8 @@ class Builder:
         if np.isnan(values).all():
             self.refuse("no value in any row", columns[0].head or "")
         for text, count in self.sheet.marks.items():
-            self.notes.append(
-                Caution(f"{count} of {values.size} levels are {text!r}: taken as not heard, {NOT_HEARD}")
-            )
+            said = f"{count} of {values.size} levels are {text!r}: taken as not heard"
+            self.notes.append(Caution(f"{said}, below the weakest; dataset.not_heard=[] refuses them"))
         first = columns[0]
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
@@ -242,40 +233,31 @@ class Builder:
     def _groups(self, where: Places) -> None:
         """Warn of two groups of places far apart, and say which column tells them apart."""
         groups = None if where.degrees else two_groups(where.across)
-        if groups is None:
-            return
-        for head, words in self._unused().items():
+        for head, words in self._unused().items() if groups is not None else ():
             values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
             if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
-                said = (
-                    f"two groups of places {groups[1] / 1e3:.4g} km apart, as column {head!r} says: zones of "
-                )
-                self.notes.append(Caution(said + "a projection? give degrees, or a file for each"))
+                said = f"two groups of places {groups[1] / 1e3:.4g} km apart, as column {head!r} says"
+                self.notes.append(Caution(f"{said}: zones of a projection? give degrees, or a file for each"))
 
     def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
         """Warn of unused columns whose groups have levels of their own at the places of one station."""
         if measured not in LEVELS or self.arrays[measured].ndim > 1:
             return
-        level, scale = self.arrays[measured], np.ones(2)
-        if where.degrees:
-            scale[1] = np.cos(np.radians(np.nanmedian(where.across[:, 0])))
+        level = self.arrays[measured]
+        station = np.zeros(len(level), int) if station is None else station
+        stretch = np.cos(np.radians(np.nanmedian(where.across[:, 0]))) if where.degrees else 1.0
+        names = [column.head or "" for column in self.chosen.get("station", ())]
         for head, words in self._unused().items():
-            if about(head) or {*NO_LEVEL, *LEVEL_WORDS} & set(words_of(head)):
-                continue
             values, group = np.unique(words, return_inverse=True)
-            if len(values) > MOST_GROUPS:
+            if about(head) or (NO_LEVEL | LEVEL_WORDS) & set(words_of(head)) or len(values) > MOST_GROUPS:
                 continue
-            for t in (0,) if station is None else range(int(station.max()) + 1):
-                of = np.isfinite(level) & (words != "") & (True if station is None else station == t)
-                apart = groups_apart(where.across[of] * scale, level[of], group.reshape(-1)[of])
-                if apart > LEAST_APART_DB:
-                    columns = [c.head or "" for c in self.chosen.get("station", ())]
-                    said = (
-                        f"column {head!r} is not used, and levels at equal places differ by {apart:.0f} dB "
-                    )
-                    how = f"between its values: dataset.columns.station={'+'.join([*columns, head])}"
-                    self.notes.append(Caution(f"{said}{how} tells them apart"))
-                    break
+            known = np.isfinite(level) & (words != "")
+            of = [known & (station == t) for t in np.unique(station)]
+            apart = [groups_apart(where.across[t] * [1, stretch], level[t], group.reshape(-1)[t]) for t in of]
+            if max(apart) > LEAST_APART_DB:
+                said = f"levels at equal places differ by {max(apart):.0f} dB between values of column"
+                how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
+                self.notes.append(Caution(f"{said} {head!r}: {how}"))
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""

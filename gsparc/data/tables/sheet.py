@@ -263,7 +263,7 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
     lines = _with_heads(lines, comment, delimiter, source)
     lines, comment_notes = _without_comments(lines, delimiter, source)
-    lines, again_notes = _heads_once(lines, delimiter, source)
+    lines, again_notes = _heads_once(lines)
     notes += comment_notes + again_notes
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
@@ -342,22 +342,16 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
     return lines, []
 
 
-def _heads_once(lines: Lines, delimiter: str, source: str) -> tuple[Lines, list[str]]:
+def _heads_once(lines: Lines) -> tuple[Lines, list[str]]:
     """The lines without those that repeat the heads, as in files joined, and a note."""
     first, *below = lines
-    line, heads = lines[first].strip(), sorted(_cells(lines[first], delimiter))
-    again = [n for n in below if lines[n].strip("\ufeff \t") == line]
-    begin = [n for n in below if lines[n].startswith(tuple(filter(None, heads))) and n not in set(again)]
-    turned = [n for n in begin if sorted(_cells(lines[n], delimiter)) == heads]
-    if turned:
-        raise DataError(
-            f"{source}, line {turned[0]}: heads again, in another order; read the files one by one"
-        )
+    line = lines[first].strip()
+    again = {n for n in below if lines[n].strip("\ufeff \t") == line}
     if not again:
         return lines, []
-    where = lines_of([f"line {n}" for n in again])
-    what = f"{where}: the heads again; left out: are these files joined that belong together?"
-    return {n: text for n, text in lines.items() if n not in set(again)}, [Caution(what)]
+    where = lines_of([f"line {n}" for n in sorted(again)])
+    what = Caution(f"{where}: the heads again; left out: are these files joined that belong together?")
+    return {n: text for n, text in lines.items() if n not in again}, [what]
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
