@@ -92,9 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if name == "stations_file":
             args.stations_file = value
         elif "." not in name:
-            settings[name] = (
-                value if name == "absent" else [float(v) for v in re.findall(r"[-+.\de]+", value)]
-            )
+            marks = re.findall(r"[-+.\de]+", value)
+            settings[name] = value if name == "absent" else [float(mark) for mark in marks]
         else:
             columns[name.removeprefix("columns.")] = value
     if not args.path:
@@ -106,7 +105,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def picture(path: str) -> str | None:
         return None if args.no_draw else args.draw or f"outputs/check/{Path(path).resolve().stem}.png"
 
-    good = [
-        check(path, console, columns, args.stations_file, picture(path), **settings) for path in args.path
-    ]
+    given = {"columns": columns, "stations_file": args.stations_file, **settings}
+    good = [check(path, console, draw=picture(path), **given) for path in args.path]
     return 0 if all(good) else 1

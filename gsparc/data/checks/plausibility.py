@@ -67,9 +67,7 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     least, most = (f"{round(float(value), 6) + 0:g}" for value in different[[0, -1]])
     if counts[-1] > max(SATURATED * len(values), 10, 5 * counts[-2]):
         share = f"{counts[-1]} of {len(values)} levels are exactly {most}, the most"
-        warnings.append(
-            f"{share}: a receiver in saturation? the field is stronger there; leave these rows out"
-        )
+        warnings.append(f"{share}: a receiver in saturation? the field is stronger there; leave them out")
     if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, 5 * float(np.median(counts))):
         share = f"{counts[0]} of {len(values)} levels are exactly {least}"
         warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
@@ -131,10 +129,8 @@ def direction_warnings(levels: LinkLevels) -> list[str]:
         return []
     places = levels.station_position
     declared = _correlation(levels, places)
-    rivals = {
-        words: _correlation(levels, factor * places[:, axes[: places.shape[1]]])
-        for words, (factor, axes) in RIVALS.items()
-    }
+    turned = {words: factor * places[:, axes[: places.shape[1]]] for words, (factor, axes) in RIVALS.items()}
+    rivals = {words: _correlation(levels, place) for words, place in turned.items()}
     best = min(rivals, key=lambda words: rivals[words])
     if rivals[best] < min(STEEP, declared - BETTER):
         return [
@@ -175,9 +171,7 @@ def stuck(levels: LinkLevels) -> list[str]:
             if len(run) < STILL_ROWS or np.diff(np.percentile(level, [5, 95]))[0] < MOVES_DB:
                 continue
             if np.corrcoef(level[:-1], level[1:])[0, 1] > TREND:
-                what = (
-                    f"the place stands still for {len(run)} rows while levels move by {np.ptp(level):.0f} dB"
-                )
+                what = f"the place stands still for {len(run)} rows, levels move by {np.ptp(level):.0f} dB"
                 rows = f"{levels.rows[run[0]]} to {levels.rows[run[-1]]}"
                 found.append(f"{rows}: {what}: a stuck fix? leave these rows out")
     return found

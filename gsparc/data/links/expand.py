@@ -130,16 +130,13 @@ def _with_absent(check: Checker, measured: str, links: Links) -> tuple[Links, np
     arrays, count, rows = check.raw.arrays, len(links.stations), len(links.station)
     if measured != "rssi_db":
         check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
-    _, first = np.unique(links.place, return_index=True)
-    of_place = np.unique(links.place, return_inverse=True)[1].reshape(-1)
+    _, first, of_place = np.unique(links.place, return_index=True, return_inverse=True)
     lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + links.station)
     like = np.concatenate([np.arange(rows), first[lost // count]])
     station = np.concatenate([links.station, lost % count])
     arrays = take_rows(arrays, like, rows)
     arrays[measured] = np.where(np.arange(len(like)) < rows, arrays[measured], -np.inf)
-    if links.stations is not None:
-        end = f"{links.static_end}_position"
-        arrays[end] = links.stations.position[station]
+    arrays[f"{links.static_end}_position"] = links.stations.position[station]
     check.raw = replace(check.raw, arrays=arrays)
     check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
     run = None if links.run is None else links.run[like]
@@ -165,8 +162,7 @@ def _without_fix(check: Checker, measured: str) -> None:
         pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
         rows = len(arrays[measured]) if arrays[measured].ndim else 0
         if any(
-            part.shape[:1] != (rows,) or part.ndim != 2 - degrees or part.dtype.kind not in "iuf"
-            for part in pair
+            part.ndim != 2 - degrees or len(part) != rows or part.dtype.kind not in "iuf" for part in pair
         ):
             continue
         place = np.column_stack(pair)[:, :2]
@@ -208,10 +204,9 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
         floor = f"{values[~silent & np.isfinite(values)].min():.4g} dB, the weakest"
     for mark in marks if given is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
-        what = (
-            f"{share}, apart from all others: taken as not heard, below {floor}; dataset.not_heard=[] keeps "
-        )
-        check.notes.append(Caution(what + "them as levels, sensitivity_db gives another limit"))
+        said = f"{share}, apart from all others: taken as not heard, below {floor}"
+        say = "dataset.not_heard=[] keeps them as levels, sensitivity_db gives another limit"
+        check.notes.append(Caution(f"{said}; {say}"))
     return silent
 
 

@@ -119,10 +119,8 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
     if count.max() == 1:
         return carrier
     most = names[one[count.argmax(), 0]]
-    said = (
-        f"station {most} at {count.max()} carriers within {100 * (ONE_CARRIER - 1):.0f} % is one (and others)"
-    )
-    check.notes.append(f"{said}; dataset.columns.station=STATION+CARRIER tells them apart")
+    said = f"station {most} at {count.max()} carriers within {100 * (ONE_CARRIER - 1):.0f} % is one"
+    check.notes.append(f"{said}, and the like; dataset.columns.station=STATION+CARRIER tells them apart")
     ends = [different[np.array(bands) == number] for number in range(bands[-1] + 1)]
     return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
 

@@ -26,19 +26,7 @@ if TYPE_CHECKING:
 # What stands for no value, in small letters.
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "#n/a", "null", "none", "nil", "?", ".")
 # What stands for "not heard" in a cell of a level, however rare; other text does where it repeats.
-NOT_HEARD = (
-    "np",
-    "nd",
-    "n.d.",
-    "nh",
-    "oor",
-    "ns",
-    "-inf",
-    "not heard",
-    "no signal",
-    "not detected",
-    "no service",
-)
+NOT_HEARD = re.compile(r"n\.?[pdh]\.?|oor|-inf|not? (?:heard|signal|detected|service|coverage)")
 REPEATS = 3
 MEASURED = re.compile(r"\s*([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)\s*", re.IGNORECASE)
 SEXAGESIMAL = re.compile(
@@ -177,7 +165,9 @@ class Sheet:
 def _silent(text: str, count: int) -> bool:
     """Whether a text that is no number stands for "not heard" where `count` levels should."""
     plain = text.strip().lower()
-    return plain in NOT_HEARD or (count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain)))
+    return NOT_HEARD.fullmatch(plain) is not None or (
+        count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain))
+    )
 
 
 @contextmanager
@@ -331,14 +321,12 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
         usual = Counter(map(len, cells)).most_common(1)[0][0]
         roles = [sum(understand(cell).role is not None for cell in row) for row in cells[:MOST_ABOVE]]
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
-        above = [
-            len(row) != usual or 2 * sum(map(bool, map(str.strip, row))) <= usual for row in cells[:first]
-        ]
+        filled = [sum(bool(cell.strip()) for cell in row) for row in cells[:first]]
+        above = [len(row) != usual or 2 * n <= usual for row, n in zip(cells, filled, strict=False)]
         if usual > 1 and first and all(above) and not any(roles[:first]):
             kept = {n: line for n, line in lines.items() if n >= numbers[first]}
-            return kept, [
-                f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
-            ]
+            note = f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
+            return kept, [note]
     return lines, []
 
 
