@@ -185,6 +185,32 @@ CASES = {
         "",
     ),
     "a banner": ("App 2,site 7\nexported 2024\n" + wide(-999), {}, "the heads stand in line 3", "refused"),
+    "a banner with a role in it": (
+        "WigleWifi-1.6,model=x,device=x,display=kismet\n"
+        + table(
+            "MAC,Frequency,RSSI,CurrentLatitude,CurrentLongitude",
+            "a" * ROWS,
+            [2412] * ROWS,
+            LEVELS[:, 0],
+            NORTH,
+            EAST,
+        ),
+        {},
+        "2.412 GHz",
+        "refused",
+    ),
+    "a node and a cell": (
+        long("Cell ID,eNodeB ID", 1 + 0 * BAND, BAND),
+        {},
+        "2 stations, 2 of them at unknown places: 1 1, 1 0",
+        "",
+    ),
+    "a quality": (
+        table("x,y,quality", *PLACES.T, LEVELS[:, 0] + 110),
+        {},
+        "'quality' is a quality, not a level",
+        "",
+    ),
     "joined files": (wide("") + wide(""), {}, "line 242: the heads again; left out", "refused"),
     "a proper minus sign": (long("t", range(ROWS)).replace("-", "\N{MINUS SIGN}"), {}, "good", "refused"),
     "units in cells": (

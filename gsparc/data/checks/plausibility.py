@@ -68,7 +68,8 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     if counts[-1] > max(SATURATED * len(values), 10, 5 * counts[-2]):
         share = f"{counts[-1]} of {len(values)} levels are exactly {most}, the most"
         warnings.append(f"{share}: a receiver in saturation? the field is stronger there; leave them out")
-    if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, 5 * float(np.median(counts))):
+    usual = max(5 * float(np.median(counts)), 3 * counts[1])
+    if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, usual):
         share = f"{counts[0]} of {len(values)} levels are exactly {least}"
         warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
         values = values[values != different[0]]
@@ -185,7 +186,7 @@ def gathered(warnings: Sequence[str]) -> list[str]:
     """Warnings of which more than a few of one kind are one, counted."""
     kinds: dict[str, list[str]] = defaultdict(list)
     for text in warnings:
-        kinds[" ".join(re.sub(NAMES, " ", text).split())[:60]].append(text)
+        kinds[" ".join(re.sub(NAMES, " ", text).split())[:30]].append(text)
     gathered: list[str] = []
     for texts in kinds.values():
         more = f"{texts[0]} (and {len(texts) - 1} more warnings of this kind)"

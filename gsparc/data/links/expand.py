@@ -167,8 +167,10 @@ def _without_fix(check: Checker, measured: str) -> None:
             continue
         place = np.column_stack(pair)[:, :2]
         null = (place == 0).all(axis=1)
-        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(place[~null], axis=0).max(initial=0.0))
-        if null.all() or np.abs(np.median(place[~null], axis=0)).max() <= least:
+        if null.all():
+            continue
+        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(place[~null], axis=0).max())
+        if np.abs(np.median(place[~null], axis=0)).max() <= least:
             continue  # 0, 0 is a place, too, for who measures there
         _unknown_at_zero(check, degrees)
         if null.any():

@@ -203,6 +203,7 @@ def unit_of(text: str) -> tuple[str, Unit | None, str]:
 
 def words_of(text: str) -> list[str]:
     """Small words of a head: `RxPower_mean` is rx, power, mean."""
+    text = re.sub(r"(?i)(?<![a-z])([eg])node[ _-]?b", r"\1nb", text)  # eNodeB is one word
     apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
     apart = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", apart, flags=re.IGNORECASE)
     return [word for word in re.split(r"[^0-9a-zµμ°]+", apart.lower()) if word]

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.checks.outliers import two_groups
 from gsparc.data.errors import Caution, nearest, some
+from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS
 from gsparc.data.tables.cells import LOOKED_AT, merged
@@ -28,7 +29,7 @@ from gsparc.data.tables.columns import (
     schema_unit,
     station_names,
 )
-from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, about, words_of
+from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, PERCENT, about, words_of
 from gsparc.data.tables.places import (
     PER_STATION,
     UNKNOWN_HEIGHT,
@@ -129,9 +130,12 @@ class Builder:
         role = next((name for name in (*LEVELS, *CHANNELS, *POLAR) if name in self.chosen), None)
         if role is None:
             fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
-            loss = next((h for h in self.sheet.heads if {"loss", "pathloss"} & set(words_of(h))), None)
-            hint = "COLUMN" if loss is None else f"{loss}*-1 takes losses for levels"
-            return self.refuse(f"{fault}; say dataset.columns.rssi_db={hint}")
+            for head in self.sheet.heads:
+                if {"loss", "pathloss"} & set(words_of(head)):
+                    return self.refuse(f"{fault}; dataset.columns.rssi_db={head}*-1 takes losses for levels")
+                if {"quality", "percent", "pct"} & set(words_of(head)):
+                    return self.refuse(f"{fault}; {head!r} is {PERCENT}")
+            return self.refuse(f"{fault}; say dataset.columns.rssi_db=COLUMN")
         if role not in LEVELS:
             self._channels(CHANNELS if role in CHANNELS else POLAR)
             return role
@@ -477,6 +481,9 @@ class Builder:
         self.sheet.refuse_rows(
             column.head, np.flatnonzero(np.isnan(values)), "no value; expected a frequency"
         )
+        if column.unit is None and column.word and np.nanmin(values) >= 100 and np.nanmax(values) < LOWEST_HZ:
+            values = 1e6 * values
+            self.notes.append(f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz")
         same = len(np.unique(values)) == 1
         self.arrays["carrier_hz"] = values[0] if same else values
         if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:

@@ -323,7 +323,7 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
         filled = [sum(bool(cell.strip()) for cell in row) for row in cells[:first]]
         above = [len(row) != usual or 2 * n <= usual for row, n in zip(cells, filled, strict=False)]
-        if usual > 1 and first and all(above) and not any(roles[:first]):
+        if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
             kept = {n: line for n, line in lines.items() if n >= numbers[first]}
             note = f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
             return kept, [note]
