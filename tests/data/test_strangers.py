@@ -12,7 +12,7 @@ from rich.console import Console
 from scipy.io import savemat
 
 from gsparc.commands.check import check
-from gsparc.data.datasets.own import read_any
+from gsparc.data.datasets.own import Own, read_any
 from gsparc.data.own import write_own
 
 GIVEN = Path(__file__).parents[3] / "shared" / "data" / "strangers"
@@ -269,6 +269,16 @@ def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):
     assert data.censored.sum() == 394 and (data.censored == DEAF.ravel()).all()
     level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
     assert abs(level[~data.censored].min() - LEVELS[~DEAF].min()) < 1e-3  # of float32
+
+
+def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
+    path = write(long("Storey", FLOOR, level=ALONG, places=STUCK))
+    Own(path).load()
+    warned = [
+        line.removeprefix("warning").strip() for line in said(path).splitlines() if line.startswith("warning")
+    ]
+    logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warned) > 2 and all(any(text in line for line in logged) for text in warned), warned
 
 
 def test_absent_links_are_silent_only_where_somebody_says_so(write):

@@ -71,8 +71,15 @@ class Campaign(DataModule):
         return reading.data
 
 
+MOST_LINKS = 1_000_000  # of places and stations; all are held at once
+
+
 def _implausible(data: Measurements) -> list[str]:
-    """What `gsparc check` warns of."""
+    """What `gsparc check` warns of, where that takes seconds."""
+    stations = 1 if data.site.stations is None else len(data.site.stations)
+    places = len(data) if data.place is None else len(np.unique(data.place))
+    if places * stations > MOST_LINKS:
+        return ["too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data)
     return [] if levels is None else plausibility_warnings(levels, steps_of(levels))
 

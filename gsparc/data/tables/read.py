@@ -237,7 +237,9 @@ class Builder:
     def _groups(self, where: Places) -> None:
         """Warn of two groups of places far apart, and say which column tells them apart."""
         groups = None if where.degrees else two_groups(where.across)
-        for head, words in self._unused().items() if groups is not None else ():
+        if groups is None:
+            return
+        for head, words in self._unused().items():
             values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
             if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
                 said = f"two groups of places {groups[1] / 1e3:.4g} km apart, as column {head!r} says"
