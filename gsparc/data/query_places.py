@@ -32,6 +32,7 @@ class QueryPlaces:
         ends: places (n,) of each end that moves, as they were given.
         rows: (n,) what messages call each.
         station: (n,) names; None where the file names none.
+        plain: (n,) the same without what several columns may add to them.
         name: (n,) what a user calls each, where a column says so; else None.
         notes: what was guessed or not used, one line each.
         table: the columns of a table in order: head, quantity that was read out of it or None, text (n,).
@@ -41,6 +42,7 @@ class QueryPlaces:
     ends: dict[End, Places]
     rows: tuple[str, ...]
     station: np.ndarray | None = None
+    plain: np.ndarray | None = None
     name: np.ndarray | None = None
     notes: tuple[str, ...] = ()
     table: tuple[tuple[str, str | None, np.ndarray], ...] = ()
@@ -122,11 +124,12 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
     station = _words(sheet, chosen, "station")
+    plain = None if station is None else sheet.words(chosen["station"][0].head or "")
     sheet.problems.raise_if_any()
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
     table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads if head)
-    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, name, (*notes, *guessed), table))
+    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, plain, name, (*notes, *guessed), table))
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:

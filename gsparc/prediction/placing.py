@@ -126,7 +126,9 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[n
     numbers = {
         name: number for number, name in enumerate(names)
     }  # by name alone: a number is a name, or wrong
-    number = np.array([numbers.get(word, -1) for word in queries.station.tolist()], np.int64)
+    plain = queries.station if queries.plain is None else queries.plain
+    words = zip(queries.station.tolist(), plain.tolist(), strict=True)
+    number = np.array([numbers.get(word, numbers.get(short, -1)) for word, short in words], np.int64)
     if (number < 0).any():
         row = int(np.argmax(number < 0))
         word = str(queries.station[row])

@@ -111,7 +111,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
             run=None if run is None else np.repeat(run, count),
         )  # fmt: skip
     of_level = links.station  # a station at two carriers has one level
-    links = by_carrier(check, links, carriers, rows)
+    links = by_carrier(check, links, carriers, rows, hopping=measured in POWERS)
     check.raw.arrays[f"{OTHER[moving]}_position"] = links.stations.position[links.station]  # type: ignore[union-attr, index]
     if links.stations is not None and links.stations.rotation is not None:
         if OTHER[moving] == "tx":

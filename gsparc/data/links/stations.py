@@ -125,8 +125,8 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
     return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
 
 
-def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: int) -> Links:
-    """Stations at several carriers as one station for each."""
+def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: int, hopping: bool) -> Links:
+    """Stations at several carriers as one station for each; where `hopping`, carriers of a band are one."""
     assert links.stations is not None and links.station is not None
     if carriers is None or carriers.ndim == 0:
         return links
@@ -143,7 +143,7 @@ def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: 
                 "carrier_hz: as many values as rows and as stations; taken as one for each row"
             )
         of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, len(stations))
-    of_link = _of_one(check, station, of_link, stations.name)
+    of_link = _of_one(check, station, of_link, stations.name) if hopping else of_link
     pairs, which = np.unique(np.stack([station, of_link], 1), axis=0, return_inverse=True)
     first, carrier = pairs[:, 0].astype(np.int64), pairs[:, 1]
     check.raw.arrays.pop("carrier_hz")

@@ -127,7 +127,7 @@ def choose(
     for role, found in guesses.items():
         candidates = [column for column in found if not column.less] or found
         if role == "station":
-            candidates = _identity(sheet, candidates)
+            candidates = _identity(sheet, candidates, always=only is not None)
         one_each = role in (*CHANNELS, *POLAR) or "station" not in {
             **chosen,
             **guesses,
@@ -169,8 +169,8 @@ def station_names(sheet: Sheet, columns: Iterable[Column]) -> np.ndarray:
     return np.array(names, dtype=str)
 
 
-def _identity(sheet: Sheet, candidates: list[Column]) -> list[Column]:
-    """A station's column and those that tell it from others of its name; the same where it needs none."""
+def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Column]:
+    """A station's column and those that tell it from others of its name, `always` or where some do."""
     for first in candidates:
         parts = TOGETHER.get(first.word, set())
         bare = {head: set(words_of(head)) - {*LABELS, *PLAIN} for head in sheet.heads if head != first.head}
@@ -181,7 +181,7 @@ def _identity(sheet: Sheet, candidates: list[Column]) -> list[Column]:
         for head in more:
             longer = [*columns, replace(first, head=head)]
             fewer, many = (len(set(station_names(sheet, some).tolist())) for some in (columns, longer))
-            if fewer < many <= len(sheet) // REPEATED:
+            if always or fewer < many <= len(sheet) // REPEATED:
                 columns = longer
         return columns if len(columns) == 1 else [replace(column, label=JOINED) for column in columns]
     return candidates
