@@ -74,6 +74,12 @@ CASES = {
     ),
     "a mark far below": (wide(-999), {}, "exactly -999, apart from all others: taken as not heard", ""),
     "a mark at zero": (wide(0), {}, "levels are exactly 0, apart from all others", ""),
+    "rows beside a station": (
+        long("t", range(ROWS), level=np.where(np.arange(ROWS) < 5, -20, np.minimum(LEVELS[:, 0], -55))),
+        {},
+        "good",
+        "not heard",
+    ),
     "a mark beyond any level": (wide(100000), {}, "394 of 720 levels are exactly 100000", "refused"),
     "a mark just below": (wide(-105), {}, "394 of 720 levels are exactly -105, apart", ""),
     "a text": (wide("No Service"), {}, "394 of 720 levels are 'No Service': taken as not heard", "refused"),

@@ -93,8 +93,9 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
 def not_heard(values: np.ndarray) -> list[float]:
     """Of levels (n,) [dB] those that repeat exactly and lie apart from all others: marks, not levels.
 
-    At either end two dozen decibels apart, and far beside the spread of the rest; at the lower end a
-    pile needs only a gap, as a receiver's own levels have none.
+    At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end not below 0,
+    as rows beside a station are strong; at the lower end a pile needs only a gap, as a receiver's own levels
+    have none.
     """
     marks: list[float] = []
     rest = values[np.isfinite(values)]
@@ -108,7 +109,7 @@ def not_heard(values: np.ndarray) -> list[float]:
         piled = counts[0] > max(PILE * len(rest), 10) and counts[0] > 5 * float(np.median(counts))
         piled = piled and steps[0] >= usual
         enough = (steps[[0, -1]] > np.maximum(APART_DB, 0.3 * np.array(spans))) & (counts[[0, -1]] >= REPEATS)
-        found = different[[0, -1]][enough | [piled, False]].tolist()
+        found = different[[0, -1]][enough & [True, different[-1] >= 0] | [piled, False]].tolist()
         if not found:
             return marks
         marks += found

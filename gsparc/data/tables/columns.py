@@ -81,7 +81,9 @@ class Column(Head):
             wanted = f"one of {known(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
             remedy = PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
             return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
-        return sheet.numbers(self.head, self.unit, lambda unit: suits(self.role, unit), self.role in LEVELS)
+        return sheet.numbers(
+            self.head, self.unit, lambda unit: suits(self.role, unit), self.role == "rssi_db"
+        )
 
 
 Chosen = dict[str, tuple[Column, ...]]
