@@ -108,7 +108,6 @@ class Sheet:
         if pd.api.types.is_bool_dtype(column.dtype):
             return self.refuse("holds True and False; expected numbers", head)
         read: dict[str, float | None] = {}
-        quiet: set[str] = set()
         if pd.api.types.is_numeric_dtype(column.dtype):
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
             bad = (values == np.inf) | (np.isinf(values) & (not levels))
@@ -123,16 +122,13 @@ class Sheet:
                 bad[bad] = self.words(head)[bad] != ""
                 counts = Counter(cells[i] for i in np.flatnonzero(bad))
                 before = len(self.problems)
-                read = {text: self._read(text, suits, head) for text in counts}
+                read = {text: self._read(text, count * levels, suits, head) for text, count in counts.items()}
                 if len(self.problems) > before:
                     return None
-                quiet = {text for text, count in counts.items() if levels and _silent(text, count)}
-                self.marks.update({text.strip(): counts[text] for text in quiet})
         values = values if unit is None else unit.convert(values)
         if read:
-            of_text = {**read, **dict.fromkeys(quiet, -np.inf)}
-            understood = [i for i in np.flatnonzero(bad) if of_text[cells[i]] is not None]
-            values[understood] = [of_text[cells[i]] for i in understood]
+            understood = [i for i in np.flatnonzero(bad) if read[cells[i]] is not None]
+            values[understood] = [read[cells[i]] for i in understood]
             bad[understood] = False
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
@@ -144,8 +140,14 @@ class Sheet:
             return self.problems.add_rows(self.where(head), rows, what)
         return values
 
-    def _read(self, text: str, suits: Callable[[Unit], bool], head: str) -> float | None:
-        """The number of a cell with a unit, or of degrees, minutes and seconds; None where it is none."""
+    def _read(self, text: str, count: int, suits: Callable[[Unit], bool], head: str) -> float | None:
+        """The number of a cell with a unit, or of degrees, minutes and seconds; None where it is none.
+
+        Text that `count` cells of a level hold may stand for "not heard": minus infinity.
+        """
+        if count and _silent(text, count):
+            self.marks[text.strip()] += count
+            return -np.inf
         measured = MEASURED.fullmatch(text)
         unit = UNITS.get(measured[2].lower()) if measured and measured[2] else Unit("", "")
         if measured and unit is not None and (not measured[2] or suits(unit)):
