@@ -26,11 +26,7 @@ from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
-COMPLEX = (
-    ("real", "imag"),
-    ("re", "im"),
-    ("r", "i"),
-)  # fields of compounds that MATLAB, Octave and others write
+COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
 DAMAGED = (
@@ -69,9 +65,7 @@ def read_raw(path: str | Path) -> Raw:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(
-            f"{path}: no such file; expected *.npz, *.h5, *.hdf5, *.mat, or Parquet with dataset.cell_m"
-        )
+        raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.mat, or Parquet with dataset.cell_m")
     if path.suffix.lower() == ".npz":
         return _read_npz(path)
     if path.suffix.lower() in HDF5_SUFFIXES:
@@ -234,11 +228,8 @@ def _read_hdf5(path: Path) -> Raw:
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
                     text = h5py.check_string_dtype(item.dtype)
-                    arrays[name] = (
-                        on_disk(item)
-                        if not (text or item.dtype.names) and is_big(item)
-                        else _values(item, fixed=True)
-                    )
+                    plain = not text and not item.dtype.names
+                    arrays[name] = on_disk(item) if plain and is_big(item) else _values(item, fixed=True)
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
@@ -277,7 +268,7 @@ def _read_mat(path: Path) -> Raw:
 def _values(item: h5py.Dataset, fixed: bool = False) -> np.ndarray:
     """Values of a dataset; text of variable length, and `fixed` where wanted, as text, compounds complex."""
     text = h5py.check_string_dtype(item.dtype)
-    if item.dtype.names and tuple(name.lower() for name in item.dtype.names) in COMPLEX:
+    if item.dtype.names and " ".join(item.dtype.names).lower() in COMPLEX:
         parts = item[()]
         return np.asarray(parts[item.dtype.names[0]] + 1j * parts[item.dtype.names[1]])
     return np.asarray(item.asstr()[()] if text and (fixed or text.length is None) else item[()])

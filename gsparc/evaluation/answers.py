@@ -259,9 +259,7 @@ def _in_order(
     ordered: dict[str, np.ndarray] = {}
     for head, role, words in queries.table:
         axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
-        known = [
-            name for name in (axis, axis.replace("z", "height")) if name in columns and name not in ordered
-        ]
+        known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*ordered}]
         if role is not None and known:
             ordered[known[0]] = columns[known[0]]
         elif role is None:

@@ -81,9 +81,8 @@ class Column(Head):
             wanted = f"one of {known(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
             remedy = PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
             return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
-        return sheet.numbers(
-            self.head, self.unit, lambda unit: suits(self.role, unit), self.role == "rssi_db"
-        )
+        marks = self.role == "rssi_db"
+        return sheet.numbers(self.head, self.unit, lambda unit: suits(self.role, unit), marks)
 
 
 Chosen = dict[str, tuple[Column, ...]]
@@ -130,10 +129,8 @@ def choose(
         candidates = [column for column in found if not column.less] or found
         if role == "station":
             candidates = _identity(sheet, candidates, always=only is not None)
-        one_each = role in (*CHANNELS, *POLAR) or "station" not in {
-            **chosen,
-            **guesses,
-        }  # of a row: tones, or stations
+        tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
+        one_each = tones or "station" not in {**chosen, **guesses}
         several = role in MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
         several &= len({column.word for column in candidates}) == 1
         several |= role == "station" and candidates[0].label == JOINED

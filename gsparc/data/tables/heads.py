@@ -216,9 +216,8 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
         return Head(joined, unit=unit, word=joined)
     if joined in OTHER_NAMES:
         return Head(OTHER_NAMES[joined], unit=unit, word=joined)
-    return (
-        _axis(rest, unit) or _level(words, unit, plain) or _channel(words, unit, plain) or _text(words, unit)
-    )
+    measured = _level(words, unit, plain) or _channel(words, unit, plain)
+    return _axis(rest, unit) or measured or _text(words, unit)
 
 
 def _axis(rest: list[str], unit: Unit | None) -> Head | None:

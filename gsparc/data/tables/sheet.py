@@ -167,9 +167,8 @@ class Sheet:
 def _silent(text: str, count: int) -> bool:
     """Whether a text that is no number stands for "not heard" where `count` levels should."""
     plain = text.strip().lower()
-    return NOT_HEARD.fullmatch(plain) is not None or (
-        count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain))
-    )
+    repeats = count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain))
+    return repeats or NOT_HEARD.fullmatch(plain) is not None
 
 
 @contextmanager
