@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
-from gsparc.data.errors import DataError
+from gsparc.data.errors import Caution, DataError
 
-SETTINGS = ("dataset.stations_file=", "dataset.columns.")
+SETTINGS = ("dataset.stations_file=", "dataset.columns.", "dataset.not_heard=", "dataset.absent=")
 
 
 def check(
@@ -19,22 +21,23 @@ def check(
     columns: Mapping[str, str] | None = None,
     stations_file: str | None = None,
     draw: str | None = None,
+    **settings: Any,
 ) -> bool:
     """Write what was understood of a file, or its problems one per line; returns whether it is good.
 
     Args:
-        path, columns, stations_file: see `read_any`.
+        path, columns, stations_file, settings: see `read_any`.
         console: where lines go.
         draw: PNG file for a map; None draws none.
     """
     # Here: they bring torch, which --help does not need.
     from gsparc.data.checks.describe import describe
-    from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
+    from gsparc.data.checks.plausibility import gathered, link_levels, plausibility_warnings, steps_of
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
 
     try:
-        reading = read_any(path, columns, stations_file)
+        reading = read_any(path, columns, stations_file, **settings)
     except DataError as error:
         count = len(error.problems)
         for line in [*error.problems, f"{path}: refused, {count} problem{'s' * (count > 1)}"]:
@@ -42,9 +45,11 @@ def check(
         return False
     levels = link_levels(reading.data)
     steps = [] if levels is None else steps_of(levels)
-    warnings = [] if levels is None else plausibility_warnings(levels, steps)
-    topics = [*describe(reading.data), *(("note", note) for note in reading.notes)]
-    for topic, sentence in [*topics, *(("warning", warning) for warning in warnings)]:
+    warnings: list[str] = [note for note in reading.notes if isinstance(note, Caution)]
+    warnings += [] if levels is None else plausibility_warnings(levels, steps)
+    topics = describe(reading.data)
+    topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
+    for topic, sentence in [*topics, *(("warning", warning) for warning in gathered(warnings))]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
@@ -82,11 +87,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--no-draw", action="store_true", help="no map of places, levels and what looks wrong")
     args = parser.parse_intermixed_args(arguments)
     columns = dict(text.partition("=")[::2] for text in args.column)
+    settings: dict[str, Any] = {}
     for text in [text for text in args.path if text.startswith(SETTINGS)]:  # as refusals and notes say them
         name, _, value = text.removeprefix("dataset.").partition("=")
         args.path.remove(text)
         if name == "stations_file":
             args.stations_file = value
+        elif "." not in name:
+            marks = re.findall(r"[-+.\de]+", value)
+            settings[name] = value if name == "absent" else [float(mark) for mark in marks]
         else:
             columns[name.removeprefix("columns.")] = value
     if not args.path:
@@ -98,5 +107,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def picture(path: str) -> str | None:
         return None if args.no_draw else args.draw or f"outputs/check/{Path(path).resolve().stem}.png"
 
-    good = [check(path, console, columns, args.stations_file, picture(path)) for path in args.path]
+    given = {"columns": columns, "stations_file": args.stations_file, **settings}
+    good = [check(path, console, draw=picture(path), **given) for path in args.path]
     return 0 if all(good) else 1

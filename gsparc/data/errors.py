@@ -23,6 +23,18 @@ def some(names: Sequence[Any], count: int = 5) -> str:
     return ", ".join(map(str, names[:count])) + more
 
 
+def lines_of(rows: Sequence[str], count: int = 5) -> str:
+    """The names of rows (`line 2`, `row 7`), neighbours as `lines 2 to 20`, at most `count` pieces."""
+    numbers = [int(last) if (last := name.rpartition(" ")[2]).isdigit() else -9 for name in rows]
+    starts = [i for i in range(len(rows)) if i == 0 or numbers[i] != numbers[i - 1] + 1 or numbers[i] < 0]
+    pieces = []
+    for first, after in zip(starts, [*starts[1:], len(rows)], strict=True):
+        what, number = rows[first].rpartition(" ")[::2]
+        one = after - first == 1
+        pieces.append(rows[first] if one else f"{what}s {number} to {rows[after - 1].rpartition(' ')[2]}")
+    return some(pieces, count)
+
+
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     """`; did you mean 'gp'?`, or nothing when no known name is close."""
     close = difflib.get_close_matches(name, known, 1, cutoff)
@@ -35,6 +47,10 @@ def reason(error: BaseException) -> str:
         return "brackets within brackets, too many"
     text = " ".join(str(error).split()).partition("; use sys.set_int_max_str_digits")[0]
     return text or type(error).__name__
+
+
+class Caution(str):
+    """A remark of a reader that something may be wrong: `gsparc check` and runs print it as a warning."""
 
 
 class DataError(ValueError):

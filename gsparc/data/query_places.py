@@ -14,7 +14,7 @@ from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import ENDS, End
 from gsparc.data.tables import is_table
-from gsparc.data.tables.columns import Chosen, choose
+from gsparc.data.tables.columns import Chosen, choose, station_names
 from gsparc.data.tables.heads import AXES
 from gsparc.data.tables.places import Places, places
 from gsparc.data.tables.read import NOTHING
@@ -32,16 +32,20 @@ class QueryPlaces:
         ends: places (n,) of each end that moves, as they were given.
         rows: (n,) what messages call each.
         station: (n,) names; None where the file names none.
+        plain: (n,) the same without what several columns may add to them.
         name: (n,) what a user calls each, where a column says so; else None.
         notes: what was guessed or not used, one line each.
+        table: the columns of a table in order: head, quantity that was read out of it or None, text (n,).
     """
 
     source: str
     ends: dict[End, Places]
     rows: tuple[str, ...]
     station: np.ndarray | None = None
+    plain: np.ndarray | None = None
     name: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    table: tuple[tuple[str, str | None, np.ndarray], ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -120,9 +124,12 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
     station = _words(sheet, chosen, "station")
+    plain = None if station is None else sheet.words(chosen["station"][0].head or "")
     sheet.problems.raise_if_any()
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
-    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, name, (*notes, *guessed)))
+    role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
+    table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads if head)
+    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, plain, name, (*notes, *guessed), table))
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:
@@ -137,8 +144,7 @@ def _missing(sheet: Sheet, end: End, both: bool) -> str:
 def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
     if role not in chosen:
         return None
-    head = chosen[role][0].head or ""
-    words = sheet.words(head)
+    head, words = chosen[role][0].head or "", station_names(sheet, chosen[role])
     sheet.refuse_rows(head, np.flatnonzero(words == ""), f"no {role}; expected its name")
     return words
 

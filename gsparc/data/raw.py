@@ -27,13 +27,14 @@ import numpy as np
 from numpy.lib.format import MAGIC_PREFIX
 from numpy.lib.format import read_array_header_1_0 as header_1
 from numpy.lib.format import read_array_header_2_0 as header_2
-from scipy.io import netcdf_file
+from scipy.io import loadmat, netcdf_file
 
 from gsparc.data.blocks import BIG, contents, is_big, memory, on_disk
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
 DAMAGED = (
@@ -65,20 +66,22 @@ class Noted(NamedTuple):
 
 
 def read_raw(path: str | Path) -> Raw:
-    """Read every array of an npz or HDF5 file.
+    """Read every array of an npz, HDF5 or MATLAB file.
 
     Raises:
         DataError: no such file, another format, damaged, or Python objects inside.
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.hdf5, or Parquet with dataset.cell_m")
+        raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.mat, or Parquet with dataset.cell_m")
     if path.suffix.lower() == ".npz":
         return _read_npz(path)
     if path.suffix.lower() in HDF5_SUFFIXES:
         return _read_hdf5(path)
+    if path.suffix.lower() == ".mat":
+        return _read_mat(path)
     suffix = path.suffix or "no ending"
-    raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5, found {suffix}")
+    raise DataError(f"{path}: expected a name ending in .npz, .h5, .hdf5 or .mat, found {suffix}")
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:
@@ -255,7 +258,8 @@ def _read_hdf5(path: Path) -> Raw:
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
                     text = h5py.check_string_dtype(item.dtype)
-                    arrays[name] = on_disk(item) if not text and is_big(item) else _values(item, fixed=True)
+                    plain = not text and not item.dtype.names
+                    arrays[name] = on_disk(item) if plain and is_big(item) else _values(item, fixed=True)
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
@@ -274,9 +278,31 @@ def _read_hdf5(path: Path) -> Raw:
     return raw
 
 
+def _read_mat(path: Path) -> Raw:
+    """Arrays of a MATLAB file without their axes of length 1, text as attributes."""
+    if h5py.is_hdf5(path):  # version 7.3 writes HDF5, the axes of arrays in reverse
+        arrays = {name: array.T for name, array in _read_hdf5(path).arrays.items()}
+        with h5py.File(path, "r") as file:
+            text = {name for name in arrays if _plain(file[name].attrs.get("MATLAB_class")) == "char"}
+        arrays |= {name: np.array([*map(chr, arrays[name].ravel())]) for name in text}
+    else:
+        try:
+            content = loadmat(path)
+        except (*DAMAGED, IndexError) as error:
+            raise DataError(f"{path}: damaged or not a MATLAB file ({reason(error)})") from None
+        arrays = {name: array for name, array in content.items() if not name.startswith("__")}
+    words = {name: "".join(array.ravel()) for name, array in arrays.items() if array.dtype.kind == "U"}
+    for name in [name for name, array in arrays.items() if array.dtype.kind in "OV"]:
+        raise DataError(f"{path}, {name}: cells or structures; expected plain arrays of numbers")
+    return Raw({name: array.squeeze() for name, array in arrays.items() if name not in words}, words)
+
+
 def _values(item: h5py.Dataset, fixed: bool = False) -> np.ndarray:
-    """Values of a dataset; text of variable length, and `fixed` where wanted, as text."""
+    """Values of a dataset; text of variable length, and `fixed` where wanted, as text, compounds complex."""
     text = h5py.check_string_dtype(item.dtype)
+    if item.dtype.names and " ".join(item.dtype.names).lower() in COMPLEX:
+        parts = item[()]
+        return np.asarray(parts[item.dtype.names[0]] + 1j * parts[item.dtype.names[1]])
     return np.asarray(item.asstr()[()] if text and (fixed or text.length is None) else item[()])
 
 

@@ -47,6 +47,7 @@ _LISTED = [
     *(Unit(n, "power", f) for n, f in (("W", 1.0), ("mW", 1e-3), ("uW", 1e-6), ("µW", 1e-6), ("nW", 1e-9))),
     *(Unit(n, "power", f) for n, f in (("pW", 1e-12), ("fW", 1e-15))),
     *(Unit("dB", "level"), Unit("dBm", "level"), Unit("dBW", "level", offset=30.0)),
+    *(Unit(name, "quality") for name in ("%", "percent", "pct")),
 ]
 # Without case: nobody receives megawatts.
 UNITS = {unit.name.lower(): unit for unit in _LISTED} | {"μw": Unit("µW", "power", 1e-6)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +21,7 @@ from gsparc.data.schema import End, Kind, Site
 from gsparc.data.units import PowerUnit
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction
-from gsparc.prediction.placing import far_outside, in_a_speck, in_world, stations_of, with_heights
+from gsparc.prediction.placing import far_outside, in_a_speck, in_height, in_world, stations_of, with_heights
 from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
@@ -88,9 +89,10 @@ def predict(
         log.warning("%s: %s", places, speck)
     if far.any():
         log.warning(
-            "%s: %d of %d places lie more than %.3g m outside the box of the training places, the first in "
+            "%s: %d of %d places lie more than %.3g m outside the box of the training places%s, the first in "
             "%s: expect little of the predictions there",
-            places, int(far.sum()), len(far), margin, queries.rows[int(np.argmax(far))],
+            places, int(far.sum()), len(far), margin, in_height(world, site, far),
+            queries.rows[int(np.argmax(far))],
         )  # fmt: skip
     power = site.power_unit(predictor.unit) if site.kind == "rssi" else None
     write(path, queries, predictions, site.kind, power)
@@ -227,6 +229,7 @@ def write(
         columns |= _entries(predictions.mean)
     columns |= {} if predictions.confidence is None else {"confidence": predictions.confidence}
     if not archive:
+        columns = _in_order(columns, queries, predictions)
         write_samples(path, {name: _cells(values) for name, values in columns.items()})
         return
     with whole_file(path) as partial, partial.open("wb") as file:
@@ -242,6 +245,21 @@ def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]
         for axis, values in zip(axes, where.all().T, strict=True):
             columns[before + axis] = values[predictions.place]
     return columns if predictions.station is None else {**columns, "station": predictions.station}
+
+
+def _in_order(
+    columns: dict[str, np.ndarray], queries: QueryPlaces, predictions: Answers
+) -> dict[str, np.ndarray]:
+    """The columns of a table of places in its order, those that were not read as they are, then the rest."""
+    ordered: dict[str, np.ndarray] = {}
+    for head, role, words in queries.table:
+        axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
+        known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*ordered}]
+        if role is not None and known:
+            ordered[known[0]] = columns[known[0]]
+        elif role is None:
+            ordered[f"{head} (given)" if head in columns else head] = words[predictions.place]
+    return {**ordered, **{name: values for name, values in columns.items() if name not in ordered}}
 
 
 def _entries(channels: np.ndarray) -> dict[str, np.ndarray]:

@@ -73,6 +73,21 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
     return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
 
 
+def in_height(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
+    """In words that places which are `far` (n,) outside are so only in height; empty: they are not."""
+    low, high = site.moving_box[:, 2::3] + site.origin[2]
+    ends = [end for end in ("tx", "rx") if end in world]
+    heights = np.column_stack([world[end][:, 2] for end in ends])
+    inside = np.clip(heights, low, high)
+    flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(ends)}
+    if far_outside(flat, site)[0].any():
+        return ""
+    beyond = (heights - inside)[far].ravel()
+    most = float(beyond[np.abs(beyond).argmax()])
+    side = "above" if most > 0 else "below"
+    return f", {abs(most):,.0f} m {side}, only in height: above the sea, or the ground?"
+
+
 def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
     """In words that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
     metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
@@ -111,7 +126,9 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[n
     numbers = {
         name: number for number, name in enumerate(names)
     }  # by name alone: a number is a name, or wrong
-    number = np.array([numbers.get(word, -1) for word in queries.station.tolist()], np.int64)
+    plain = queries.station if queries.plain is None else queries.plain
+    words = zip(queries.station.tolist(), plain.tolist(), strict=True)
+    number = np.array([numbers.get(word, numbers.get(short, -1)) for word, short in words], np.int64)
     if (number < 0).any():
         row = int(np.argmax(number < 0))
         word = str(queries.station[row])

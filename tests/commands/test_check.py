@@ -5,7 +5,6 @@ import pytest
 from rich.console import Console
 
 from gsparc.commands.check import check, main
-from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import write_own
 
@@ -65,17 +64,17 @@ def test_degrees_in_place_of_metres_were_good(tmp_path):
     )
 
 
-def test_a_place_without_a_fix_is_refused(tmp_path):
-    """It was refused for its 11,000 km in metres, which no column of the file holds."""
+def test_a_place_without_a_fix_is_left_out_and_named(tmp_path):
+    """It was refused for its 11,000 km in metres, later by the number of the first such row alone."""
     rng = np.random.default_rng(0)
     fix = {"latitude": rng.uniform(40.76, 40.8, 50), "longitude": rng.uniform(-111.84, -111.8, 50)}
-    fix["latitude"][7] = fix["longitude"][7] = 0
+    fix["latitude"][[7, 8, 9, 20]] = fix["longitude"][[7, 8, 9, 20]] = 0
     arrays = {**fix, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
-    with pytest.raises(DataError, match="row 7: latitude and longitude are 0: no fix"):
-        write_own(tmp_path / "a.npz", arrays)
+    assert len(write_own(tmp_path / "a.npz", arrays)) == 46
+    assert "rows 7 to 9, row 20: latitude and longitude are 0: no fix" in _said(tmp_path / "a.npz")[1]
     at_sea = {name: fix[name] - middle for name, middle in (("latitude", 40.78), ("longitude", -111.82))}
     at_sea["latitude"][7] = at_sea["longitude"][7] = 0
-    write_own(tmp_path / "b.npz", {**arrays, **at_sea})  # measured around that very place
+    assert len(write_own(tmp_path / "b.npz", {**arrays, **at_sea})) == 50  # measured around that very place
 
 
 def test_receivers_in_one_plane_are_noted(tmp_path, arrays):

@@ -333,6 +333,28 @@ def test_places_far_outside_are_counted(town, tmp_path, caplog):
     assert "2 of 4 places lie more than" in caplog.text and "the first in line 4" in caplog.text
 
 
+def test_heights_above_the_sea_were_only_outside_the_box(town, tmp_path, caplog):
+    file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1615.5], [5, 7, 1612]])
+    predict(town, file)
+    assert "1,614 m above, only in height" in caplog.text
+
+
+def test_columns_of_a_users_own_were_left_out_of_the_predictions(town, tmp_path):
+    (tmp_path / "a.csv").write_text("note,station,x,rssi_db,y,z\nwall,mast,1,-70,2,1.5\n,roof-0,3,,4,1.5\n")
+    predict(town, tmp_path / "a.csv")
+    rows = read(tmp_path / "a.predicted.csv")
+    heads = ["note", "station", "x", "rssi_db (given)", "y", "z", "rssi_db"]
+    assert list(rows[0])[:7] == heads and rows[0]["note"] == "wall" and rows[0]["rssi_db (given)"] == "-70"
+
+
+@pytest.mark.parametrize(("names", "found"), [(("7 1", "7 2", "8 1"), "7 2"), (("7", "8", "9"), "7")])
+def test_stations_of_several_columns_are_asked_as_they_were_learned(tmp_path, names, found):
+    model = fitted(stations(station_name=np.array(names)), tmp_path)
+    (tmp_path / "a.csv").write_text("x,y,z,PCI,EARFCN\n2,3,1.5,7,2\n")
+    predict(model, tmp_path / "a.csv")
+    assert read(tmp_path / "a.predicted.csv")[0]["station"] == found
+
+
 @pytest.mark.parametrize(("factor", "warned"), [(1e-3, True), (1e-5, True), (1e-2, False)])
 def test_degrees_or_kilometres_as_metres_were_one_place_without_a_word(
     town, tmp_path, caplog, factor, warned

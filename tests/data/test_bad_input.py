@@ -209,7 +209,7 @@ NO_FILES = {  # name of the file, what becomes of a sound archive, and what is s
     "noise.npz": (lambda whole: b"not a zip", "damaged or not an npz"),
     "half.npz": (lambda whole: whole[: len(whole) // 2], "damaged or not an npz"),
     "empty.npz": (lambda whole: b"", "damaged or not an npz"),
-    "mine.csv": (lambda whole: b"x", "expected a name ending in .npz, .h5 or .hdf5, found .csv"),
+    "mine.csv": (lambda whole: b"x", "expected a name ending in .npz, .h5, .hdf5 or .mat, found .csv"),
     "noise.h5": (lambda whole: b"not hdf5", "damaged or not an HDF5"),
     "empty.hdf5": (lambda whole: b"", "damaged or not an HDF5"),
     "flipped.npz": (_flipped, "csi: damaged"),

@@ -106,7 +106,7 @@ def test_every_guess_is_said_and_what_is_not_used(write):
 def test_many_transmitters_did_not_become_one_without_a_word(write):
     rows = "".join(f"A{i % 3},{i},{i * i},2,-{60 + i % 7}\n" for i in range(24))
     notes = understand_table(write("Transmitter ID,x,y,z,rssi\n" + rows)).notes
-    assert sum("'Transmitter ID' holds 3 names again and again: stations?" in note for note in notes) == 1
+    assert sum("'Transmitter ID' speaks of a station and is not used" in note for note in notes) == 1
     other = understand_table(write("Operator ID,x,y,z,rssi\n" + rows)).notes
     assert not any("stations?" in note for note in other)
 
@@ -248,7 +248,7 @@ SPOILT = {
     "text in a column of numbers": (
         "# my drive\nx,y,rssi\n1,2,-80\n\n2,3,none heard\n", {}, "column 'rssi', line 5: 'none heard': is no",
     ),
-    "infinity": ("x,y,rssi\n1,2,-80\n2,3,-inf\n", {}, "column 'rssi', line 3: '-inf': is no finite number"),
+    "infinity": ("x,y,rssi\n1,2,-80\n2,3,inf\n", {}, "column 'rssi', line 3: 'inf': is no finite number"),
     "no place in a row": ("x,y,rssi\n1,2,-80\n,3,-81\n", {}, "column 'x', line 3: no value; x is needed"),
     "no place at all": ("rssi,speed\n-80,1\n-81,2\n", {}, "no coordinates among 'rssi', 'speed'"),
     "no y": ("x,rssi\n1,-80\n2,-81\n", {}, "x is there but no y; say dataset.columns.y=COLUMN"),
@@ -260,18 +260,17 @@ SPOILT = {
     "two levels": ("x,y,RSRP,RSSI\n1,2,-80,-60\n", {}, "'RSRP' and 'RSSI' could each be rssi_db; say which"),
     "dBm and mW": ("x,y,power_dbm,power_mw\n1,2,-80,1\n", {}, "are different measurements; say dataset.col"),
     "metres and degrees": ("x,y,lat,lon,rssi\n1,2,40,8,-80\n", {}, "both say where; say dataset.columns.x=x"),
-    "dBm or watts": ("x,y,power\n1,2,3\n2,3,4\n", {}, "column 'power': no value below 0: dBm or W? say"),
+    "dBm or watts": ("x,y,power\n1,2,3\n2,3,4\n", {}, "column 'power': no value below 0: dBm or W, per cent"),
     "an unknown unit": ("x [inch],y [m],rssi\n1,2,-80\n", {}, "column 'x [inch]': [inch] is no known unit"),
     "a misspelt column": (PLAIN, {"rssi_db": "rsi"}, "dataset.columns.rssi_db=rsi: drive.csv has no such column; "
                           "did you mean 'rssi'?"),
     "a misspelt quantity": (PLAIN, {"rsi_db": "rssi"}, "no such quantity; did you mean rssi_db?"),
-    "a unit that does not suit": (PLAIN.replace("rssi", "p [mW]"), {"rssi_db": "p"}, "is in mW; rssi_db needs"),
+    "a unit that does not suit": (PLAIN.replace("rssi", "p [mW]"), {"rssi_db": "p"}, "is in mW: rssi_db needs"),
     "latitude beyond the pole": ("lat,lon,rssi\n40,8,-80\n140,8,-81\n", {}, "column 'lat', line 3: 140: latitude"),
     "latitude and longitude swapped": (
         "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",
     ),
     "channels of stations without places": ("x,y,re,im,cell\n1,2,1,0,a\n", {}, "stations without places; add columns"),
-    "columns of stations without places": ("x,y,rssi_a,rssi_b\n1,2,-80,-81\n", {}, "say dataset.stations_file"),
     "a station that moved": (
         "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,a,5,6\n", {}, "'a' is at (5, 5) in line 2 and at (5, 6)",
     ),
@@ -292,7 +291,7 @@ SPOILT = {
                                 "no column of levels, powers or channels"),
     "perhaps a level": ("x,y,rssi_ema\n1,2,-80\n", {}, "'rssi_ema': a received level or power, or something else?"),
     "a field strength": ("x,y,level (dBuV/m)\n1,2,80\n", {}, "[dBuV/m] is no known unit; expected one of dB, dBm, dBW"),
-    "percent": ("x,y,signal (%)\n1,2,80\n", {}, "[%] is no known unit"),
+    "percent": ("x,y,signal (%)\n1,2,80\n", {}, "'signal (%)': is in %: a quality, not a level"),
     "millimetres beside nothing": ("x_mm,y,rssi\n1,2,-80\n", {}, "'x_mm' is in mm, 'y' says no unit; rename one, e.g. to 'y [m]'"),
     "Excel": (b"PK\x03\x04" + bytes(50), {}, "not a table of text but an Excel workbook"),
     "gzip": (b"\x1f\x8b" + bytes(50), {}, "compressed by gzip"),

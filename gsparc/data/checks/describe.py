@@ -155,6 +155,9 @@ def _units(positions: np.ndarray) -> list[str]:
         return [
             f"positions near {near} within {across:.2g}: degrees? then give them as latitude and longitude"
         ]
+    groups = outliers.two_groups(positions[:, :2])
+    if groups is not None:
+        return [f"two groups of places {groups[1] / 1e3:.4g} km apart: zones of a projection, or two sites?"]
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)

@@ -37,6 +37,24 @@ def too_far(positions: np.ndarray) -> np.ndarray:
     return _few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
 
 
+def two_groups(places: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Of places (n, 2) [m] those on the far side (n,) bool of a gap, and how wide it is [m].
+
+    None unless the gap is ten times as wide as the places on either side, which are not few.
+    """
+    for axis in (0, 1):
+        order = np.argsort(places[:, axis], kind="stable")
+        gaps = np.diff(places[order, axis])
+        cut = int(gaps.argmax()) + 1 if len(gaps) else 0
+        few = max(5, FEW * len(places))
+        if min(cut, len(places) - cut) < few or gaps[cut - 1] < DISTANT_M:
+            continue
+        wide = max(np.ptp(places[part], axis=0).max() for part in (order[:cut], order[cut:]))
+        if gaps[cut - 1] > FAR * wide:
+            return np.isin(np.arange(len(places)), order[cut:]), float(gaps[cut - 1])
+    return None
+
+
 def _few_beyond(values: np.ndarray, gap: Callable[[float, float], bool]) -> np.ndarray:
     """The most, but few, largest of `values` (n,) above which there is a gap, as (n,) bool."""
     order = np.argsort(values, kind="stable")

@@ -6,6 +6,7 @@ what one station measured at one place, in the order of measuring; levels are in
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,10 @@ from gsparc.data.errors import some
 from gsparc.data.schema import Measurements
 
 NAMED = 5  # wild rows that a station may have, however few its rows
+SATURATED = 0.01  # of all levels, at least
+PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
+APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
+REPEATS = 3
 HIGHEST_DBM = 60.0  # a kilowatt received
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
@@ -34,7 +39,7 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
         levels: of powers.
         steps: `steps_of` them.
     """
-    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
+    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels) + stuck(levels)
     return [*warnings, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
 
 
@@ -57,10 +62,17 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         return []
     if not np.ptp(values):
         return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
-    marks = _marks(values)
-    warnings = _mark_warnings(marks, values)
-    for mark, _ in marks:
-        values = values[values != mark]
+    warnings = []
+    different, counts = np.unique(values, return_counts=True)
+    least, most = (f"{round(float(value), 6) + 0:g}" for value in different[[0, -1]])
+    if counts[-1] > max(SATURATED * len(values), 10, 5 * counts[-2]):
+        share = f"{counts[-1]} of {len(values)} levels are exactly {most}, the most"
+        warnings.append(f"{share}: a receiver in saturation? the field is stronger there; leave them out")
+    usual = max(5 * float(np.median(counts)), 3 * counts[1])
+    if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, usual):
+        share = f"{counts[0]} of {len(values)} levels are exactly {least}"
+        warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
+        values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
     if low >= 0 and high <= 1:
         warnings.append(
@@ -78,53 +90,109 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     return warnings
 
 
-def _mark_warnings(marks: list[tuple[float, bool]], values: np.ndarray) -> list[str]:
-    warnings = []
-    for mark, apart in marks:
-        count, level = int((values == mark).sum()), f"{round(mark, 6) + 0:g}"  # 0 dB is 5.5e-9 in float32
-        share = f"{count} of {len(values)} levels are exactly {level}"
-        if apart:
-            warnings.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
-        else:
-            warnings.append(
-                f"{share}, the least: not heard? leave them empty and give sensitivity_db={level}"
-            )
-    return warnings
+def not_heard(values: np.ndarray) -> list[float]:
+    """Of levels (n,) [dB] those that repeat exactly and lie apart from all others: marks, not levels.
+
+    At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end not below 0,
+    as rows beside a station are strong; at the lower end a pile needs only a gap, as a receiver's own levels
+    have none.
+    """
+    marks: list[float] = []
+    rest = values[np.isfinite(values)]
+    while True:
+        different, counts = np.unique(rest, return_counts=True)
+        if len(different) < 4:
+            return marks
+        steps = np.diff(different)
+        spans = (different[-1] - different[1], different[-2] - different[0])
+        usual = max(GAP_DB, 5 * float(np.median(steps)))
+        piled = counts[0] > max(PILE * len(rest), 10) and counts[0] > 5 * float(np.median(counts))
+        piled = piled and steps[0] >= usual
+        enough = (steps[[0, -1]] > np.maximum(APART_DB, 0.3 * np.array(spans))) & (counts[[0, -1]] >= REPEATS)
+        found = different[[0, -1]][enough & [True, different[-1] >= 0] | [piled, False]].tolist()
+        if not found:
+            return marks
+        marks += found
+        rest = rest[~np.isin(rest, found)]
 
 
-def _marks(values: np.ndarray) -> list[tuple[float, bool]]:
-    """Values (n,) that many rows have and that lie apart from all others (True), or at the lower end."""
-    different, counts = np.unique(values, return_counts=True)
-    if len(different) < 4:
-        return []
-    marks = []
-    for i, inner in ((0, 1), (len(different) - 1, len(different) - 2)):
-        distance = abs(different[i] - different[inner])
-        apart = distance > 20 and distance > 0.3 * abs(different[-2] - different[1]) and counts[i] >= 3
-        pile = i == 0 and counts[0] > max(0.05 * len(values), 5 * float(np.median(counts)), 10)
-        if apart or pile:
-            marks.append((float(different[i]), bool(apart)))
-    return marks
+# What a list of stations may be in by mistake, beside rows in metres, and what turns it right.
+RIVALS: dict[str, tuple[float, list[int]]] = {
+    "in feet": (0.3048, [0, 1, 2]),
+    "in metres, the rows in feet": (1 / 0.3048, [0, 1, 2]),
+    "with x and y exchanged": (1.0, [1, 0, 2]),
+}
+BETTER, STEEP = 0.3, -0.6  # in the correlation, and the correlation itself
 
 
 def direction_warnings(levels: LinkLevels) -> list[str]:
-    """Levels that rise with the distance from their station: losses, or stations in wrong places."""
+    """Levels that rise with the distance from their station, or fall far better from another place."""
     if levels.station_position is None:
         return []
-    axes = min(levels.position.shape[1], levels.station_position.shape[1])
-    away = levels.position[:, :axes] - levels.station_position[levels.station, :axes]
+    places = levels.station_position
+    declared = _correlation(levels, places)
+    turned = {words: factor * places[:, axes[: places.shape[1]]] for words, (factor, axes) in RIVALS.items()}
+    rivals = {words: _correlation(levels, place) for words, place in turned.items()}
+    best = min(rivals, key=lambda words: rivals[words])
+    if rivals[best] < min(STEEP, declared - BETTER):
+        return [
+            f"levels fall with the distance far better if the stations are {best} (correlation "
+            f"{rivals[best]:.2f} instead of {declared:.2f}): is their list in the unit and order of the rows?"
+        ]
+    if declared > 0.3:
+        return [
+            f"levels rise with distance (correlation {declared:.2f}): losses instead of levels (then say "
+            "dataset.columns.rssi_db=HEAD*-1), or are the stations, or x and y, elsewhere?"
+        ]
+    return []
+
+
+def _correlation(levels: LinkLevels, places: np.ndarray) -> float:
+    """Of level and logarithm of the distance from stations at `places` (T, 2 or 3), median of stations."""
+    away = levels.position[:, : places.shape[1]] - places[levels.station]
     spread = np.log10(np.maximum(np.linalg.norm(away, axis=1), 1e-3))
-    slopes = []
+    found = []
     for _, used in levels.heard():
         level = levels.level_db[used]
         if len(used) >= 20 and np.ptp(spread[used]) > 0.3 and np.ptp(level) > 0:
-            slopes.append(np.corrcoef(spread[used], level)[0, 1])
-    if slopes and np.median(slopes) > 0.3:
-        return [
-            f"levels rise with distance (correlation {np.median(slopes):.2f}): losses instead of levels, "
-            "or are the stations, or x and y, elsewhere?"
-        ]
-    return []
+            found.append(np.corrcoef(spread[used], level)[0, 1])
+    return float(np.median(found)) if found else 0.0
+
+
+STILL_ROWS, MOVES_DB = 30, 20.0
+TREND = 0.5  # correlation of a level with the one before: a way, not fading at one place
+
+
+def stuck(levels: LinkLevels) -> list[str]:
+    """Places that stand still over many rows while levels change as they do along a way."""
+    found = []
+    for _, used in levels.heard():
+        moves = np.flatnonzero((np.diff(levels.position[used], axis=0) != 0).any(axis=1)) + 1
+        for run in np.split(used, moves):
+            level = levels.level_db[run]
+            if len(run) < STILL_ROWS or np.diff(np.percentile(level, [5, 95]))[0] < MOVES_DB:
+                continue
+            if np.corrcoef(level[:-1], level[1:])[0, 1] > TREND:
+                what = f"the place stands still for {len(run)} rows, levels move by {np.ptp(level):.0f} dB"
+                rows = f"{levels.rows[run[0]]} to {levels.rows[run[-1]]}"
+                found.append(f"{rows}: {what}: a stuck fix? leave these rows out")
+    return found
+
+
+MOST_OF_A_KIND = 3
+NAMES = r"'[^']*'|\b(?:stations?|line|row) [^:, ]+(?:, )?|[^a-z ]"  # what differs between warnings of a kind
+
+
+def gathered(warnings: Sequence[str]) -> list[str]:
+    """Warnings of which more than a few of one kind are one, counted."""
+    kinds: dict[str, list[str]] = defaultdict(list)
+    for text in warnings:
+        kinds[" ".join(re.sub(NAMES, " ", text).split())[:30]].append(text)
+    gathered: list[str] = []
+    for texts in kinds.values():
+        more = f"{texts[0]} (and {len(texts) - 1} more warnings of this kind)"
+        gathered += texts if len(texts) <= MOST_OF_A_KIND else [more]
+    return gathered
 
 
 def copies(levels: LinkLevels) -> list[str]:
@@ -263,7 +331,8 @@ def gaps(levels: LinkLevels) -> list[str]:
         who = _of([name for name, _, _ in faint], len(names))
         warnings.append(
             f"{count} levels missing{who}, beside the weakest ones: not heard? then give sensitivity_db "
-            f"(the least level is {least:.4g} dB), and they count as below it"
+            f"(the least level is {least:.4g} dB), and they count as below it; where they have no row, "
+            "dataset.absent=silent"
         )
     if plain:
         count = sum(n for _, n in plain)

@@ -12,6 +12,7 @@ import numpy as np
 
 from gsparc.data.assemble import FARTHEST, bad_positions
 from gsparc.data.checks.describe import suspicious_values
+from gsparc.data.checks.plausibility import gathered, link_levels, plausibility_warnings, steps_of
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text
@@ -63,11 +64,24 @@ class Campaign(DataModule):
         selected = select(raw, self.selection, self.file)
         reading = interpret(selected.raw, self.file)
         left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*left_out, *selected.notes, *reading.notes):
+        for note in (*left_out, *selected.notes, *reading.notes, *gathered(_implausible(reading.data))):
             log.warning("%s: %s", self.file, note)
         for hint in suspicious_values(reading.data):
             log.warning("%s: units? %s", self.file, hint)
         return reading.data
+
+
+MOST_LINKS = 1_000_000  # of places and stations; all are held at once
+
+
+def _implausible(data: Measurements) -> list[str]:
+    """What `gsparc check` warns of, where that takes seconds."""
+    stations = 1 if data.site.stations is None else len(data.site.stations)
+    places = len(data) if data.place is None else len(np.unique(data.place))
+    if places * stations > MOST_LINKS:
+        return ["too many links to be looked at for implausible levels here; gsparc check does"]
+    levels = link_levels(data)
+    return [] if levels is None else plausibility_warnings(levels, steps_of(levels))
 
 
 class StandIn(Protocol):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from gsparc.data.datasets.ble import raw_of_ble
 from gsparc.data.datasets.campaign import Campaign
@@ -12,7 +14,8 @@ from gsparc.data.datasets.newrf import raw_of_newrf
 from gsparc.data.datasets.powder import raw_of_powder
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
-from gsparc.data.errors import DataError
+from gsparc.data.errors import Caution, DataError
+from gsparc.data.limits import choice
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
 from gsparc.data.tables import is_table
@@ -25,6 +28,8 @@ def raw_of_own(
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
+    not_heard: Sequence[float] | None = None,
+    absent: str = "unknown",
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
 
@@ -33,17 +38,29 @@ def raw_of_own(
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
         cell_m: of Parquet, also a folder or a URL of it: means of rows [dB] by cells of this side [m].
+        not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
+        absent: `silent`: a station without a row at a place where others have one was not heard there.
 
     Raises:
         DataError: bad input, or a file of another campaign.
+        SettingError: another word for `absent`.
     """
     raw, notes = raw_of(path, columns, stations_file, cell_m)
+    raw = understood(raw, not_heard, absent)
     campaign = campaign_of(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
     for note in notes:
-        log.info("%s: %s", path, note)
+        log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", path, note)
     return raw
+
+
+def understood(raw: Raw, not_heard: Sequence[float] | None = None, absent: str = "unknown") -> Raw:
+    """The same with what settings say of rows and cells without a level; see `raw_of_own`."""
+    choice("unknown", "silent").check("dataset.absent", absent)
+    said: dict[str, Any] = {} if not_heard is None else {"not_heard": [float(mark) for mark in not_heard]}
+    said |= {} if absent == "unknown" else {"absent": absent}
+    return replace(raw, attributes={**raw.attributes, **said})
 
 
 class Own(Campaign):
@@ -73,13 +90,17 @@ def campaign_of(raw: Raw) -> str | None:
 
 
 def read_any(
-    path: str | Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+    path: str | Path,
+    columns: Mapping[str, object] | None = None,
+    stations_file: str | Path | None = None,
+    **settings: Any,
 ) -> Reading:
     """Read a folder of the RFID release, a file of another campaign, one of one's own, or a table.
 
     Args:
         path: folder or file.
         columns, stations_file: of a table, see `raw_of_own`.
+        **settings: see `understood`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
@@ -98,7 +119,7 @@ def read_any(
     campaign = campaign_of(raw)
     if campaign is not None:
         raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
-    reading = interpret(raw, path)
+    reading = interpret(understood(raw, **settings), path)
     return Reading(reading.data, (*notes, *reading.notes))
 
 

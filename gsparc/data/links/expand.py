@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.blocks import is_big
-from gsparc.data.checks.plausibility import degree_warnings
+from gsparc.data.checks.plausibility import degree_warnings, not_heard
+from gsparc.data.errors import Caution, lines_of, some
 from gsparc.data.links.georeference import Georeference, bad_degrees
 from gsparc.data.links.stations import by_carrier, ends_of, numbered, station_of_row, station_table
 from gsparc.data.own_checks import Checker
@@ -20,6 +21,7 @@ from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links
 from gsparc.data.selection import take_rows
 
 POWERS = ("rssi", "rssi_db")
+NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 STATION_FIELDS = ("station", "station_position", "station_name", "station_orientation", "sensitivity_db")
 
@@ -35,6 +37,7 @@ def expand(check: Checker, measured: str) -> Links | None:
     if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
         check.raw.arrays.setdefault("row_name", numbered_rows(len(check.raw.arrays[measured])))
     before = len(check.problems)  # what is already noted does not keep from noting more
+    _without_fix(check, measured)
     origin = in_metres(check)
     if len(check.problems) > before or not _heights(check):
         return None
@@ -108,7 +111,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
             run=None if run is None else np.repeat(run, count),
         )  # fmt: skip
     of_level = links.station  # a station at two carriers has one level
-    links = by_carrier(check, links, carriers, rows)
+    links = by_carrier(check, links, carriers, rows, hopping=measured in POWERS)
     check.raw.arrays[f"{OTHER[moving]}_position"] = links.stations.position[links.station]  # type: ignore[union-attr, index]
     if links.stations is not None and links.stations.rotation is not None:
         if OTHER[moving] == "tx":
@@ -116,7 +119,28 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         check.raw.arrays["rx_rotation"] = links.stations.rotation[links.station]  # type: ignore[index]
     for name in STATION_FIELDS[:-1]:
         check.raw.arrays.pop(name, None)
+    if long and check.raw.attributes.get("absent") == "silent":
+        links, of_level = _with_absent(check, measured, links)
     return _valid(check, measured, links, of_level, count)  # type: ignore[arg-type]
+
+
+def _with_absent(check: Checker, measured: str, links: Links) -> tuple[Links, np.ndarray | None]:
+    """A row that was not heard for each place and station without one, and the stations of all rows."""
+    assert links.stations is not None and links.station is not None and links.place is not None
+    arrays, count, rows = check.raw.arrays, len(links.stations), len(links.station)
+    if measured != "rssi_db":
+        check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
+    _, first, of_place = np.unique(links.place, return_index=True, return_inverse=True)
+    lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + links.station)
+    like = np.concatenate([np.arange(rows), first[lost // count]])
+    station = np.concatenate([links.station, lost % count])
+    arrays = take_rows(arrays, like, rows)
+    arrays[measured] = np.where(np.arange(len(like)) < rows, arrays[measured], -np.inf)
+    arrays[f"{links.static_end}_position"] = links.stations.position[station]
+    check.raw = replace(check.raw, arrays=arrays)
+    check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
+    run = None if links.run is None else links.run[like]
+    return replace(links, station=station, place=links.place[like], run=run), station
 
 
 def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
@@ -128,6 +152,64 @@ def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
             wide[name] = array.reshape(rows * count, *array.shape[2:])
     other = {name: array for name, array in raw.arrays.items() if name not in (*MEASUREMENTS, "mask")}
     return replace(raw, arrays=take_rows(other, np.repeat(np.arange(rows), count), rows, count) | wide)
+
+
+def _without_fix(check: Checker, measured: str) -> None:
+    """Leave out rows at exactly 0, 0 where all others are elsewhere; stations there are at unknown places."""
+    arrays = check.raw.arrays
+    degrees = "latitude" in arrays
+    for name in ("latitude",) if degrees else check.given("rx_position", "tx_position"):
+        pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
+        rows = len(arrays[measured]) if arrays[measured].ndim else 0
+        if any(
+            part.ndim != 2 - degrees or len(part) != rows or part.dtype.kind not in "iuf" for part in pair
+        ):
+            continue
+        place = np.column_stack(pair)[:, :2]
+        null = (place == 0).all(axis=1)
+        if null.all():
+            continue
+        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(place[~null], axis=0).max())
+        if np.abs(np.median(place[~null], axis=0)).max() <= least:
+            continue  # 0, 0 is a place, too, for who measures there
+        _unknown_at_zero(check, degrees)
+        if null.any():
+            which = lines_of([str(name) for name in arrays["row_name"][null]])
+            what = f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"
+            check.notes.append(Caution(f"{which}: {what}; these {null.sum()} of {rows} rows are left out"))
+            check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(~null), rows))
+            arrays = check.raw.arrays
+
+
+def _unknown_at_zero(check: Checker, degrees: bool) -> None:
+    """Stations at exactly 0, 0, where rows are elsewhere, stand at places that nobody knows."""
+    arrays = check.raw.arrays
+    names = ("station_latitude", "station_longitude") if degrees else ("station_position",)
+    if not set(names) <= set(arrays):
+        return
+    at_zero = np.flatnonzero((np.column_stack([arrays[name] for name in names])[:, :2] == 0).all(axis=1))
+    for name in names:
+        arrays[name] = arrays[name].astype(np.float64)
+        arrays[name][at_zero] = np.nan
+    if len(at_zero):
+        who = some([arrays["station_name"][i] if "station_name" in arrays else i for i in at_zero])
+        check.notes.append(Caution(f"stations at 0, 0: {who}: no fix; their places are unknown"))
+
+
+def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:
+    """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names, else found."""
+    given = check.raw.attributes.get("not_heard")
+    marks = not_heard(values) if given is None else np.atleast_1d(np.asarray(given, np.float64)).tolist()
+    silent = np.isin(values, marks) | ((values == -np.inf) & (given is None or len(marks) > 0))
+    floor = "sensitivity_db"
+    if level is None and silent.any() and np.isfinite(values[~silent]).any():
+        floor = f"{values[~silent & np.isfinite(values)].min():.4g} dB, the weakest"
+    for mark in marks if given is None else ():
+        share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
+        said = f"{share}, apart from all others: taken as not heard, below {floor}"
+        say = "dataset.not_heard=[] keeps them as levels, sensitivity_db gives another limit"
+        check.notes.append(Caution(f"{said}; {say}"))
+    return silent
 
 
 def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
@@ -154,8 +236,13 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
     marked = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
     censored = np.zeros(len(values), bool)
+    if measured == "rssi_db" and values.ndim == 1 and values.dtype.kind in "iuf":
+        unheard = _without_marks(check, values, level) & marked
+        unknown |= unheard
+        if level is None and unheard.any() and np.isfinite(values[~unheard]).any():
+            level, censored = values[~unheard & np.isfinite(values)].min(), unheard
     if level is not None:
-        censored = unknown & marked
+        censored = censored if censored.any() else unknown & marked
         floor = np.broadcast_to(np.atleast_1d(level)[of_level if level.size > 1 else 0], (len(values),))
         below = ~unknown & marked & (values < floor)
         if below.any():
@@ -305,11 +392,6 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
     fault = bad_degrees(*np.where(absent, 0, (latitude, longitude)))
     if fault:
         check.refuse(names[0], "row {}: {}".format(*fault))
-    none = (latitude == 0) & (longitude == 0)
-    # (0, 0) is a place, too, for who measures there.
-    if none.any() and max(abs(np.median(latitude)), abs(np.median(longitude))) > 1:
-        row = int(none.argmax())
-        check.refuse(names[0], f"row {row}: latitude and longitude are 0: no fix; leave the row out")
     return latitude, longitude
 
 

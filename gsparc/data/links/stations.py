@@ -103,8 +103,30 @@ def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
     return index.astype(np.int64)
 
 
-def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: int) -> Links:
-    """Stations at several carriers as one station for each."""
+ONE_CARRIER = 1.05  # channels of one band within this ratio are one carrier to a field of powers
+
+
+def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Carriers (n,) [Hz] of links, those of one station that lie close together at their middle."""
+    different, which = np.unique(carrier, return_inverse=True)
+    bands: list[int] = []
+    for value in different:
+        start = different[bands.index(bands[-1])] if bands else value
+        bands.append((bands[-1] if bands else 0) + int(value > ONE_CARRIER * start))
+    band = np.array(bands)[which.reshape(-1)]
+    pairs = np.unique(np.stack([station, band, which.reshape(-1)], 1), axis=0)[:, :2]
+    one, count = np.unique(pairs, axis=0, return_counts=True)
+    if count.max() == 1:
+        return carrier
+    most = names[one[count.argmax(), 0]]
+    said = f"station {most} at {count.max()} carriers within {100 * (ONE_CARRIER - 1):.0f} % is one"
+    check.notes.append(f"{said}, and the like; dataset.columns.station=STATION+CARRIER tells them apart")
+    ends = [different[np.array(bands) == number] for number in range(bands[-1] + 1)]
+    return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
+
+
+def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: int, hopping: bool) -> Links:
+    """Stations at several carriers as one station for each; where `hopping`, carriers of a band are one."""
     assert links.stations is not None and links.station is not None
     if carriers is None or carriers.ndim == 0:
         return links
@@ -121,6 +143,7 @@ def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: 
                 "carrier_hz: as many values as rows and as stations; taken as one for each row"
             )
         of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, len(stations))
+    of_link = _of_one(check, station, of_link, stations.name) if hopping else of_link
     pairs, which = np.unique(np.stack([station, of_link], 1), axis=0, return_inverse=True)
     first, carrier = pairs[:, 0].astype(np.int64), pairs[:, 1]
     check.raw.arrays.pop("carrier_hz")

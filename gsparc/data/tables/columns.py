@@ -12,16 +12,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import some
+from gsparc.data.errors import Caution, some
 from gsparc.data.tables.heads import (
     AXES,
     END_WORDS,
     ENDS,
     KINDS,
+    LABELS,
     MANY,
     OTHER_NAMES,
+    PERCENT,
     STATION_WORDS,
+    TOGETHER,
+    TOPICS,
     Head,
+    about,
     suits,
     understand,
     unit_of,
@@ -31,8 +36,8 @@ from gsparc.data.tables.sheet import Sheet
 from gsparc.data.units import SCHEMA, UNITS, Unit, known
 
 LEVELS = ("rssi_db", "rssi")
-CHANNELS = ("csi_re", "csi_im")
-MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS)
+CHANNELS, POLAR = ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
+MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS, POLAR)
 # Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
 ONE_OF = (
     MEASURED,
@@ -41,10 +46,12 @@ ONE_OF = (
 # Beside the word for a level: which radio, antenna or cell it is of.
 PLAIN = {
     *("wifi", "wlan", "lte", "nr", "5g", "gsm", "umts", "ble", "bluetooth", "lora", "zigbee"),
-    *("uwb", "serving"),
+    *("uwb", "serving", "dl"),
 }
 STATION = re.compile(
-    r"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|" + "|".join(STATION_WORDS) + r")?[\W_]*\d+)[\W_]*$"
+    r"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|"
+    + "|".join(sorted(STATION_WORDS))
+    + r")?[\W_]*\d+)[\W_]*$"
 )
 REPEATED = 4  # rows for each name of a column that may hold stations
 
@@ -68,11 +75,11 @@ class Column(Head):
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not suits(self.role, self.unit):
-            kind = KINDS[self.role]
-            wanted = f"one of {known(kind)}" if kind in SCHEMA else "no unit"
-            return sheet.refuse(f"is in {self.unit.name}; {self.role} needs {wanted}", self.head)
-        values = sheet.numbers(self.head)
-        return values if values is None or self.unit is None else self.unit.convert(values)
+            wanted = f"one of {known(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
+            remedy = PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
+            return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
+        marks = self.role == "rssi_db"
+        return sheet.numbers(self.head, self.unit, lambda unit: suits(self.role, unit), marks)
 
 
 Chosen = dict[str, tuple[Column, ...]]
@@ -115,10 +122,15 @@ def choose(
         guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
     _one_way(sheet, guesses)
     notes = []
-    for role, candidates in guesses.items():
-        one_each = role in CHANNELS or "station" not in {**chosen, **guesses}  # of a row: tones, or stations
+    for role, found in guesses.items():
+        candidates = [column for column in found if not column.less] or found
+        if role == "station":
+            candidates = _identity(sheet, candidates, always=only is not None)
+        tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
+        one_each = tones or "station" not in {**chosen, **guesses}
         several = role in MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
         several &= len({column.word for column in candidates}) == 1
+        several |= role == "station" and candidates[0].label == JOINED
         exact = [column for column in candidates if column.head == role]
         if len(candidates) > 1 and not several and not exact:
             _ambiguous(sheet, role, candidates)
@@ -128,32 +140,87 @@ def choose(
             sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
             continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
-        if not exact:
+        if not exact or several:
             notes.append(_note(chosen[role]))
     for column in (columns[0] for columns in chosen.values()):
         if not column.word and column.unit is not None and column.unit.changes:
             notes.append(f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}")
     _one_unit(sheet, chosen)
+    if only is None and not any(roles[0] in chosen for roles in MEASURED):
+        notes += _wide_survey(sheet, chosen)
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head and head not in used]
     if unused:
         notes.append(f"not used: column{'s' * (len(unused) > 1)} {some(unused, 8)}")
-    if "station" not in chosen and not any(columns[0].label for columns in chosen.values()):
-        notes += _perhaps_stations(sheet, used)
-    return chosen, notes
+    return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]
 
 
-def _perhaps_stations(sheet: Sheet, used: Container[str | None]) -> list[str]:
-    """Columns that repeat few words and are called an end: without them all transmitters would be one."""
-    notes = []
-    ends = [head for head in sheet.heads if head not in used and set(words_of(head)) & set(END_WORDS)]
-    for head in ends:
-        distinct = len(set(sheet.words(head).tolist()) - {""})
-        if 2 <= distinct <= len(sheet) // REPEATED:
-            notes.append(
-                f"column {head!r} holds {distinct} names again and again: stations? say "
-                f"dataset.columns.station={head!r}, with their places in dataset.stations_file"
-            )
+JOINED = "joined"  # label of columns whose values together name a station
+
+
+def station_names(sheet: Sheet, columns: Iterable[Column]) -> np.ndarray:
+    """Text (S,): what the rows call their station, values of several columns joined; empty where nothing."""
+    parts = [sheet.words(column.head or "") for column in columns]
+    names = [" ".join(filter(None, row)) if row[0] else "" for row in zip(*parts, strict=True)]
+    return np.array(names, dtype=str)
+
+
+def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Column]:
+    """A station's column and those that tell it from others of its name, `always` or where some do."""
+    for first in candidates:
+        parts = TOGETHER.get(first.word, set())
+        bare = {head: set(words_of(head)) - {*LABELS, *PLAIN} for head in sheet.heads if head != first.head}
+        more = [head for head, words in bare.items() if words and words <= parts]
+        if not parts or not all(column is first or column.head in more for column in candidates):
+            continue
+        columns = [first]
+        for head in more:
+            longer = [*columns, replace(first, head=head)]
+            fewer, many = (len(set(station_names(sheet, some).tolist())) for some in (columns, longer))
+            if always or fewer < many <= len(sheet) // REPEATED:
+                columns = longer
+        return columns if len(columns) == 1 else [replace(column, label=JOINED) for column in columns]
+    return candidates
+
+
+MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
+NAMED = re.compile(rf"(?i)^[\W_]*({'|'.join(sorted(STATION_WORDS))})[\W_]*[a-z]?\d+[\W_]*$")
+
+
+def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
+    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels; the notes."""
+    used = {column.head for columns in chosen.values() for column in columns}
+    heads = [head for head in sheet.heads if head not in used and (MAC.search(head) or NAMED.match(head))]
+    if not heads or "station" in chosen:
+        return []
+    chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in heads)
+    return [_note(chosen["rssi_db"])]
+
+
+def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[str]:
+    """Warnings of columns that are not used though their heads speak of something that matters."""
+    stations = chosen.get("station", ())
+    notes: list[str] = []
+    names = station_names(sheet, stations) if stations else np.zeros(len(sheet), str)
+    have = {"a floor": "z", "a height": "z", "a carrier": "carrier_hz"}
+    for head in sheet.heads:
+        lone = "station" not in chosen and not any(columns[0].label for columns in chosen.values())
+        topic = about(head) or ("a station" if lone and set(words_of(head)) & set(END_WORDS) else None)
+        if topic is None or head in used:
+            if topic == "a floor" and any(c.head == head and c.unit is None for c in chosen.get("z", ())):
+                say = f"dataset.columns.z={head}*3.2 takes 3.2 m each"
+                notes.append(Caution(f"column {head!r}: floors as heights in metres? {say}"))
+            continue
+        wanted = have.get(topic)
+        if wanted in chosen or (wanted == "z" and {"rx_z", "tx_z"} & set(chosen)):
+            continue
+        words = sheet.words(head)
+        pairs = {pair for pair in zip(names.tolist(), words.tolist(), strict=True) if pair[1]}
+        groups = len({name for name, _ in pairs}) if wanted != "z" else 1
+        if len(pairs) > groups and (wanted is not None or len(pairs) <= len(sheet) // REPEATED):
+            joined = "+".join([*(column.head or "" for column in stations), head])
+            how = TOPICS[topic].format(head=head, joined=joined)
+            notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
     return notes
 
 
@@ -167,6 +234,15 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
+    times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text)
+    head = _head(sheet, times[1].strip()) if times and KINDS[role] != "text" else None
+    if times and head is not None:
+        unit = _unit(head, role) or Unit("", KINDS[role])
+        unit = replace(unit, name=f"x {times[2]} {unit.name}".strip(), factor=unit.factor * float(times[2]))
+        return (Column(role, unit=unit, head=head),)
+    joined = [_head(sheet, part.strip()) for part in text.split("+")] if role == "station" else []
+    if len(joined) > 1 and all(joined):
+        return tuple(Column(role, JOINED, head=part) for part in joined)
     if "*" in text and role in MANY:
         heads = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
         before, _, after = text.partition("*")
@@ -236,7 +312,7 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
     """Refuse a column in another unit than the schema's beside one of its kind that says none."""
     for kind in SCHEMA:
         columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
-        turned = [c for c in columns if c.unit is not None and c.unit.changes]
+        turned = [c for c in columns if c.unit is not None and c.unit.changes and c.unit.name[:2] != "x "]
         silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]  # to watts or milliwatts?
         if turned and silent and turned[0].unit is not None:
             other = silent[0].unit
@@ -270,9 +346,11 @@ def _note(columns: tuple[Column, ...]) -> str:
     kind = KINDS[first.role]
     unit = f" [{schema_unit(first)}]" if kind in SCHEMA else ""
     what = f"{_names(columns)} taken as {first.role}{unit}"
+    if first.label == JOINED:
+        return f"{what}: their values together name one"
     if len(columns) > 1:
         labels = [column.label for column in columns]
-        of = "frequencies" if first.role in CHANNELS else "stations"
+        of = "frequencies" if first.role in (*CHANNELS, *POLAR) else "stations"
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
     turned = first.unit is not None and first.unit.changes
     return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
@@ -280,7 +358,7 @@ def _note(columns: tuple[Column, ...]) -> str:
 
 def schema_unit(column: Column) -> str:
     """Unit of the column's values once they are read."""
-    unit = SCHEMA[KINDS[column.role]]
+    unit = SCHEMA.get(KINDS[column.role], "deg")
     return "dB" if unit == "dBm" and column.unit is not None and column.unit.name == "dB" else unit
 
 

@@ -7,43 +7,86 @@ from dataclasses import dataclass, replace
 
 from gsparc.data.units import UNITS, Unit
 
+PERCENT = (
+    "a quality, not a level: export levels in dBm; where a driver made it of them as Windows does, "
+    "they are quality / 2 - 100"
+)
+
 # Quantities a column can hold: of an end (the moving one when it is not named), and of a row.
 ENDS = ("", "rx_", "tx_", "station_")
 AXES = {"x": "length", "y": "length", "z": "length", "latitude": "angle", "longitude": "angle"}
 KINDS: dict[str, str] = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | {
     **{"rssi_db": "level", "rssi": "power", "sensitivity_db": "level"},
-    **{"csi_re": "number", "csi_im": "number"},
+    **{"csi_re": "number", "csi_im": "number", "csi_amp": "number", "csi_phase": "phase"},
     **{"carrier_hz": "frequency", "frequency_hz": "frequency"},
     **{"station": "text", "run": "text", "row_name": "text"},
 }
-MANY = ("rssi_db", "rssi", "csi_re", "csi_im")  # may be several columns: stations, or frequencies
+# May be several columns: stations, or frequencies.
+MANY = ("rssi_db", "rssi", "csi_re", "csi_im", "csi_amp", "csi_phase")
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
 END_WORDS = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
-STATION_WORDS = (
-    *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb"),
-    *("ap", "anchor", "pci", "bssid"),
+
+
+def _words(text: str) -> set[str]:
+    return set(text.split())
+
+
+def _by_word(table: dict[str, str]) -> dict[str, str]:
+    """Which entry of a table each word of its texts stands for."""
+    return {word: meaning for meaning, words in table.items() for word in words.split()}
+
+
+STATION_WORDS = _words(
+    "station site tower mast sensor gateway gw gtw bs cell enb enodeb gnb ap wap anchor pci psc bsic bssid "
+    "netid cid eci nci cgi sector beacon"
 )
-_AXIS = {"x": "x", "easting": "x", "y": "y", "northing": "y", "z": "z"}
-_AXIS |= dict.fromkeys(("height", "alt", "altitude", "elevation", "elev"), "z")
-_AXIS |= dict.fromkeys(("lat", "latitude"), "latitude")
-_AXIS |= dict.fromkeys(("lon", "lng", "long", "longitude"), "longitude")
-_PLACE = ("position", "pos", "coordinate", "coord", "location", "loc", "gps", "local", "wgs84")
-_LEVEL = ("rssi", "rsrp", "rss", "rxlev", "power", "level", "signal", "prx")
-_ABOUT_LEVEL = (
-    *("rx", "received", "receive", "strength", "signal", "mean", "avg", "average", "median"),
-    *("measured", "value"),
+LESS = ("mac", "eui")  # of a station where nothing else names it
+# Columns whose values together name a station: the first is unique only beside one of the second.
+TOGETHER = {
+    word: set(parts.split())
+    for words, parts in (
+        ("pci psc bsic", "earfcn arfcn uarfcn nrarfcn dlarfcn channel freq frequency"),
+        ("cell cid sector", "lac tac area enb enodeb gnb site"),
+        ("bssid mac ap netid", "band"),
+    )
+    for word in words.split()
+}
+_AXIS = _by_word({"x": "x easting", "y": "y northing", "z": "z height hgt alt altitude elevation elev"})
+_AXIS |= _by_word({"latitude": "lat latitude", "longitude": "lon lng long longitude"})
+_PLACE = _words(
+    "position pos coordinate coord location loc gps gnss local wgs84 utm current device user phone reading "
+    "measured decimal"
 )
-_NO_LEVEL = (
-    *("tx", "transmit", "transmitted", "eirp", "noise", "std", "stdev", "var", "min", "max"),
-    *("count", "loss", "delay", "angle", "interference", "quality", "headroom", "class", "control"),
-    *("delta", "diff", "difference", "change", "error", "residual", "offset", "threshold", "limit"),
-    *("predicted", "prediction", "estimated", "expected", "simulated", "gain", "battery", "supply"),
+# Above what: heights that differ by a constant.
+_ABOVE = _words(
+    "msl amsl asl agl above sea sealevel level ground takeoff relative rel baro barometric ellipsoid "
+    "ellipsoidal geoid orthometric mean"
 )
-_LABEL = ("name", "id", "nr", "no", "number", "index", "mac", "address", "label")
+# What an unused column may speak of, and what to do with it.
+TOPICS = {
+    "a floor": "z={head}*3.2 takes 3.2 m a floor, .station={joined} a station for each",
+    "a height": "z={head} takes it",
+    "a station": "station={joined} tells them apart",
+    "a carrier": "carrier_hz={head} takes it, in Hz",
+}
+_TOPIC = dict.fromkeys((*STATION_WORDS, *LESS, "earfcn", "lac", "tac", "band"), "a station")
+_TOPIC |= {word: "a height" for word, axis in _AXIS.items() if axis == "z"}
+_TOPIC |= _by_word({"a carrier": "frequency freq carrier channel", "a floor": "floor storey etage"})
+_ACCURACY = {"accuracy", "error", "std", "dop", "valid", "quality", "count"}
+LEVEL_WORDS = _words("rssi rsrp rss rxlev power level signal prx rscp")
+_ABOUT_LEVEL = _words("rx received receive strength signal mean avg average median measured value")
+NO_LEVEL = _words(
+    "tx transmit transmitted eirp noise std stdev var min max count loss delay angle interference quality "
+    "headroom class control delta diff difference change error residual offset threshold limit predicted "
+    "prediction estimated expected simulated gain battery supply pathloss attenuation bars rsrq snr sinr cqi "
+    "lsnr ber"
+)
+LABELS = _words("name id ids nr no number index mac eui address addr label code")
 _CHANNEL = ("csi", "h", "channel", "cfr")
-_PART = {"re": "csi_re", "real": "csi_re", "i": "csi_re", "im": "csi_im", "imag": "csi_im", "q": "csi_im"}
+_PART = _by_word({"csi_re": "re real i", "csi_im": "im imag q", "csi_phase": "phase arg"})
+_PART |= _by_word({"csi_amp": "amp amplitude mag magnitude abs"})
 
 
 @dataclass(frozen=True)
@@ -56,6 +99,7 @@ class Head:
         unit: where it says one.
         word: what named the role, in small letters.
         strange: text in brackets that is no known unit.
+        less: whether it yields to another column of the same role.
     """
 
     role: str | None = None
@@ -63,6 +107,13 @@ class Head:
     unit: Unit | None = None
     word: str = ""
     strange: str = ""
+    less: bool = False
+
+
+def about(head: str) -> str | None:
+    """Of which of `TOPICS` a head speaks; None: of none."""
+    words = words_of(unit_of(head)[0])
+    return None if _ACCURACY & set(words) else next((_TOPIC[word] for word in words if word in _TOPIC), None)
 
 
 def understand(text: str) -> Head:
@@ -84,7 +135,7 @@ def understand(text: str) -> Head:
 
 def suits(role: str, unit: Unit) -> bool:
     """Whether a column of `role` can be in `unit`."""
-    return KINDS[role] == unit.kind
+    return KINDS[role] == unit.kind or (KINDS[role], unit.kind) == ("phase", "angle")
 
 
 def unit_of(text: str) -> tuple[str, Unit | None, str]:
@@ -104,6 +155,7 @@ def unit_of(text: str) -> tuple[str, Unit | None, str]:
 
 def words_of(text: str) -> list[str]:
     """Small words of a head: `RxPower_mean` is rx, power, mean."""
+    text = re.sub(r"(?i)(?<![a-z])([eg])node[ _-]?b", r"\1nb", text)  # eNodeB is one word
     apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
     apart = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", apart, flags=re.IGNORECASE)
     return [word for word in re.split(r"[^0-9a-zµμ°]+", apart.lower()) if word]
@@ -116,23 +168,26 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
         return Head(joined, unit=unit, word=joined)
     if joined in OTHER_NAMES:
         return Head(OTHER_NAMES[joined], unit=unit, word=joined)
-    return _axis(rest, unit) or _level(words, unit, plain) or _channel(words, plain) or _text(words, unit)
+    measured = _level(words, unit, plain) or _channel(words, unit, plain)
+    return _axis(rest, unit) or measured or _text(words, unit)
 
 
 def _axis(rest: list[str], unit: Unit | None) -> Head | None:
     axes = [word for word in rest if word in _AXIS]
-    ends = [word for word in rest if word not in _AXIS]
+    above = len(axes) == 1 and _AXIS[axes[0]] == "z"
+    ends = [word for word in rest if word not in _AXIS and not (above and word in _ABOVE)]
+    less = len(ends) + len(axes) < len(rest)
     if len(axes) != 1 or len(ends) > 1:
         return None
     if not ends:
-        return Head(_AXIS[axes[0]], unit=unit, word=axes[0])
+        return Head(_AXIS[axes[0]], unit=unit, word=axes[0], less=less)
     end = "station_" if ends[0] in STATION_WORDS else END_WORDS.get(ends[0])
-    return None if end is None else Head(end + _AXIS[axes[0]], unit=unit, word=axes[0])
+    return None if end is None else Head(end + _AXIS[axes[0]], unit=unit, word=axes[0], less=less)
 
 
 def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
-    named = [word for word in words if word in _LEVEL]
-    if not named or any(word in _NO_LEVEL for word in words):
+    named = [word for word in words if word in LEVEL_WORDS]
+    if not named or any(word in NO_LEVEL for word in words):
         return None
     # 'signal strength' and 'signal power' are one thing said twice.
     word = next((w for w in named if w != "signal"), "signal")
@@ -147,28 +202,31 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     return Head(role, label, unit, word)
 
 
-def _channel(words: list[str], plain: str) -> Head | None:
+def _channel(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     numbers = [word for word in words if word.isdigit()]
     parts = [word for word in words if word in _PART]
     others = [word for word in words if word not in _PART and not word.isdigit() and word not in _CHANNEL]
     named = any(word in _CHANNEL for word in words)
-    if len(parts) != 1 or not (named or parts[0] in ("re", "im", "real", "imag")):
+    plainly = ("re", "im", "real", "imag", *("amp", "amplitude", "mag", "magnitude", "phase") * bool(numbers))
+    if len(parts) != 1 or not (named or parts[0] in plainly):
         return None
     if others or len(numbers) > 1:  # of a channel, but not plainly the number of a tone: refused by its label
-        return Head(_PART[parts[0]], " ".join(numbers + others), word=parts[0]) if named else None
+        return Head(_PART[parts[0]], " ".join(numbers + others), unit, parts[0]) if named else None
     label = numbers[0] if numbers else ""
     dash = re.search(rf"(.?)[-\u2212]{label}(?!\d)", plain) if numbers else None
     if dash is not None and not dash[1].isalnum():
         label = f"-{label}"
     elif dash is not None and "-" not in plain[: dash.start()]:  # csi-re-2 has the mark between all words
         label = f"{label} or -{label}"
-    return Head(_PART[parts[0]], label, word=parts[0])
+    return Head(_PART[parts[0]], label, unit, parts[0])
 
 
 def _text(words: list[str], unit: Unit | None) -> Head:
-    rest = [word for word in words if word not in _LABEL]
+    rest = [word for word in words if word not in LABELS]
     if len(rest) == 1 and rest[0] in STATION_WORDS:
         return Head("station", word=rest[0])
+    if not rest and set(words) & set(LESS):
+        return Head("station", word=next(word for word in words if word in LESS), less=True)
     if rest == ["run"]:
         return Head("run", word="run")
     if rest and all(word in ("frequency", "freq", "carrier", "fc", "center", "centre") for word in rest):

@@ -11,6 +11,7 @@ from gsparc.data.tables.columns import Chosen, as_station, choose
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
+ON_EARTH = ((-90, 90), (-180, 360))  # degrees of latitude and longitude
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,31 @@ def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np
     return values
 
 
+def _notation(lat: np.ndarray, lon: np.ndarray) -> str | None:
+    """What numbers (n,) that are no decimal degrees are instead; None: metres, it seems."""
+    if max(np.abs(lat).max() / 90, np.abs(lon).max() / 180) <= 100 and (np.abs([lat, lon]) % 100 < 60).all():
+        return "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; convert them"
+    whole = np.abs(lat).min() >= 1e7 and np.abs(lat).max() <= 9e8 and np.abs(lon).max() <= 1.8e9
+    return "degrees times ten million; divide them" if whole else None
+
+
 def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray) -> None:
-    for i, (role, low, high) in enumerate(zip(roles, (-90, -180), (90, 360), strict=True)):
-        bad = np.flatnonzero((across[:, i] < low) | (across[:, i] > high))
-        swapped = i == 0 and len(bad) and (np.abs(across[:, 1]) <= 90).all()
-        hint = "; are latitude and longitude swapped?" if swapped else ""
-        rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in bad)
-        sheet.problems.add_rows(
-            sheet.where(chosen[role][0].head or ""), rows, f"{role} is outside {low} to {high} degrees{hint}"
-        )
+    limits = zip(across.T, ON_EARTH, strict=True)
+    outside = [np.flatnonzero((values < low) | (values > high)) for values, (low, high) in limits]
+    swapped = len(outside[0]) > 0 and (np.abs(across[:, 1]) <= 90).all()
+    heads = [chosen[role][0].head or "" for role in roles]
+    if 2 * len(outside[0]) > len(across) and not swapped:
+        end = roles[0].removesuffix("latitude")
+        metres = f"metres? say dataset.columns.{end}x={heads[1]} dataset.columns.{end}y={heads[0]}"
+        fault = _notation(*across[np.isfinite(across).all(axis=1)].T) or metres
+        example = f"{across[outside[0][0], 0]:.10g} in {sheet.rows[outside[0][0]]}"
+        return sheet.refuse(f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}")
+    for i, (role, (low, high)) in enumerate(zip(roles, ON_EARTH, strict=True)):
+        hint = "; are latitude and longitude swapped?" if i == 0 and swapped else ""
+        rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in outside[i])
+        fault = f"{role} is outside {low} to {high} degrees{hint}"
+        sheet.problems.add_rows(sheet.where(heads[i]), rows, fault)
+    return None
 
 
 def one_each(
@@ -98,8 +115,9 @@ def one_each(
         ask: say whether it is so, and note nothing.
     """
     values = row_places.all()
-    first = np.array([int(np.argmax(station == t)) for t in range(len(names))])
-    moved = np.flatnonzero((values != values[first[station]]).any(axis=1))
+    fixed = (values[:, :2] != 0).any(axis=1)  # 0, 0 in some of a station's rows: no fix there
+    first = np.array([int(np.argmax((station == t) * (1 + fixed))) for t in range(len(names))])
+    moved = np.flatnonzero((values != values[first[station]]).any(axis=1) & fixed)
     if len(moved) == 0:
         return row_places.take(first)
     if not ask:

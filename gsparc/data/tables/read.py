@@ -10,12 +10,26 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
-from gsparc.data.errors import nearest
+from gsparc.data.checks.outliers import two_groups
+from gsparc.data.errors import Caution, nearest, some
+from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS
 from gsparc.data.tables.cells import LOOKED_AT, merged
-from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen, Column, choose, schema_unit
+from gsparc.data.tables.columns import (
+    CHANNELS,
+    JOINED,
+    LEVELS,
+    POLAR,
+    Chosen,
+    Column,
+    choose,
+    schema_unit,
+    station_names,
+)
+from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, PERCENT, about, words_of
 from gsparc.data.tables.places import (
     PER_STATION,
     UNKNOWN_HEIGHT,
@@ -71,6 +85,22 @@ def understand_table(
     return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
+MOST_GROUPS = 12  # values of a column that may tell stations apart
+LEAST_APART_DB = 6.0  # beyond what levels of one group differ by between neighbours
+NEAR, LEAST_ROWS = 4, 10  # neighbours looked at; rows of pairs within and between groups
+
+
+def groups_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> float:
+    """How much more levels (n,) [dB] differ between neighbours (n, 2) of two groups than of one, median."""
+    if len(level) <= NEAR:
+        return 0.0
+    near = cKDTree(places).query(places, k=NEAR + 1)[1][:, 1:]
+    apart, same = np.abs(level[near] - level[:, None]), group[near] == group[:, None]
+    few = min(same.sum(), (~same).sum()) < NEAR * LEAST_ROWS
+    return 0.0 if few else float(np.median(apart[~same]) - np.median(apart[same]))
+
+
+TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
 HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
 
 
@@ -99,12 +129,17 @@ class Builder:
 
     def _measurement(self) -> str | None:
         """Add the measurement; its quantity."""
-        role = next((name for name in (*LEVELS, *CHANNELS) if name in self.chosen), None)
+        role = next((name for name in (*LEVELS, *CHANNELS, *POLAR) if name in self.chosen), None)
         if role is None:
             fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
+            for head in self.sheet.heads:
+                if {"loss", "pathloss"} & set(words_of(head)):
+                    return self.refuse(f"{fault}; dataset.columns.rssi_db={head}*-1 takes losses for levels")
+                if {"quality", "percent", "pct"} & set(words_of(head)):
+                    return self.refuse(f"{fault}; {head!r} is {PERCENT}")
             return self.refuse(f"{fault}; say dataset.columns.rssi_db=COLUMN")
-        if role in CHANNELS:
-            self._channels()
+        if role not in LEVELS:
+            self._channels(CHANNELS if role in CHANNELS else POLAR)
             return role
         columns = self.chosen[role]
         levels = [column.numbers(self.sheet) for column in columns]
@@ -113,31 +148,42 @@ class Builder:
         values = np.stack([v for v in levels if v is not None], axis=1)
         if np.isnan(values).all():
             self.refuse("no value in any row", columns[0].head or "")
+        for text, count in self.sheet.marks.items():
+            said = f"{count} of {values.size} levels are {text!r}: taken as not heard"
+            self.notes.append(Caution(f"{said}, below the weakest; dataset.not_heard=[] refuses them"))
         first = columns[0]
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
             choices = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
-            self.refuse(f"no value below 0: dBm or W? say {choices}", first.head or "")
+            fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
+            self.refuse(f"{fault}, or dataset.columns.rssi_db={first.head}*-1", first.head or "")
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
 
-    def _channels(self) -> None:
-        pairs = [self._tones(part) for part in CHANNELS]
+    def _channels(self, names: tuple[str, str]) -> None:
+        """Add channels of columns of real and imaginary parts, or of amplitudes and phases."""
+        pairs = [self._tones(part) for part in names]
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
         parts: list[list[np.ndarray]] = [[], []]
         for tone in self.tones.tolist():
-            for part, columns, other in zip(CHANNELS, pairs, pairs[::-1], strict=True):
+            for i, columns, other in zip((0, 1), pairs, pairs[::-1], strict=True):
                 if tone not in columns:
-                    self.refuse(
-                        f"{other[tone].head!r} has no {part} beside it; say dataset.columns.{part}=COLUMN"
-                    )
+                    fault = f"{other[tone].head!r} has no {names[i]} beside it"
+                    self.refuse(f"{fault}; say dataset.columns.{names[i]}=COLUMN")
                     continue
                 values = columns[tone].numbers(self.sheet)
                 if values is not None:
-                    parts[CHANNELS.index(part)].append(values)
+                    parts[i].append(values)
         if self.sheet.problems:
             return
-        csi = np.stack(parts[0], axis=1) + 1j * np.stack(parts[1], axis=1)
+        first, second = (np.stack(part, axis=1) for part in parts)
+        if names == POLAR:
+            degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
+            if pairs[1][self.tones[0]].unit is None:
+                self.notes.append(f"phases are taken as {'degrees' if degrees else 'radians'}")
+            turn = np.exp(1j * (np.radians(second) if degrees else second))
+            first, second = first * turn.real, first * turn.imag
+        csi = first + 1j * second
         csi = csi[:, 0] if csi.shape[1] == 1 else csi
         self.arrays["csi"] = csi
         if np.isnan(csi).any():
@@ -176,11 +222,50 @@ class Builder:
             return
         stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
+        self._groups(where)
         if stations is not None:
             self._add_stations(stations, where.degrees)
+        self._splitting(measured, where, None if stations is None else stations.index)
         self._add_places(moving, where)
         for other in ends.values():  # the end that is left, where there are no stations
             self._add_other("tx" if moving == "rx" else "rx", other, where)
+
+    def _unused(self) -> dict[str, np.ndarray]:
+        """Text (S,) of the columns that are not used, those of one value left out."""
+        used = {column.head for columns in self.chosen.values() for column in columns}
+        words = {head: self.sheet.words(head) for head in self.sheet.heads if head and head not in used}
+        return {head: text for head, text in words.items() if (text != text[0]).any()}
+
+    def _groups(self, where: Places) -> None:
+        """Warn of two groups of places far apart, and say which column tells them apart."""
+        groups = None if where.degrees else two_groups(where.across)
+        if groups is None:
+            return
+        for head, words in self._unused().items():
+            values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
+            if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
+                said = f"two groups of places {groups[1] / 1e3:.4g} km apart, as column {head!r} says"
+                self.notes.append(Caution(f"{said}: zones of a projection? give degrees, or a file for each"))
+
+    def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
+        """Warn of unused columns whose groups have levels of their own at the places of one station."""
+        if measured not in LEVELS or self.arrays[measured].ndim > 1:
+            return
+        level = self.arrays[measured]
+        station = np.zeros(len(level), int) if station is None else station
+        stretch = np.cos(np.radians(np.nanmedian(where.across[:, 0]))) if where.degrees else 1.0
+        names = [column.head or "" for column in self.chosen.get("station", ())]
+        for head, words in self._unused().items():
+            values, group = np.unique(words, return_inverse=True)
+            if about(head) or (NO_LEVEL | LEVEL_WORDS) & set(words_of(head)) or len(values) > MOST_GROUPS:
+                continue
+            known = np.isfinite(level) & (words != "")
+            of = [known & (station == t) for t in np.unique(station)]
+            apart = [groups_apart(where.across[t] * [1, stretch], level[t], group.reshape(-1)[t]) for t in of]
+            if max(apart) > LEAST_APART_DB:
+                said = f"levels at equal places differ by {max(apart):.0f} dB between values of column"
+                how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
+                self.notes.append(Caution(f"{said} {head!r}: {how}"))
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
@@ -208,9 +293,9 @@ class Builder:
         for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
             self.refuse(f"two columns of the station {label!r}; rename one")
         if len(labels) > 1:
-            return self._wide(labels, where)
-        column = self.chosen.get("station", (None,))[0]
-        if column is None:
+            return self._wide(labels, where, next(iter(end_places.values())).degrees)
+        columns = self.chosen.get("station", ())
+        if not columns:
             if self.listed is not None and len(self.listed.names) == 1:
                 return self._by_list(np.array(self.listed.names * len(self.sheet.rows)))
             if self.listed is not None:
@@ -220,10 +305,14 @@ class Builder:
             if where is None:
                 where = self._second_in_degrees(end_places)
             return None if where is None else self._unnamed(where)
-        words = self.sheet.words(column.head or "")
-        self.sheet.refuse_rows(column.head, np.flatnonzero(words == ""), "no station; expected its name")
+        words, head = station_names(self.sheet, columns), columns[0].head or ""
+        if columns[0].label == JOINED and columns[0].word and self.listed is not None:
+            plain = self.sheet.words(head)
+            words = plain if set(plain) <= set(self.listed.names) else words
+        self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
+        self._rounded(words, head)
         if self.listed is not None:
-            self._all_listed(words, column.head or "")
+            self._all_listed(words, head)
             return None if self.sheet.problems else self._by_list(words)
         index, distinct = pd.factorize(words)  # in the order of their first rows
         names = tuple(map(str, distinct))
@@ -242,19 +331,29 @@ class Builder:
             one_each(self.sheet, end_places[ends[0]], index, names)
             return None
         if measured in LEVELS:
-            nowhere = np.full((len(names), 3), np.nan)
-            degrees = next(iter(end_places.values())).degrees
-            self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
-            return StationList(names, Places(nowhere[:, :2], nowhere[:, 2], degrees), index=index)
+            return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
 
-    def _wide(self, labels: tuple[str, ...], where: Places | None) -> StationList | None:
+    def _rounded(self, words: np.ndarray, head: str) -> None:
+        """Warn of names that a spreadsheet has rounded: several stations may have become one."""
+        lost = sorted({w for w in words.tolist() if re.fullmatch(r"\d(?:[.,]\d+)?E\+\d+|\d{15}0{2,}", w)})
+        if lost:
+            said = f"column {head!r}: {some(lost, 3)}: rounded by a spreadsheet, stations may have become one"
+            self.notes.append(Caution(f"{said}; export the column as text"))
+
+    def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
+        """Stations at places that nobody gave."""
+        nowhere = np.full((len(names), 3), np.nan)
+        self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
+        return StationList(names, Places(nowhere[:, :2], nowhere[:, 2], degrees), index=index)
+
+    def _wide(self, labels: tuple[str, ...], where: Places | None, degrees: bool) -> StationList | None:
+        if self.listed is None and where is not None:
+            fault = f"{len(labels)} columns of stations in one place for all columns"
+            return self.refuse(f"{fault}; say dataset.stations_file=FILE (name, x, y, z)")
         if self.listed is None:
-            hint = "in one place for all columns" if where is not None else "without places"
-            return self.refuse(
-                f"{len(labels)} columns of stations {hint}; say dataset.stations_file=FILE (name, x, y, z)"
-            )
+            return self._nowhere(labels, degrees)
         self._all_listed(np.array(labels), None)
         silent = [name for name in self.listed.names if name not in labels]
         used = {column.head for columns in self.chosen.values() for column in columns}
@@ -386,6 +485,9 @@ class Builder:
         self.sheet.refuse_rows(
             column.head, np.flatnonzero(np.isnan(values)), "no value; expected a frequency"
         )
+        if column.unit is None and column.word and np.nanmin(values) >= 100 and np.nanmax(values) < LOWEST_HZ:
+            values = 1e6 * values
+            self.notes.append(f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz")
         same = len(np.unique(values)) == 1
         self.arrays["carrier_hz"] = values[0] if same else values
         if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,16 +16,25 @@ import numpy as np
 import pandas as pd
 from fsspec.core import url_to_fs
 
-from gsparc.data.errors import DataError, Problems, reason
+from gsparc.data.errors import Caution, DataError, Problems, lines_of, reason
 from gsparc.data.files import checked_line
 from gsparc.data.tables import TABLE_SUFFIXES
-from gsparc.data.tables.heads import understand
+from gsparc.data.tables.heads import PERCENT, UNITS, Unit, understand
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
 # What stands for no value, in small letters.
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "#n/a", "null", "none", "nil", "?", ".")
+# What stands for "not heard" in a cell of a level, however rare; other text does where it repeats.
+NOT_HEARD = re.compile(r"n\.?[pdh]\.?|oor|-inf|not? (?:heard|signal|detected|service|coverage)")
+REPEATS = 3
+MEASURED = re.compile(r"\s*([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)\s*", re.IGNORECASE)
+SEXAGESIMAL = re.compile(
+    r"\s*([nsew]?)\s*([-+]?)(\d{1,3}(?:\.\d+)?)(?:\s*[°º:d\s]\s*(?:(\d{1,2}(?:\.\d+)?)"
+    r"(?:\s*['′’:m\s]\s*(?:(\d{1,2}(?:\.\d+)?)\s*(?:[\"″”s]|''|′′)?)?)?)?)?\s*([nsew]?)\s*",
+    re.IGNORECASE,
+)
 DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
 DECIMAL_POINT = r"\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*"
 
@@ -40,6 +50,7 @@ class Sheet:
         rows: what a message calls each row: `line 2`, `row 0`.
         decimal: `.` or `,`, of numbers that are text.
         problems: takes what is wrong.
+        marks: texts that stand for "not heard" among levels that were read, and how often each does.
     """
 
     source: str
@@ -48,6 +59,7 @@ class Sheet:
     rows: tuple[str, ...]
     decimal: str = "."
     problems: Problems = field(default_factory=lambda: Problems(""))
+    marks: Counter[str] = field(default_factory=Counter)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -78,23 +90,47 @@ class Sheet:
         empty = missing | np.isin(np.char.lower(text.astype(str)), MISSING)
         return np.where(empty, "", text).astype(str)
 
-    def numbers(self, head: str) -> np.ndarray | None:
-        """Numbers (S,) float64 of a column, NaN for no value; None, and noted, where a cell is text."""
+    def numbers(
+        self,
+        head: str,
+        unit: Unit | None = None,
+        suits: Callable[[Unit], bool] = lambda unit: False,
+        levels: bool = False,
+    ) -> np.ndarray | None:
+        """Numbers (S,) float64 of a column, NaN for no value; None, and noted, where a cell is text.
+
+        Args:
+            head: of the column.
+            unit: that its head says; values are in the schema's.
+            suits: whether cells may hold a unit.
+            levels: whether text that repeats may stand for "not heard": minus infinity.
+        """
         column = self.columns[self.heads.index(head)]
         if pd.api.types.is_bool_dtype(column.dtype):
             return self.refuse("holds True and False; expected numbers", head)
+        read: dict[str, float | None] = {}
         if pd.api.types.is_numeric_dtype(column.dtype):
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
-            bad = np.isinf(values)
+            bad = (values == np.inf) | (np.isinf(values) & (not levels))
         else:
             cells = [str(cell) for cell in column]
             if self.decimal == ",":
                 # A point in such a file is a second sort of mark, or stands between thousands: refused.
-                cells = ["x" if "." in cell else cell.replace(",", ".") for cell in cells]
+                cells = ["x0" if "." in cell else cell.replace(",", ".") for cell in cells]
             values = pd.to_numeric(np.array(cells, dtype=object), errors="coerce").astype(np.float64)
             bad = ~np.isfinite(values)
             if bad.any():
                 bad[bad] = self.words(head)[bad] != ""
+                counts = Counter(cells[i] for i in np.flatnonzero(bad))
+                before = len(self.problems)
+                read = {text: self._read(text, count * levels, suits, head) for text, count in counts.items()}
+                if len(self.problems) > before:
+                    return None
+        values = values if unit is None else unit.convert(values)
+        if read:
+            understood = [i for i in np.flatnonzero(bad) if read[cells[i]] is not None]
+            values[understood] = [read[cells[i]] for i in understood]
+            bad[understood] = False
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
             texts = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
@@ -104,6 +140,36 @@ class Sheet:
             what = f"is no finite number{hint}; or leave it empty"
             return self.problems.add_rows(self.where(head), rows, what)
         return values
+
+    def _read(self, text: str, count: int, suits: Callable[[Unit], bool], head: str) -> float | None:
+        """The number of a cell with a unit, or of degrees, minutes and seconds; None where it is none.
+
+        Text that `count` cells of a level hold may stand for "not heard": minus infinity.
+        """
+        if count and _silent(text, count):
+            self.marks[text.strip()] += count
+            return -np.inf
+        measured = MEASURED.fullmatch(text)
+        unit = UNITS.get(measured[2].lower()) if measured and measured[2] else Unit("", "")
+        if measured and unit is not None and (not measured[2] or suits(unit)):
+            return float(unit.convert(np.array(float(measured[1]))))
+        if measured and unit is not None and unit.kind == "quality" and suits(UNITS["dbm"]):
+            fault = f"{self.where(head)}: cells are in %: {PERCENT}"
+            self.problems.extend([] if fault in self.problems else [fault])
+            return np.nan  # said once, not of every row
+        parts = SEXAGESIMAL.fullmatch(text) if suits(UNITS["deg"]) else None
+        if parts is None:
+            return None
+        first, sign, *numbers, last = parts.groups()
+        degrees = sum(float(number or 0) / 60**k for k, number in enumerate(numbers))
+        return -degrees if sign == "-" or (first or last).lower() in ("s", "w") else degrees
+
+
+def _silent(text: str, count: int) -> bool:
+    """Whether a text that is no number stands for "not heard" where `count` levels should."""
+    plain = text.strip().lower()
+    repeats = count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain))
+    return repeats or NOT_HEARD.fullmatch(plain) is not None
 
 
 @contextmanager
@@ -179,9 +245,11 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     text, encoding = _decoded(path)
     if encoding != "UTF-8":
         notes.append(f"read as {encoding}")
-    lines, comment = _lines(text, source)
+    lines, comment = _lines(MINUS.sub("-", text), source)
     if not lines:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
+    lines, banner_notes = _without_banner(lines)
+    notes += banner_notes
     excel = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
     if excel:  # Excel's own hint
         del lines[min(lines)]
@@ -198,7 +266,8 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         raise DataError(f"{source}: {fault} are read: write Parquet, with dataset.cell_m where rows are many")
     lines = _with_heads(lines, comment, delimiter, source)
     lines, comment_notes = _without_comments(lines, delimiter, source)
-    notes += comment_notes
+    lines, again_notes = _heads_once(lines)
+    notes += comment_notes + again_notes
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
     for i, head in enumerate(heads):
@@ -253,6 +322,39 @@ def _lines(text: str, source: str) -> tuple[Lines, str]:
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
             lines[number] = line
     return lines, comment
+
+
+MINUS = re.compile(r"(?<![^\s,;|\"'])[\u2212\u2013\u2010\u2011\ufe63\uff0d](?=\s?[\d.,])")
+MOST_ABOVE = 10  # lines above the heads
+
+
+def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
+    """The lines from the heads on, where lines above them that hold something else leave no doubt; a note."""
+    numbers = list(lines)[:LOOKED_AT]
+    for delimiter in DELIMITERS:
+        cells = [_cells(lines[n], delimiter) for n in numbers]
+        usual = Counter(map(len, cells)).most_common(1)[0][0]
+        roles = [sum(understand(cell).role is not None for cell in row) for row in cells[:MOST_ABOVE]]
+        first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
+        filled = [sum(bool(cell.strip()) for cell in row) for row in cells[:first]]
+        above = [len(row) != usual or 2 * n <= usual for row, n in zip(cells, filled, strict=False)]
+        if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
+            kept = {n: line for n, line in lines.items() if n >= numbers[first]}
+            note = f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
+            return kept, [note]
+    return lines, []
+
+
+def _heads_once(lines: Lines) -> tuple[Lines, list[str]]:
+    """The lines without those that repeat the heads, as in files joined, and a note."""
+    first, *below = lines
+    line = lines[first].strip()
+    again = {n for n in below if lines[n].strip("\ufeff \t") == line}
+    if not again:
+        return lines, []
+    where = lines_of([f"line {n}" for n in sorted(again)])
+    what = Caution(f"{where}: the heads again; left out: are these files joined that belong together?")
+    return {n: text for n, text in lines.items() if n not in again}, [what]
 
 
 def _cells(line: str, delimiter: str) -> list[str]:

@@ -219,7 +219,7 @@ def _overrides(path: Path) -> tuple[str, ...]:
 def _config(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
-    return dict(leaves(yaml.safe_load(path.read_text(encoding="utf-8")) or {}))
+    return dict(leaves(load_yaml(path.read_text(encoding="utf-8"), path) or {}))
 
 
 def number(value: object) -> float | None:

@@ -101,9 +101,6 @@ def test_sound_degrees():
         (lambda v: -v + 40, "all positive: losses, percent, or linear?"),
         (lambda v: np.round((v + 100) / 2), "whole numbers from"),
         (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
-        (lambda v: np.where(np.arange(len(v)) % 5 == 0, 100, v), "exactly 100, far from all others"),
-        (lambda v: np.where(np.arange(len(v)) % 5 == 0, -200, v), "exactly -200, far from all others"),
-        (lambda v: np.where(np.arange(len(v)) % 5 == 0, 5.5e-9, v), "exactly 0, far"),  # 0 dB, of float32
         (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? leave them empty and give"),
         (lambda v: v * 0 - 3, "all levels are -3 dB"),
     ],

@@ -1,0 +1,373 @@
+"""Tables and arrays as strangers make them: each kind is read right, or named."""
+
+from __future__ import annotations
+
+from io import StringIO
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.io import savemat
+
+from gsparc.commands.check import check
+from gsparc.data.datasets.own import Own, read_any
+from gsparc.data.own import write_own
+
+GIVEN = Path(__file__).parents[3] / "shared" / "data" / "strangers"
+ROWS = 240
+RNG = np.random.default_rng(3)
+PLACES = np.round(np.c_[RNG.uniform(0, 60, ROWS), RNG.uniform(0, 40, ROWS)], 2)
+AT = np.array([[5.0, 5], [55, 8], [10, 35]])
+AWAY = np.linalg.norm(PLACES[:, None] - AT, axis=2)
+LEVELS = np.round(-40 - 25 * np.log10(np.maximum(AWAY, 1)) + RNG.normal(0, 2, AWAY.shape))
+NORTH, EAST = 48.2 + PLACES[:, 1] / 1.1e4, 16.37 + PLACES[:, 0] / 7.4e3
+DEAF = np.quantile(LEVELS, 0.6) > LEVELS
+
+
+def said(path: Path, **settings) -> str:
+    out = StringIO()
+    check(str(path), Console(file=out, width=2000), **settings)
+    return out.getvalue()
+
+
+def table(heads: str, *columns) -> str:
+    lines = [",".join(map(str, row)) for row in zip(*columns, strict=True)]
+    return "\n".join([heads, *lines]) + "\n"
+
+
+def wide(mark) -> str:
+    cells = np.where(DEAF, str(mark), LEVELS.astype(int).astype(str))
+    return table("x,y,AP1,AP2,AP3", *PLACES.T, *cells.T)
+
+
+def long(heads: str, *more, level=LEVELS[:, 0], places=PLACES) -> str:
+    return table(f"x,y,rssi,{heads}", *places.T, level, *more)
+
+
+FLOOR = RNG.integers(0, 3, ROWS)
+BAND = RNG.integers(0, 2, ROWS)
+ZERO = np.where(np.arange(ROWS)[:, None] < 12, 0, np.c_[NORTH, EAST])
+HALF = np.where(np.arange(ROWS)[:, None] < ROWS * 0.6, 0, np.c_[NORTH, EAST])
+MINUTES = [f"{int(v)} {60 * (v % 1):.4f} N" for v in NORTH], [f"{int(v)}°{60 * (v % 1):.4f}'E" for v in EAST]
+NMEA = [100 * int(v) + 60 * (v % 1) for v in NORTH], [100 * int(v) + 60 * (v % 1) for v in EAST]
+ZONES = PLACES + np.where(np.arange(ROWS)[:, None] < 80, [700_000, 5e6], [300_000, 5e6])
+WAY = np.c_[np.linspace(0, 60, ROWS), np.full(ROWS, 9.0)]
+ALONG = np.round(-30 - 70 * np.log10(1 + 0.3 * WAY[:, 0]), 1)
+STUCK = np.where((np.arange(ROWS)[:, None] > 60) & (np.arange(ROWS)[:, None] < 180), WAY[61], WAY)
+IN_FEET = table("name,x,y", "abc", *(AT / 0.3048).T)
+OF_THREE = [
+    f"{name},{x},{y},{v}"
+    for (x, y), row in zip(PLACES, LEVELS, strict=True)
+    for name, v in zip("abc", row, strict=True)
+]
+THREE = "\n".join(["station,x,y,rssi", *OF_THREE])
+
+# name: content, settings, what `check` must say, what it must not.
+CASES = {
+    "a mark far above": (
+        wide(100),
+        {},
+        "exactly 100, apart from all others: taken as not heard",
+        ">kilowatt",
+    ),
+    "a mark far below": (wide(-999), {}, "exactly -999, apart from all others: taken as not heard", ""),
+    "a mark at zero": (wide(0), {}, "levels are exactly 0, apart from all others", ""),
+    "rows beside a station": (
+        long("t", range(ROWS), level=np.where(np.arange(ROWS) < 5, -20, np.minimum(LEVELS[:, 0], -55))),
+        {},
+        "good",
+        "not heard",
+    ),
+    "a mark beyond any level": (wide(100000), {}, "394 of 720 levels are exactly 100000", "refused"),
+    "a mark just below": (wide(-105), {}, "394 of 720 levels are exactly -105, apart", ""),
+    "a text": (wide("No Service"), {}, "394 of 720 levels are 'No Service': taken as not heard", "refused"),
+    "below a limit": (wide("<-95"), {}, "394 of 720 levels are '<-95': taken as not heard", "refused"),
+    "no power": (wide("-inf"), {}, "394 of 720 powers were not heard", "refused"),
+    "a mark that is none": (wide(100), {"not_heard": []}, "394 levels above 60 dBm", "taken as not heard"),
+    "absent": (THREE.replace("c,", "b,", 9), {"absent": "silent"}, "links without a row were not heard", ""),
+    "no fix": (
+        table("lat,lon,rssi", *ZERO.T, LEVELS[:, 0]),
+        {},
+        "lines 2 to 13: latitude and longitude are 0",
+        "",
+    ),
+    "mostly no fix": (
+        table("lat,lon,rssi", *HALF.T, LEVELS[:, 0]),
+        {},
+        "these 144 of 240 rows are left out",
+        "",
+    ),
+    "minutes": (table("lat,lon,rssi", *MINUTES, LEVELS[:, 0]), {}, "north of 48.20", "refused"),
+    "NMEA": (table("lat,lon,rssi", *NMEA, LEVELS[:, 0]), {}, "as NMEA writes them (ddmm.mmmm)", "more rows"),
+    "ten millionths": (
+        table("lat,lon,rssi", *(np.c_[NORTH, EAST] * 1e7).astype(int).T, LEVELS[:, 0]),
+        {},
+        "times ten million",
+        "",
+    ),
+    "degrees in metres": (
+        table("LAT,LON,rssi", *(PLACES + np.array([5e6, 4e5])).T, LEVELS[:, 0]),
+        {},
+        "dataset.columns.x=LON dataset.columns.y=LAT",
+        "",
+    ),
+    "two zones": (
+        long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES),
+        {},
+        "two groups of places 399.9 km apart, as column 'grid' says",
+        "millimetres",
+    ),
+    "a stuck fix": (
+        long("t", range(ROWS), level=ALONG, places=STUCK),
+        {},
+        "line 63 to line 181: the place stands still",
+        "",
+    ),
+    "a list in feet": (THREE, {"stations_file": IN_FEET}, "far better if the stations are in feet", ""),
+    "floors": (
+        long("Storey", FLOOR, level=LEVELS[:, 0] - 15 * FLOOR),
+        {},
+        "dataset.columns.z=Storey*3.2",
+        "",
+    ),
+    "floors as metres": (
+        long("floor", FLOOR),
+        {"columns": {"z": "floor"}},
+        "floors as heights in metres?",
+        "",
+    ),
+    "a floor of 3.2 m": (long("floor", FLOOR), {"columns": {"z": "floor*3.2"}}, "x 6.40 m", "warning"),
+    "a flight in feet": (
+        table(
+            "lat,lon,rssi,height_above_takeoff(feet)", NORTH, EAST, LEVELS[:, 0], RNG.uniform(30, 160, ROWS)
+        ),
+        {},
+        "feet turned into m",
+        "",
+    ),
+    "above the sea": (
+        long("alt_msl[m]", RNG.uniform(430, 460, ROWS)),
+        {},
+        "'alt_msl[m]' taken as z",
+        "not used",
+    ),
+    "an area and a cell": (
+        long("cell_id,tac", 7 + 0 * BAND, BAND),
+        {},
+        "2 stations, 2 of them at unknown places: 7 1, 7 0",
+        "",
+    ),
+    "columns that are said": (
+        long("site,antenna", 7 + 0 * BAND, BAND),
+        {"columns": {"station": "site+antenna"}},
+        "2 stations, 2 of",
+        "",
+    ),
+    "a column that splits": (
+        long("site,antenna", 7 + 0 * BAND, BAND, level=LEVELS[:, 0] - 12 * BAND),
+        {},
+        "dataset.columns.station=site+antenna tells them apart",
+        "",
+    ),
+    "hopping": (
+        long("gateway,freq_mhz", ["g"] * ROWS, RNG.choice([867.1, 868.1, 868.5], ROWS)),
+        {},
+        "1 stations",
+        "warning",
+    ),
+    "two bands": (long("gateway,freq_mhz", ["g"] * ROWS, 434 + 434 * BAND), {}, "2 stations", ""),
+    "a rounded name": (
+        long("gateway_eui", np.where(BAND == 1, "1.2E+15", "b")),
+        {},
+        "rounded by a spreadsheet",
+        "",
+    ),
+    "a receiver in saturation": (
+        long("t", range(ROWS), level=np.minimum(LEVELS[:, 0], -76)),
+        {},
+        "levels are exactly -76, the most: a receiver in saturation?",
+        "",
+    ),
+    "a banner": ("App 2,site 7\nexported 2024\n" + wide(-999), {}, "the heads stand in line 3", "refused"),
+    "a banner with a role in it": (
+        "WigleWifi-1.6,model=x,device=x,display=kismet\n"
+        + table(
+            "MAC,Frequency,RSSI,CurrentLatitude,CurrentLongitude",
+            "a" * ROWS,
+            [2412] * ROWS,
+            LEVELS[:, 0],
+            NORTH,
+            EAST,
+        ),
+        {},
+        "2.412 GHz",
+        "refused",
+    ),
+    "a node and a cell": (
+        long("Cell ID,eNodeB ID", 1 + 0 * BAND, BAND),
+        {},
+        "2 stations, 2 of them at unknown places: 1 1, 1 0",
+        "",
+    ),
+    "a quality": (
+        table("x,y,quality", *PLACES.T, LEVELS[:, 0] + 110),
+        {},
+        "'quality' is a quality, not a level",
+        "",
+    ),
+    "joined files": (wide("") + wide(""), {}, "line 242: the heads again; left out", "refused"),
+    "a proper minus sign": (long("t", range(ROWS)).replace("-", "\N{MINUS SIGN}"), {}, "good", "refused"),
+    "units in cells": (
+        long("t", range(ROWS), level=[f"{v} dBm" for v in LEVELS[:, 0]]),
+        {},
+        "good",
+        "refused",
+    ),
+    "per cent in cells": (
+        long("t", range(ROWS), level=[f"{v + 110}%" for v in LEVELS[:, 0]]),
+        {},
+        "a quality, not a level",
+        "more rows",
+    ),
+    "losses": (table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]), {}, "rssi_db=path_loss*-1 takes losses", ""),
+    "losses that are said": (
+        table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]),
+        {"columns": {"rssi_db": "path_loss*-1"}},
+        "good",
+        "warning",
+    ),
+    "a survey": (
+        table("X,Y,02:00:00:00:00:a1;lab,02-00-00-00-00-b1", *PLACES.T, *LEVELS[:, :2].T),
+        {},
+        "2 stations",
+        "refused",
+    ),
+    "many of a kind": (
+        "\n".join(
+            [
+                ",".join(["x", "y", *(f"AP{i}" for i in range(30))]),
+                *(
+                    ",".join([f"{x},{y}", *(str(-50 - 40 * (n == 100 + i) - n % 3) for i in range(30))])
+                    for n, (x, y) in enumerate(PLACES)
+                ),
+            ]
+        ),
+        {},
+        "(and 29 more warnings of this kind)",
+        "station AP7",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_table_of_a_stranger(write, name):
+    content, settings, says, silent = CASES[name]
+    if "stations_file" in settings:
+        settings = {"stations_file": write(settings["stations_file"], "sites.csv")}
+    found = said(write(content), **settings)
+    assert says in found and (not silent or silent not in found), found
+
+
+def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):
+    data = read_any(write(wide(100))).data
+    assert data.censored.sum() == 394 and (data.censored == DEAF.ravel()).all()
+    level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
+    assert abs(level[~data.censored].min() - LEVELS[~DEAF].min()) < 1e-3  # of float32
+
+
+def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
+    path = write(long("Storey", FLOOR, level=ALONG, places=STUCK))
+    Own(path).load()
+    warned = [
+        line.removeprefix("warning").strip() for line in said(path).splitlines() if line.startswith("warning")
+    ]
+    logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warned) > 2 and all(any(text in line for line in logged) for text in warned), warned
+
+
+def test_absent_links_are_silent_only_where_somebody_says_so(write):
+    path = write("\n".join(["station,x,y,rssi", *OF_THREE[::3], *OF_THREE[1::6]]))
+    unknown, silent = read_any(path).data, read_any(path, absent="silent").data
+    assert unknown.censored is None and len(silent) == 2 * ROWS
+    assert silent.censored.sum() == ROWS // 2
+
+
+def channels() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    csi = rng.normal(size=(30, 4)) + 1j * rng.normal(size=(30, 4))
+    return {"rx_position": rng.uniform(0, 9, (30, 3)), "tx_position": np.array([4.0, 2, 2]), "csi": csi,
+            "frequency_hz": 2.4e9 + np.arange(4) * 1e6}  # fmt: skip
+
+
+@pytest.mark.parametrize("names", [("real", "imag"), ("r", "i")])
+def test_compounds_of_real_and_imaginary_parts_were_refused(tmp_path, names):
+    arrays, wanted = channels(), write_own(tmp_path / "a.npz", channels())
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, array in arrays.items():
+            parts = array
+            if name == "csi":
+                parts = np.zeros(array.shape, [(part, "f8") for part in names])
+                parts[names[0]], parts[names[1]] = array.real, array.imag
+            file[name] = parts
+    np.testing.assert_array_equal(read_any(tmp_path / "a.h5").data.target, wanted.target)
+
+
+@pytest.mark.parametrize("version", ["5", "7.3"])
+def test_files_of_matlab_were_refused(tmp_path, version):
+    arrays, wanted, path = channels(), write_own(tmp_path / "a.npz", channels()), tmp_path / "a.mat"
+    if version == "5":
+        savemat(path, {**arrays, "name": "hall"})
+    else:
+        with h5py.File(path, "w", userblock_size=512) as file:
+            for name, array in arrays.items():
+                file[name] = np.atleast_2d(array).T
+            file["name"] = np.array([[ord(letter)] for letter in "hall"], np.uint16)
+            file["name"].attrs["MATLAB_class"] = np.bytes_("char")
+    data = read_any(path).data
+    np.testing.assert_array_equal(data.target, wanted.target)
+    assert data.site.name == "hall"
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad", ""])
+def test_amplitudes_and_phases_are_channels(write, unit):
+    arrays = channels()
+    phase = np.angle(arrays["csi"]) * (1 if unit != "deg" else 180 / np.pi)
+    heads = [f"csi_amp_{k},csi_phase_{k}{'_' if unit else ''}{unit}" for k in range(4)]
+    columns = np.stack([np.abs(arrays["csi"]), phase], axis=2).reshape(30, 8)
+    text = table(",".join(["x,y,z", *heads]), *arrays["rx_position"].T, *columns.T)
+    where = {"tx_x": 4, "tx_y": 2, "tx_z": 2, "frequency_hz": "2.4e9:2.403e9"}
+    data = read_any(write(text), where).data
+    np.testing.assert_allclose(data.target[:, 0] * data.site.target_scale, arrays["csi"], atol=1e-5)
+
+
+STRANGERS = {
+    "c02_wigle.csv": "2 stations",
+    "c02_20_null.csv": "lines 2 to 20:",
+    "c02_half_null.csv": "lines 2 to 208:",
+    "c03_minus.csv": "3 stations",
+    "c03_percent.csv": "a quality, not a level",
+    "c03_survey.csv": "3 stations",
+    "c06_pci.csv": "3 stations",
+    "c06_dms.csv": "3 stations",
+    "c06_nmea.csv": "NMEA",
+    "c06_glued.csv": "line 243: the heads",
+    "c07_utm.csv": "379.6 km apart, as column 'zone' says",
+    "c07_floors.csv": "z=FLOOR*3.2",
+    "c07_uji.csv": "dataset.columns.x=LONGITUDE",
+    "c08_gw_null.csv": "ttn-roof-3: no fix",
+    "c10_dji.csv": "x 40.00 m",
+    "c11_us915.csv": "1 stations",
+    "silent_100.csv": "514 of 720 levels are exactly 100",
+    "silent_200.csv": "exactly -200",
+    "silent_NP.csv": "514 of 720 levels are 'NP'",
+    "c10_compound.h5": "good",
+}
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+def test_a_file_of_a_stranger(name):
+    if not (GIVEN / name).exists():
+        pytest.skip(f"{GIVEN / name} is not there")
+    assert STRANGERS[name] in said(GIVEN / name)
