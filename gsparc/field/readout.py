@@ -58,8 +58,8 @@ def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solve
     missing = (rendered - _lines(trial) @ view) @ view.mH
     lines = torch.linalg.solve(gram + ridge, missing.to(gram.dtype).mH).mH.to(view.dtype)
     correction = torch.view_as_real(lines) if lines.is_complex() else lines.unsqueeze(-1)
-    trial.emission.weight2 += correction[:-1].transpose(0, 1)
-    trial.emission.bias2 += correction[-1]
+    trial.emission.weight2.add_(correction[:-1].transpose(0, 1))
+    trial.emission.bias2.add_(correction[-1])
     error = trial(batch.tx, batch.rx).mean - model(batch.tx, batch.rx).mean
     return Solved(trial.emission.weight2, trial.emission.bias2, float(error.square().mean().sqrt()))
 

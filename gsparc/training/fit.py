@@ -218,7 +218,7 @@ def run_stage(
     budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
     steps, position = (int(metrics[name]) if name in metrics else None for name in KEPT)
     taken = int(metrics[TAKEN])
-    timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]
+    timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[union-attr]
     timed_out = any((timer.time_remaining() or 0) <= 0 for timer in timers)
     if timed_out:
         log.warning("trainer.max_time ended training after %d of %d steps", taken, module.total_steps)

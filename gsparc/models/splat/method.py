@@ -488,7 +488,7 @@ class LearnedField(Method):
         own = super().facts()
         if self.choices is not None:
             chosen = {"init": self.choices.init, "encoding": self.choices.encoding}
-            chosen |= {"activation": self.choices.activation, "steps": self.steps_taken}
+            chosen |= {"activation": self.choices.activation, "steps": str(self.steps_taken)}
             own |= {"model/choices": ", ".join(f"{name}={value}" for name, value in chosen.items())}
             own |= {"model/init": self.choices.init}
         return own | {
