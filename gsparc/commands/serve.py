@@ -18,6 +18,8 @@ from gsparc.data.limits import SettingError, whole
 from gsparc.evaluation.console import open_console
 from gsparc.prediction.operating_point import load
 
+OTHERS = 64  # files that are open beside connections: the log, libraries
+
 
 def loopback(host: str) -> bool:
     """Whether nobody else reaches it."""
@@ -36,10 +38,13 @@ def task(config: DictConfig) -> None:
         raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
-    from gsparc.prediction.serving import Limits, Server, application, open_files
+    from gsparc.prediction.serving import Limits, Server, application
 
     limits = Limits(**{field.name: config[field.name] for field in fields(Limits)})
-    _allow(open_files(limits), limits.connections)
+    needed, allowed = 2 * limits.connections + OTHERS, resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if 0 <= allowed < needed:
+        files = f"{needed} open files may be needed, {allowed} are allowed"
+        raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
     predictor = load(config.ckpt)
     predictor = predictor if config.station is None else predictor.at(config.station)
     if predictor.site.static_end is None or (predictor.site.stations and config.station is None):
@@ -49,15 +54,3 @@ def task(config: DictConfig) -> None:
     gc.freeze()  # going through all that was loaded held up answers by half a second
     with suppress(KeyboardInterrupt):  # the server has ended by then
         Server(app, limits, host=config.host, port=config.port).run()
-
-
-def _allow(files: int, connections: int) -> None:
-    """Let this process open so many files."""
-    now, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if most != resource.RLIM_INFINITY and most < files:
-        less = f"say ulimit -n {files}, or fewer connections"
-        raise SettingError(
-            f"connections={connections}: {files} open files are needed, {most} are allowed; {less}"
-        )
-    if now != resource.RLIM_INFINITY and now < files:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (files, most))

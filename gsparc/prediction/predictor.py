@@ -149,7 +149,7 @@ class Predictor:
             ValueError: measured in metres about an unknown origin, or no positions.
         """
         origin = self._georeference()
-        places = checked_positions("position", position)
+        places = as_places("position", position)
         latitude, longitude = origin.to_degrees(np.atleast_2d(places)[:, :2])
         if places.ndim == 1:
             return float(latitude[0]), float(longitude[0]), float(places[2])
@@ -283,7 +283,7 @@ class Predictor:
         heard = snapshots.of_values(self.site, values, silent)
         unknown = locator.Unknown(phase_known, offset_db)
         low_high = self.site.moving_box[:, :3] + self.site.origin
-        places = low_high if where is None else np.atleast_2d(checked_positions("where", where))
+        places = low_high if where is None else np.atleast_2d(as_places("where", where))
         key = (places.tobytes(), unknown, share)
         if key not in self._locators:
             cells = locator.cover(places - self.site.origin, locator.MOST, where is not None)
@@ -400,9 +400,7 @@ class Predictor:
         """Both ends as they were given, checked."""
         receiver = rx.position if isinstance(rx, Pose) else rx
         places = {
-            end: checked_positions(end, value)
-            for end, value in (("tx", tx), ("rx", receiver))
-            if value is not None
+            end: as_places(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
         }
         moving, static = self.site.moving_end, self.site.static_end or "tx"
         for needed in (moving,) if self.site.static_end else ("rx", "tx"):
@@ -476,7 +474,7 @@ def usual_heights(site: Site) -> dict[End, float]:
     return {end: above[end] for i, end in enumerate(moving) if low[i] == high[i]}
 
 
-def checked_positions(end: str, value: Any) -> np.ndarray:
+def as_places(end: str, value: Any) -> np.ndarray:
     """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
     try:
         array = numbers(value) if isinstance(value, Tensor) else np.asarray(value)

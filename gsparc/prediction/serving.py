@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import hmac
 import socket
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import uvicorn
@@ -23,16 +23,13 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gsparc.data.limits import POSITIVE, Checked, SettingError, number, setting, whole
-from gsparc.data.schema import End
-from gsparc.prediction.predictor import Predictor, checked_positions
+from gsparc.prediction.predictor import Predictor, as_places
 
 RAW = "application/octet-stream"
-PLACE, BYTES = 12, 64  # bytes of a place, raw and at most as JSON
-PIECE = 8192  # numbers or bytes of what is written or read at once: a millisecond, the others wait
+PLACE, BYTES, MORE = 12, 64, 8192  # bytes of a place, raw and at most as JSON, and of what is around places
+PIECE = 8192  # numbers that are written at once: a millisecond, in which nobody else is answered
 QUEUE = 2048  # connections that wait in the kernel
-STOP_S = 10  # that requests under way have to end
-OTHERS = 64  # files: of the log, of libraries
-KEEP_S = 5  # that a connection without a request stays
+KEEP_S, STOP_S = 5, 10  # that a connection without a request stays, that requests have when the server stops
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,8 @@ class Limits(Checked):
     """Of a server; `conf/serve.yaml` has the reasons.
 
     Attributes:
-        most, numbers: places and numbers of an answer, and of what is computed at once.
-        connections: open at once; of more the one that waits longest without a whole request is ended.
+        most, numbers: places and numbers of an answer.
+        connections: open at once; of more, one that waits long or asks for much is ended.
         request_s: from the first byte of a request to the last of its answer [s].
         delay_ms: that a request waits for others, to be computed with them.
     """
@@ -51,11 +48,6 @@ class Limits(Checked):
     connections: int = setting(64, whole(1))
     request_s: float = setting(10.0, POSITIVE)
     delay_ms: float = setting(2.0, number(0, 1000))
-
-    @property
-    def at_once(self) -> int:
-        """Connections taken before others are read: until one is, thrice as many may come."""
-        return max(1, self.connections // 8)
 
 
 class Places(BaseModel):
@@ -75,36 +67,29 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """See the base class; where there are too many, another one is ended."""
         super().connection_made(transport)
-        self.end, self.received = self._ends_after(self.limits.request_s), 0
-        if len(self.connections) > self.limits.connections:
-            others = {one for one in self.connections if isinstance(one, Connection)} - {self}
-            works = {one for one in others if one.works}
-            # Half the room is for those who have just come: their requests are not read yet.
-            if 2 * len(works) > self.limits.connections:
-                other = max(works, key=lambda one: one.received)
-            else:
-                other = min(others - works, key=lambda one: one.end.when())
-            self.connections.discard(other)
-            other.transport.abort()
+        self.end = self.loop.call_later(self.limits.request_s, transport.abort)
+        if len(self.connections) <= self.limits.connections:
+            return
+        others = [one for one in self.connections if isinstance(one, Connection) and one is not self]
+        works = [one for one in others if one.works()]
+        if (
+            2 * len(works) > self.limits.connections
+        ):  # half the room is for those whose request is not read yet
+            other = max(works, key=lambda one: one.cycle.scope.get("places", 0))
+        else:
+            other = min((one for one in others if not one.works()), key=lambda one: one.end.when())
+        self.connections.discard(other)
+        other.transport.abort()
 
-    def _ends_after(self, seconds: float) -> asyncio.TimerHandle:
-        return self.loop.call_later(seconds, self.transport.abort)
-
-    @property
     def works(self) -> bool:
         """Whether the answer to a whole request is computed, or written to a client that reads."""
         cycle = self.cycle
         return bool(cycle) and not (cycle.more_body or cycle.response_complete or self.flow.write_paused)
 
-    def data_received(self, data: bytes) -> None:
-        """See the base class."""
-        self.received += len(data)
-        super().data_received(data)
-
     def on_response_complete(self) -> None:
         """See the base class; the next request has its own time."""
         self.end.cancel()
-        self.end, self.received = self._ends_after(self.limits.request_s + KEEP_S), 0
+        self.end = self.loop.call_later(self.limits.request_s + KEEP_S, self.transport.abort)
         super().on_response_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -116,49 +101,21 @@ class Connection(H11Protocol):
 class Server(uvicorn.Server):
     """uvicorn within limits: of requests nothing is logged, and the log is the command's, which is open."""
 
-    def __init__(self, app: FastAPI, limits: Limits, **listen: Any) -> None:
-        config = uvicorn.Config(
-            app, http=partial(Connection, limits), ws="none", log_config=None, log_level="error",  # type: ignore[arg-type]
-            access_log=False, backlog=limits.at_once, timeout_keep_alive=KEEP_S,
-            timeout_graceful_shutdown=STOP_S, **listen,
-        )  # fmt: skip
-        super().__init__(config)
+    def __init__(self, app: ASGIApp, limits: Limits, **listen: Any) -> None:
+        listen |= {"ws": "none", "log_config": None, "log_level": "error", "access_log": False}
+        listen |= {"timeout_keep_alive": KEEP_S, "timeout_graceful_shutdown": STOP_S}
+        at_once = max(1, limits.connections // 8)  # until the first of them is read, thrice as many may come
+        super().__init__(uvicorn.Config(app, http=partial(Connection, limits), backlog=at_once, **listen))  # type: ignore[arg-type]
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """See the base class; the kernel lets more wait than are taken at once."""
         await super().startup(sockets)
-        for listener in (one for server in self.servers for one in server.sockets):
+        for listener in self.servers[0].sockets:
             with socket.fromfd(listener.fileno(), listener.family, listener.type) as same:
                 same.listen(QUEUE)
 
 
-def open_files(limits: Limits) -> int:
-    """Files that a server has open at most, with connections taken before others are ended."""
-    return limits.connections + 3 * limits.at_once + OTHERS
-
-
-class Guard:
-    """Lets through what bears the token, and questions for health."""
-
-    def __init__(self, app: ASGIApp, token: str) -> None:
-        self.app, self.wanted = app, f"Bearer {token}".encode()
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """See ASGI."""
-        given = dict(scope.get("headers", ())).get(b"authorization", b"")
-        if (
-            scope["type"] == "http"
-            and scope["path"] != "/healthz"
-            and not hmac.compare_digest(given, self.wanted)
-        ):
-            said = {"detail": "Authorization: Bearer TOKEN is needed"}
-            answer = JSONResponse(said, 401, {"connection": "close", "www-authenticate": "Bearer"})
-            return await answer(scope, receive, send)
-        await self.app(scope, receive, send)
-
-
-@dataclass(frozen=True, eq=False)
-class Asked:
+class Asked(NamedTuple):
     """A request that waits: how many places its body holds if it is sound, and where its answer comes."""
 
     count: int
@@ -183,34 +140,28 @@ class Batcher:
 
     async def ask(self, count: int, body: bytes, raw: bool) -> np.ndarray:
         """Answers (n, ...) at the world places (n, 3) [m] of a body; raises what reading and the model do."""
-        asked = Asked(count, body, raw, asyncio.get_running_loop().create_future())
-        self.waiting.append(asked)
+        self.waiting.append(Asked(count, body, raw, asyncio.get_running_loop().create_future()))
         self.some.set()
-        return await asked.answer
+        return await self.waiting[-1].answer
 
     async def run(self) -> None:
         """Until cancelled; a request whose client left is dropped."""
         while True:
             await self.some.wait()
-            if sum(one.count for one in self.waiting) < self.most:
-                await asyncio.sleep(self.delay_s)
+            await asyncio.sleep(self.delay_s)
             batch = self._next()
             for one, found in zip(batch, await asyncio.to_thread(self._answers, batch), strict=True):
-                if one.answer.done():
-                    continue
-                if isinstance(found, Exception):
-                    one.answer.set_exception(found)
-                else:
-                    one.answer.set_result(found)
+                if not one.answer.done():
+                    failed = isinstance(found, Exception)
+                    (one.answer.set_exception if failed else one.answer.set_result)(found)  # type: ignore[arg-type]
 
     def _next(self) -> list[Asked]:
         """The request that waits longest, and the smallest others: few places do not wait for many."""
         waiting = [one for one in self.waiting if not one.answer.done()]
         batch, left = waiting[:1], self.most
         for one in sorted(waiting[1:], key=lambda one: one.count):
-            if one.count <= left:
-                batch.append(one)
-                left -= one.count
+            left -= one.count
+            batch += [one] if left >= 0 else []
         self.waiting = [one for one in waiting if one not in batch]
         if not self.waiting:
             self.some.clear()
@@ -218,79 +169,69 @@ class Batcher:
 
     def _answers(self, batch: list[Asked]) -> list[np.ndarray | Exception]:
         """Of each request, or its own fault."""
-        places: list[np.ndarray] = []
+        site = self.predictor.site
         try:
-            places = [_read(self.predictor.site.moving_end, one) for one in batch]
-            if not places:
-                return []
-            ask = getattr(self.predictor, self.predictor.site.kind)
-            values = ask(**{self.predictor.site.moving_end: np.concatenate(places)})
+            places = [np.zeros((0, 3)), *(_read(site.moving_end, one) for one in batch)]
+            values = getattr(self.predictor, site.kind)(**{site.moving_end: np.concatenate(places)})
             values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
-            parts = np.split(values.astype("<f4", copy=False), np.cumsum([len(one) for one in places])[:-1])
-            return [part.copy() for part in parts]  # a view would keep the others' answers
+            parts = np.split(values.astype("<f4"), np.cumsum([len(one) for one in places])[:-1])
+            return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
         except Exception as error:
             return [error] if len(batch) == 1 else [self._answers([one])[0] for one in batch]
 
 
-def numbers_of(predictor: Predictor) -> int:
-    """Numbers of an answer at one place, two of each entry of a channel."""
-    site = predictor.site
-    middle = site.moving_box.mean(0) + site.origin
-    values = np.asarray(getattr(predictor, site.kind)(**{site.moving_end: middle}))
-    return values.size * (2 if np.iscomplexobj(values) else 1)
-
-
-def application(predictor: Predictor, limits: Limits, token: str | None) -> FastAPI:
+def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGIApp:
     """The routes: POST /predict, GET /healthz.
 
     Args:
         predictor: of one end that moves and one station.
         limits: more places or numbers in one request are refused (413).
-        token: that a request must bear (401); None: none.
+        token: that a request must bear (401) but for /healthz; None: none.
 
     Raises:
         SettingError: an answer at one place holds more numbers than `limits` allow.
     """
-    site, each = predictor.site, numbers_of(predictor)
+    site = predictor.site
+    middle = getattr(predictor, site.kind)(**{site.moving_end: site.moving_box.mean(0) + site.origin})
+    each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
     if each > limits.numbers:
         raise SettingError(
-            f"numbers={limits.numbers}: an answer at one place holds {each}; say numbers={each}"
+            f"numbers={limits.numbers}: an answer at one place holds {each}; say {each} or more"
         )
     most = min(limits.most, limits.numbers // each)
-    batcher, worker = Batcher(predictor, limits.delay_ms / 1e3, most), ThreadPoolExecutor(1)
+    batcher, writer = Batcher(predictor, limits.delay_ms / 1e3, most), ThreadPoolExecutor(1)
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
         work = asyncio.create_task(batcher.run())
         yield
         work.cancel()
-        worker.shutdown(wait=False, cancel_futures=True)
+        writer.shutdown(wait=False, cancel_futures=True)
 
     app = FastAPI(title="gsparc", lifespan=life)
-    if token is not None:
-        app.add_middleware(Guard, token=token)
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
         return {"status": "ok", "kind": site.kind, "model": predictor.method.name, "end": site.moving_end}
 
     async def pieces(values: np.ndarray, raw: bool) -> AsyncIterator[bytes]:
-        parts = _written(values, raw)
-        while part := await asyncio.get_running_loop().run_in_executor(worker, next, parts, b""):
-            yield part
+        rows, loop = max(1, PIECE // each), asyncio.get_running_loop()
+        for first in range(0, len(values), rows):
+            yield await loop.run_in_executor(writer, _written, values, raw, first, first + rows)
 
     @app.post("/predict")
     async def predict(request: Request) -> Response:
-        body, too_many = bytearray(), f"at most {most} places, {each} numbers each"
-        raw = request.headers.get("content-type", "").startswith(RAW)
+        body, raw = bytearray(), request.headers.get("content-type", "").startswith(RAW)
         try:
             async for part in request.stream():
                 body += part
-                count = max(1, len(body) // PLACE if raw else body.count(b"[") - 1)
-                if count > most or len(body) > most * BYTES + PIECE:
-                    raise HTTPException(413, too_many, {"connection": "close"})
+                count = len(body) // PLACE if raw else body.count(b"[") - 1
+                if count > most or len(body) > most * BYTES + MORE:
+                    said = f"at most {most} places, {each} numbers each"
+                    raise HTTPException(413, said, {"connection": "close"})
         except ClientDisconnect:
             raise HTTPException(400, "the client left") from None
+        request.scope["places"] = count = max(count, 1)
         work = asyncio.ensure_future(batcher.ask(count, bytes(body), raw))
         gone = asyncio.ensure_future(request.receive())  # nothing comes after a body but the client's leaving
         await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
@@ -304,46 +245,41 @@ def application(predictor: Predictor, limits: Limits, token: str | None) -> Fast
             raise HTTPException(422 if isinstance(error, ValueError) else 500, str(error)) from error
         kind, shape = RAW if raw else "application/json", {"x-shape": ",".join(map(str, values.shape))}
         if values.size <= PIECE:
-            return Response(b"".join(_written(values, raw)), headers=shape, media_type=kind)
+            return Response(_written(values, raw, 0, len(values)), headers=shape, media_type=kind)
         return StreamingResponse(pieces(values, raw), headers=shape, media_type=kind)
 
-    return app
+    return app if token is None else _guarded(app, f"Bearer {token}".encode())
 
 
-def _read(end: End, asked: Asked) -> np.ndarray:
-    """World places (n, 3) float64 [m] of a body; raises ValueError."""
-    if asked.raw:
-        if len(asked.body) % PLACE:
-            raise ValueError("expected little-endian float32, three a place")
-        return checked_positions(end, np.frombuffer(asked.body, "<f4").reshape(-1, 3))
-    try:
-        return checked_positions(end, Places.model_validate_json(asked.body).places)
-    except ValidationError as error:
-        fault = error.errors(include_url=False, include_input=False)[0]
-        where = "".join(f"[{part}]" if isinstance(part, int) else part for part in fault["loc"])
-        said = f"{where}: {fault['msg']}".lstrip(": ")
-        raise ValueError(f'expected {{"places": [[x, y, z], ...]}}, finite metres: {said}') from None
+def _guarded(app: ASGIApp, wanted: bytes) -> ASGIApp:
+    """Whatever is asked, but for /healthz, needs the token."""
 
-
-def _written(values: np.ndarray, raw: bool) -> Iterator[bytes]:
-    """A body of answers (n, ...) in pieces of about `PIECE` numbers."""
-    if raw:
-        yield from (
-            values.data.cast("B")[first : first + 4 * PIECE] for first in range(0, values.nbytes, 4 * PIECE)
+    async def guard(scope: Scope, receive: Receive, send: Send) -> None:
+        given = dict(scope.get("headers", ())).get(b"authorization", b"")
+        free = scope["type"] == "lifespan" or scope["path"] == "/healthz"
+        refused = JSONResponse(
+            {"detail": "Authorization: Bearer TOKEN is needed"}, 401, {"connection": "close"}
         )
-    else:
-        yield b'{"shape":' + to_json(values.shape) + b',"values":'
-        yield from _rows(values)
-        yield b"}"
+        await (app if free or hmac.compare_digest(given, wanted) else refused)(scope, receive, send)
+
+    return guard
 
 
-def _rows(values: np.ndarray) -> Iterator[bytes]:
-    each = values[0].size
-    for first in range(0, len(values), max(1, PIECE // each)):
-        yield b"," if first else b"["
-        part = values[first : first + max(1, PIECE // each)]
-        if each > PIECE:
-            yield from _rows(part[0])
-        else:
-            yield to_json(part.tolist())[1:-1]
-    yield b"]"
+def _read(end: str, asked: Asked) -> np.ndarray:
+    """World places (n, 3) float64 [m] of a body; raises ValueError."""
+    try:
+        raw = np.frombuffer(asked.body, "<f4").reshape(-1, 3) if asked.raw else None
+        places = Places.model_validate_json(asked.body).places if raw is None else raw
+    except (ValidationError, ValueError):
+        wanted = "little-endian float32, three a place" if asked.raw else '{"places": [[x, y, z], ...]}'
+        raise ValueError(f"expected {wanted}, finite metres, and nothing else") from None
+    return as_places(end, places)
+
+
+def _written(values: np.ndarray, raw: bool, first: int, past: int) -> bytes:
+    """Answers [first, past) of (n, ...), with what is before the first and after the last."""
+    part = values[first:past]
+    if raw:
+        return part.tobytes()
+    head = b"," if first else b'{"shape":' + to_json(values.shape) + b',"values":['
+    return head + to_json(part.tolist())[1:-1] + (b"" if past < len(values) else b"]}")

@@ -129,13 +129,13 @@ def mutated(form: Form, draw: np.random.Generator) -> bytes:
 
 def _even_sets(numbers: list[float], arrays: dict[str, np.ndarray], draw: np.random.Generator) -> None:
     """Trees over all rows, their neighbours as many as are said, boxes of their nodes."""
-    many, rows = arrays["sets"].size // 3, int(min(max(numbers[1], 0), MOST))
+    many, rows = arrays["sets"].size // 3, int(np.clip(np.nan_to_num(numbers[1]), 0, MOST))
     cut = np.linspace(0, rows, many + 1).astype(np.int64)
     near = np.minimum(np.diff(cut), draw.integers(0, 40))
     depth = draw.integers(0, 8, many)
     arrays["sets"] = np.stack([np.diff(cut), near, depth], 1).ravel()
     numbers[2] = float(near.sum())
-    if arrays["boxes"].size and numbers[0] <= 6:
+    if arrays["boxes"].size and numbers[0] in (1, 2, 3, 6):
         arrays["boxes"] = np.resize(arrays["boxes"], int(((2 << depth) - 1).sum() * 2 * numbers[0]))
 
 

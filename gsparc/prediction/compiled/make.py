@@ -55,7 +55,7 @@ FIGURES: dict[Kind, str] = {
     "csi": "NMSE",
     "rssi": "RMSE dB",
 }  # as `gsparc evaluate` has them
-NEAREST_M = 0.1  # to the other end that places of the largest errors are looked for
+NEAREST = 1e-3  # of the way to the other end: where the largest errors are looked for
 SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
 
 
@@ -202,18 +202,13 @@ def random_places(site: Site, count: int, seed: int) -> np.ndarray:
 
 
 def near_places(site: Site, count: int, seed: int) -> np.ndarray:
-    """Like `random_places`, the last end's distances across from the other even in their logarithm."""
+    """Like `random_places`, the last end nearer to the other, evenly in the logarithm of how much."""
     places, (low, high) = random_places(site, count, seed), site.moving_box
-    other = places[:, :2] if site.static_end is None else site.static_position
+    other = places[:, :3] if site.static_end is None else site.static_position
     if other is None:  # nobody knows where
         return places
-    draw, reach = np.random.default_rng(seed), max(float(np.linalg.norm((high - low)[-3:-1])), NEAREST_M)
-    angle, far = (
-        draw.uniform(0, 2 * np.pi, count),
-        NEAREST_M * (reach / NEAREST_M) ** draw.uniform(size=count),
-    )
-    across = np.asarray(other)[..., :2] + (far * np.stack([np.cos(angle), np.sin(angle)])).T
-    places[:, -3:-1] = across.clip(low[-3:-1], high[-3:-1])
+    share = NEAREST ** np.random.default_rng(seed).uniform(size=(count, 1))
+    places[:, -3:] = (other + share * (places[:, -3:] - other)).clip(low[-3:], high[-3:])
     return places
 
 
