@@ -17,7 +17,7 @@ class Facts(ctypes.Structure):
     _fields_ = (
         ("kind", ctypes.c_int32), ("axes", ctypes.c_int32), ("shape", ctypes.c_int32 * 2),
         ("values", ctypes.c_int64), ("scratch", ctypes.c_int64), ("origin", ctypes.c_double * 3),
-        ("error", ctypes.c_double),
+        ("error", ctypes.c_double), ("worst", ctypes.c_double),
     )  # fmt: skip
 
 

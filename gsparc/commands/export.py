@@ -19,7 +19,7 @@ from gsparc.prediction.along import deepmimo, emulators
 from gsparc.prediction.along.impulses import write_impulses
 from gsparc.prediction.along.taps import Trajectory
 from gsparc.prediction.compiled.blob import write
-from gsparc.prediction.compiled.make import compiled
+from gsparc.prediction.compiled.make import FIGURES, compiled
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.placing import in_world, with_heights
 from gsparc.prediction.predictor import Predictor
@@ -56,10 +56,12 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
     result = compiled(predictor, int(config.places))
-    size = write(folder / "field.gsparc", result.form, np.asarray(predictor.site.origin), result.error)
+    origin = np.asarray(predictor.site.origin)
+    size = write(folder / "field.gsparc", result.form, origin, result.error, result.worst)
     shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
     shutil.copytree(SOURCES, folder / "source", ignore=OTHERS)
-    facts = {"export/bytes": size, "export/error": result.error, "export/form": result.form.kind}
+    facts = {"export/bytes": size, "export/form": result.form.kind, "export/error": result.error}
+    facts |= {"export/worst": result.worst, "export/figure": FIGURES[predictor.site.kind]}
     build = f"cmake -S {out}/source/field -B {out}/build && cmake --build {out}/build"
     return facts, [result.summary, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
 

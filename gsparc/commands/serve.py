@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import gc
 import ipaddress
 import os
+import resource
+from contextlib import suppress
+from dataclasses import fields
 from importlib.util import find_spec
 
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.settings import RunSettings
 from gsparc.data.errors import DataError
-from gsparc.data.limits import SettingError, number, whole
+from gsparc.data.limits import SettingError, whole
 from gsparc.evaluation.console import open_console
 from gsparc.prediction.operating_point import load
 
-STOP_S = 10  # that requests under way have to end
+OTHERS = 64  # files that are open beside connections: the log, libraries
 
 
 def loopback(host: str) -> bool:
@@ -28,24 +32,25 @@ def loopback(host: str) -> bool:
 def task(config: DictConfig) -> None:
     """Serve until Ctrl-C or SIGTERM; requests under way are answered."""
     RunSettings.of(config)
-    whole(1).check("most", config.most)
     whole(0, 65535).check("port", config.port)
-    number(0, 1000).check("delay_ms", config.delay_ms)
     token = config.token or os.environ.get("GSPARC_TOKEN")
     if not token and not loopback(config.host):
         raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
-    import uvicorn
+    from gsparc.prediction.serving import Limits, Server, application
 
-    from gsparc.prediction.serving import application
-
+    limits = Limits(**{field.name: config[field.name] for field in fields(Limits)})
+    needed, allowed = 2 * limits.connections + OTHERS, resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if 0 <= allowed < needed:
+        files = f"{needed} open files may be needed, {allowed} are allowed"
+        raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
     predictor = load(config.ckpt, unit=config.unit)
     predictor = predictor if config.station is None else predictor.at(config.station)
     if predictor.site.static_end is None or (predictor.site.stations and predictor.site.kind != "rssi"):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
-    app = application(predictor, config.delay_ms / 1e3, config.most, token)
+    app = application(predictor, limits, token)
     open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)
-    uvicorn.run(
-        app, host=config.host, port=config.port, log_level="warning", timeout_graceful_shutdown=STOP_S
-    )
+    gc.freeze()  # going through all that was loaded held up answers by half a second
+    with suppress(KeyboardInterrupt):  # the server has ended by then
+        Server(app, limits, host=config.host, port=config.port).run()

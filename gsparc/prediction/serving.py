@@ -4,21 +4,126 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import json
+import socket
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
+import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, StreamingResponse
+from pydantic import BaseModel, ConfigDict, FailFast, ValidationError
+from pydantic_core import to_json
 from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from gsparc.data.limits import POSITIVE, Checked, SettingError, number, setting, whole
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import read_places
 
 RAW = "application/octet-stream"
-BYTES = 64  # of a place at most, as JSON
+PLACE, BYTES, MORE = 12, 64, 8192  # bytes of a place, raw and at most as JSON, and of what is around places
+PIECE = 8192  # numbers that are written at once: a millisecond, in which nobody else is answered
+QUEUE = 2048  # connections that wait in the kernel
+KEEP_S, STOP_S = 5, 10  # that a connection without a request stays, that requests have when the server stops
+
+
+@dataclass(frozen=True)
+class Limits(Checked):
+    """Of a server; `conf/serve.yaml` has the reasons.
+
+    Attributes:
+        most, numbers: places and numbers of an answer.
+        connections: open at once; of more, one that waits long or asks for much is ended.
+        request_s: from the first byte of a request to the last of its answer [s].
+        delay_ms: that a request waits for others, to be computed with them.
+    """
+
+    most: int = setting(4096, whole(1))
+    numbers: int = setting(131_072, whole(1))
+    connections: int = setting(64, whole(1))
+    request_s: float = setting(10.0, POSITIVE)
+    delay_ms: float = setting(2.0, number(0, 1000))
+
+
+class Places(BaseModel):
+    """A request's body: world places of what moves [m]."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    places: Annotated[list[tuple[float, float, float]], FailFast()]
+
+
+class Connection(H11Protocol):
+    """A client's connection, which ends when a request takes too long, whatever of it is slow."""
+
+    def __init__(self, limits: Limits, **given: Any) -> None:
+        super().__init__(**given)
+        self.limits = limits
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """See the base class; where there are too many, another one is ended."""
+        super().connection_made(transport)
+        self.end = self.loop.call_later(self.limits.request_s, transport.abort)
+        if len(self.connections) <= self.limits.connections:
+            return
+        others = [one for one in self.connections if isinstance(one, Connection) and one is not self]
+        works = [one for one in others if one.works()]
+        if (
+            2 * len(works) > self.limits.connections
+        ):  # half the room is for those whose request is not read yet
+            other = max(works, key=lambda one: one.cycle.scope.get("places", 0))
+        else:
+            other = min((one for one in others if not one.works()), key=lambda one: one.end.when())
+        self.connections.discard(other)
+        other.transport.abort()
+
+    def works(self) -> bool:
+        """Whether the answer to a whole request is computed, or written to a client that reads."""
+        cycle = self.cycle
+        return bool(cycle) and not (cycle.more_body or cycle.response_complete or self.flow.write_paused)
+
+    def on_response_complete(self) -> None:
+        """See the base class; the next request has its own time."""
+        self.end.cancel()
+        self.end = self.loop.call_later(self.limits.request_s + KEEP_S, self.transport.abort)
+        super().on_response_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """See the base class."""
+        self.end.cancel()
+        super().connection_lost(exc)
+
+
+class Server(uvicorn.Server):
+    """uvicorn within limits: of requests nothing is logged, and the log is the command's, which is open."""
+
+    def __init__(self, app: ASGIApp, limits: Limits, **listen: Any) -> None:
+        listen |= {"ws": "none", "log_config": None, "log_level": "error", "access_log": False}
+        listen |= {"timeout_keep_alive": KEEP_S, "timeout_graceful_shutdown": STOP_S}
+        at_once = max(1, limits.connections // 8)  # until the first of them is read, thrice as many may come
+        super().__init__(uvicorn.Config(app, http=partial(Connection, limits), backlog=at_once, **listen))  # type: ignore[arg-type]
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """See the base class; the kernel lets more wait than are taken at once."""
+        await super().startup(sockets)
+        for listener in self.servers[0].sockets:
+            with socket.fromfd(listener.fileno(), listener.family, listener.type) as same:
+                same.listen(QUEUE)
+
+
+class Asked(NamedTuple):
+    """A request that waits: how many places its body holds if it is sound, and where its answer comes."""
+
+    count: int
+    body: bytes
+    raw: bool
+    answer: asyncio.Future[np.ndarray]
 
 
 class Batcher:
@@ -28,59 +133,80 @@ class Batcher:
         predictor: of one end that moves, and one station or powers of several.
         what: is asked, a method of it.
         delay_s: that the first request of a batch waits for others [s].
-        most: places of a batch.
+        most: places of a batch, beside those of the request that waits longest.
     """
 
     def __init__(self, predictor: Predictor, what: str, delay_s: float, most: int) -> None:
-        self.method, self.end = getattr(predictor, what), predictor.site.moving_end
-        self.delay_s, self.most = delay_s, most
-        self.waiting: asyncio.Queue[tuple[np.ndarray, asyncio.Future]] = asyncio.Queue()
+        self.predictor, self.delay_s, self.most = predictor, delay_s, most
+        self.what = what
+        self.waiting: list[Asked] = []
+        self.some = asyncio.Event()
 
-    async def ask(self, place: np.ndarray) -> np.ndarray:
-        """Answers (n, ...) at world places (n, 3) [m]; raises what the model does."""
-        future: asyncio.Future = asyncio.get_running_loop().create_future()
-        self.waiting.put_nowait((place, future))
-        return await future
+    async def ask(self, count: int, body: bytes, raw: bool) -> np.ndarray:
+        """Answers (n, ...) at the world places (n, 3) [m] of a body; raises what reading and the model do."""
+        self.waiting.append(Asked(count, body, raw, asyncio.get_running_loop().create_future()))
+        self.some.set()
+        return await self.waiting[-1].answer
 
     async def run(self) -> None:
         """Until cancelled; a request whose client left is dropped."""
-        clock = asyncio.get_running_loop().time
         while True:
-            batch = [await self.waiting.get()]
-            until = clock() + self.delay_s
-            while sum(len(place) for place, _ in batch) < self.most and clock() < until:
-                try:
-                    batch.append(await asyncio.wait_for(self.waiting.get(), until - clock()))
-                except TimeoutError:
-                    break
-            await self._serve(batch)
+            await self.some.wait()
+            await asyncio.sleep(self.delay_s)
+            batch = self._next()
+            for one, found in zip(batch, await asyncio.to_thread(self._answers, batch), strict=True):
+                if not one.answer.done():
+                    failed = isinstance(found, Exception)
+                    (one.answer.set_exception if failed else one.answer.set_result)(found)  # type: ignore[arg-type]
 
-    async def _serve(self, batch: list[tuple[np.ndarray, asyncio.Future]]) -> None:
+    def _next(self) -> list[Asked]:
+        """The request that waits longest, and the smallest others: few places do not wait for many."""
+        waiting = [one for one in self.waiting if not one.answer.done()]
+        batch, left = waiting[:1], self.most
+        for one in sorted(waiting[1:], key=lambda one: one.count):
+            left -= one.count
+            batch += [one] if left >= 0 else []
+        self.waiting = [one for one in waiting if one not in batch]
+        if not self.waiting:
+            self.some.clear()
+        return batch
+
+    def _answers(self, batch: list[Asked]) -> list[np.ndarray | Exception]:
+        """Of each request, or its own fault."""
+        site = self.predictor.site
         try:
-            place = np.concatenate([place for place, _ in batch])
-            answers = await asyncio.to_thread(self.method, **{self.end: place})
-            ends = np.cumsum([len(place) for place, _ in batch])[:-1]
-            for (_, future), own in zip(batch, np.split(answers, ends), strict=True):
-                if not future.done():
-                    future.set_result(own)
+            places = [np.zeros((0, 3)), *(_read(site.moving_end, one) for one in batch)]
+            values = getattr(self.predictor, self.what)(**{site.moving_end: np.concatenate(places)})
+            values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
+            parts = np.split(values.astype("<f4"), np.cumsum([len(one) for one in places])[:-1])
+            return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
         except Exception as error:
-            if len(batch) > 1:  # one request's fault is not the others'
-                for one in batch:
-                    await self._serve([one])
-            elif not batch[0][1].done():
-                batch[0][1].set_exception(error)
+            return [error] if len(batch) == 1 else [self._answers([one])[0] for one in batch]
 
 
-def application(predictor: Predictor, delay_s: float, most: int, token: str | None) -> FastAPI:
+def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGIApp:
     """The routes: POST /predict, and /std for its deviations, GET /healthz.
 
     Args:
-        predictor, delay_s, most: see `Batcher`; more places in one request are refused (413).
-        token: that a request must bear (401); None: none.
+        predictor: of one end that moves and one station.
+        limits: more places or numbers in one request are refused (413).
+        token: that a request must bear (401) but for /healthz; None: none.
+
+    Raises:
+        SettingError: an answer at one place holds more numbers than `limits` allow.
     """
     site = predictor.site
-    routes = {"/predict": site.kind, "/std": "std"}
-    batchers = {route: Batcher(predictor, what, delay_s, most) for route, what in routes.items()}
+    middle = getattr(predictor, site.kind)(**{site.moving_end: site.moving_box.mean(0) + site.origin})
+    each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
+    if each > limits.numbers:
+        raise SettingError(
+            f"numbers={limits.numbers}: an answer at one place holds {each}; say {each} or more"
+        )
+    most = min(limits.most, limits.numbers // each)
+    routes, writer = {"/predict": site.kind, "/std": "std"}, ThreadPoolExecutor(1)
+    batchers = {
+        route: Batcher(predictor, what, limits.delay_ms / 1e3, most) for route, what in routes.items()
+    }
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -88,6 +214,7 @@ def application(predictor: Predictor, delay_s: float, most: int, token: str | No
         yield
         for task in work:
             task.cancel()
+        writer.shutdown(wait=False, cancel_futures=True)
 
     app = FastAPI(title="gsparc", lifespan=life)
 
@@ -97,42 +224,80 @@ def application(predictor: Predictor, delay_s: float, most: int, token: str | No
         model = {"model": predictor.method.name, "end": site.moving_end, "unit": predictor.unit, **stations}
         return {"status": "ok", "kind": site.kind, **model}
 
+    async def pieces(values: np.ndarray, raw: bool) -> AsyncIterator[bytes]:
+        rows, loop = max(1, PIECE // each), asyncio.get_running_loop()
+        for first in range(0, len(values), rows):
+            yield await loop.run_in_executor(
+                writer, _written, values, raw, predictor.unit, first, first + rows
+            )
+
     @app.post("/std")
     @app.post("/predict")
     async def predict(request: Request) -> Response:
-        header = request.headers.get("authorization", "")
-        if token is not None and not hmac.compare_digest(header.encode(), f"Bearer {token}".encode()):
-            raise HTTPException(401, "Authorization: Bearer TOKEN is needed")
-        body = b""
+        body, raw = bytearray(), request.headers.get("content-type", "").startswith(RAW)
         try:
             async for part in request.stream():
                 body += part
-                if len(body) > most * BYTES:
-                    raise HTTPException(413, f"at most {most} places")
+                count = len(body) // PLACE if raw else body.count(b"[") - 1
+                if count > most or len(body) > most * BYTES + MORE:
+                    said = f"at most {most} places, {each} numbers each"
+                    raise HTTPException(413, said, {"connection": "close"})
         except ClientDisconnect:
             raise HTTPException(400, "the client left") from None
-        raw = request.headers.get("content-type", "").startswith(RAW)
+        request.scope["places"] = count = max(count, 1)
+        work = asyncio.ensure_future(batchers[request.url.path].ask(count, bytes(body), raw))
+        gone = asyncio.ensure_future(request.receive())  # after a body nothing but the client's leaving
+        await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
+        gone.cancel()
+        if not work.done():
+            work.cancel()
+            raise HTTPException(400, "the client left")
         try:
-            place = np.frombuffer(body, "<f4").reshape(-1, 3) if raw else np.array(json.loads(body)["places"])
-            place = place.astype(np.float64)
-            if place.ndim != 2 or place.shape[1] != 3 or not len(place) or not np.isfinite(place).all():
-                raise ValueError
-        except (ValueError, KeyError, TypeError, RecursionError):
-            wanted = "little-endian float32, three a place" if raw else '{"places": [[x, y, z], ...]}'
-            raise HTTPException(422, f"expected {wanted}, finite metres") from None
-        if len(place) > most:
-            raise HTTPException(413, f"at most {most} places")
-        try:
-            values = await batchers[request.url.path].ask(place)
+            values = work.result()
         except Exception as error:
             raise HTTPException(422 if isinstance(error, ValueError) else 500, str(error)) from error
-        values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
+        kind = RAW if raw else "application/json"
         about = {"x-shape": ",".join(map(str, values.shape)), "x-unit": quote(predictor.unit)}
-        if raw:
-            return Response(values.astype("<f4").tobytes(), media_type=RAW, headers=about)
-        if not np.isfinite(values).all():  # JSON has no word for the level of silence
-            values, known = values.astype(object), np.isfinite(values)
-            values[~known] = None
-        return JSONResponse({"shape": values.shape, "unit": predictor.unit, "values": values.tolist()})
+        if values.size <= PIECE:
+            return Response(
+                _written(values, raw, predictor.unit, 0, len(values)), headers=about, media_type=kind
+            )
+        return StreamingResponse(pieces(values, raw), headers=about, media_type=kind)
 
-    return app
+    return app if token is None else _guarded(app, f"Bearer {token}".encode())
+
+
+def _guarded(app: ASGIApp, wanted: bytes) -> ASGIApp:
+    """Whatever is asked, but for /healthz, needs the token."""
+
+    async def guard(scope: Scope, receive: Receive, send: Send) -> None:
+        given = dict(scope.get("headers", ())).get(b"authorization", b"")
+        free = scope["type"] == "lifespan" or scope["path"] == "/healthz"
+        refused = JSONResponse(
+            {"detail": "Authorization: Bearer TOKEN is needed"}, 401, {"connection": "close"}
+        )
+        await (app if free or hmac.compare_digest(given, wanted) else refused)(scope, receive, send)
+
+    return guard
+
+
+def _read(end: str, asked: Asked) -> np.ndarray:
+    """World places (n, 3) float64 [m] of a body; raises ValueError."""
+    try:
+        raw = np.frombuffer(asked.body, "<f4").reshape(-1, 3) if asked.raw else None
+        places = Places.model_validate_json(asked.body).places if raw is None else raw
+    except (ValidationError, ValueError):
+        wanted = "little-endian float32, three a place" if asked.raw else '{"places": [[x, y, z], ...]}'
+        raise ValueError(f"expected {wanted}, finite metres, and nothing else") from None
+    return read_places(end, places)
+
+
+def _written(values: np.ndarray, raw: bool, unit: str, first: int, past: int) -> bytes:
+    """Answers [first, past) of (n, ...), with what is before the first and after the last."""
+    part = values[first:past]
+    if raw:
+        return part.tobytes()
+    about = to_json({"shape": values.shape, "unit": unit})[:-1]
+    head = b"," if first else about + b',"values":['
+    # JSON has no word for the level of silence.
+    return head + to_json(part.tolist(), inf_nan_mode="null")[1:-1] + (b"" if past < len(values) else b"]}")

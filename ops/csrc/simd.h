@@ -24,15 +24,18 @@ template <class S> struct Lanes;
 template <> struct Lanes<float> {
     typedef float V __attribute__((vector_size(kBytes)));
     typedef int32_t I __attribute__((vector_size(kBytes)));
+    typedef uint32_t U __attribute__((vector_size(kBytes)));
     static constexpr int n = kBytes / 4;
 };
 template <> struct Lanes<double> {
     typedef double V __attribute__((vector_size(kBytes)));
     typedef int64_t I __attribute__((vector_size(kBytes)));
+    typedef uint64_t U __attribute__((vector_size(kBytes)));
     static constexpr int n = kBytes / 8;
 };
 template <class S> using Vec = typename Lanes<S>::V;
 template <class S> using Int = typename Lanes<S>::I;
+template <class S> using Whole = typename Lanes<S>::U;  // wraps round where `Int` may not
 
 #define GSPARC_INLINE inline __attribute__((always_inline))
 
@@ -171,7 +174,7 @@ GSPARC_INLINE Vec<double> magnitude(Vec<double> x) { return (Vec<double>)((Int<d
 GSPARC_INLINE Vec<float> nearest(Vec<float> x) { return (x + 12582912.0f) - 12582912.0f; }
 GSPARC_INLINE Vec<double> nearest(Vec<double> x) { return (x + 6755399441055744.0) - 6755399441055744.0; }
 
-// exp(x) for x <= 0, relative error below 4e-7 in float32 and 1e-15 in float64; flat below the normal numbers.
+// exp(x) for x <= 0, relative error below 4e-7 in float32 and 1e-15 in float64; flat below the normal numbers, anything above 0.
 GSPARC_INLINE Vec<float> exponential(Vec<float> x) {
     x = greater<float>(x, splat(-87.0f));
     const Vec<float> shifted = x * 1.44269504f + 12582912.0f, whole = shifted - 12582912.0f;
@@ -183,7 +186,7 @@ GSPARC_INLINE Vec<float> exponential(Vec<float> x) {
     p = fma(p, r, splat(0.5f));
     p = fma(p, r, splat(1.0f));
     p = fma(p, r, splat(1.0f));
-    return (Vec<float>)((Int<float>)p + ((Int<float>)shifted << 23));
+    return (Vec<float>)((Whole<float>)p + ((Whole<float>)shifted << 23));
 }
 GSPARC_INLINE Vec<double> exponential(Vec<double> x) {
     x = greater<double>(x, splat(-700.0));
@@ -193,7 +196,7 @@ GSPARC_INLINE Vec<double> exponential(Vec<double> x) {
     const double factors[] = {1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320,
                               1.0 / 5040, 1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 0.5, 1.0, 1.0};
     for (int i = 0; i < 13; ++i) p = fma(p, r, splat(factors[i]));
-    return (Vec<double>)((Int<double>)p + ((Int<double>)shifted << 52));
+    return (Vec<double>)((Whole<double>)p + ((Whole<double>)shifted << 52));
 }
 
 // 2^-halvings: what lies beyond the cut-off may come out as anything. In float32 to a relative error below 4e-6.
@@ -217,8 +220,7 @@ template <> GSPARC_INLINE Vec<float> bell<float>(Vec<float> halvings) {
     p = fma(p, r, splat(0.2402474582195282f));
     p = fma(p, r, splat(0.6931218504905701f));
     p = fma(p, r, splat(0.9999992847442627f));
-    typedef uint32_t Whole __attribute__((vector_size(kBytes)));  // far beyond the cut-off the sum wraps round
-    return (Vec<float>)((Whole)p + ((Whole)shifted << 23));
+    return (Vec<float>)((Whole<float>)p + ((Whole<float>)shifted << 23));
 }
 #endif
 

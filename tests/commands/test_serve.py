@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
+import logging
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -12,6 +15,8 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,11 +25,15 @@ import gsparc
 from gsparc.commands.serve import loopback
 from gsparc.models import checkpoint
 
-uvicorn = pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
+pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
 pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
-from gsparc.prediction.serving import RAW, application  # noqa: E402
+from gsparc.prediction.serving import RAW, Limits, Server, application
 
 TX = np.array([3.0, 2, 2])
+HOSTILE, HOSTILE_S = (
+    Path(__file__).parents[1] / "helpers" / "hostile.py",
+    int(os.environ.get("GSPARC_HOSTILE_S", "15")),
+)
 
 
 def fitted(kind="rssi"):
@@ -38,11 +47,10 @@ def fitted(kind="rssi"):
 
 
 class Served:
-    def __init__(self, predictor, most=64, token=None, delay_s=2e-3):
-        app = application(predictor, delay_s, most, token)
-        self.asked = []
-        config = uvicorn.Config(app, port=0, log_level="warning", timeout_graceful_shutdown=5)
-        self.server = uvicorn.Server(config)
+    def __init__(self, predictor, token=None, **limits):
+        limits = Limits(**{"most": 64, **limits})
+        app = application(predictor, limits, token)
+        self.server = Server(app, limits, port=0)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
     def __enter__(self):
@@ -58,6 +66,10 @@ class Served:
         self.thread.join(20)
         assert not self.thread.is_alive()
 
+    @property
+    def connections(self):
+        return len(self.server.server_state.connections)
+
     def post(self, body, kind="application/json", **headers):
         client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
         client.request("POST", "/predict", body, {"content-type": kind, **headers})
@@ -65,6 +77,23 @@ class Served:
         found = answer.status, answer.read(), dict(answer.getheaders())
         client.close()
         return found
+
+    def get(self, path, **headers):
+        client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        client.request("GET", path, headers=headers)
+        with contextlib.closing(client):
+            return client.getresponse().status
+
+    def send(self, sent):
+        client = socket.create_connection(("127.0.0.1", self.port), timeout=20)
+        client.sendall(sent)
+        return client
+
+    def within(self, seconds, ready):
+        until = time.monotonic() + seconds
+        while not ready() and time.monotonic() < until:
+            time.sleep(0.02)
+        return ready()
 
 
 def as_json(places):
@@ -142,8 +171,8 @@ def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch)
     expected = [powers.rssi(rx=places) for places in given]
     calls = []
     own = powers.rssi
-    monkeypatch.setattr(powers, "rssi", lambda rx: calls.append(len(rx)) or own(rx=rx))
     with Served(powers) as served, ThreadPoolExecutor(32) as clients:
+        monkeypatch.setattr(powers, "rssi", lambda rx: calls.append(len(rx)) or own(rx=rx))
         found = list(clients.map(lambda places: served.post(as_json(places)), given))
     for (status, body, _), wanted in zip(found, expected, strict=True):
         assert status == 200
@@ -164,6 +193,12 @@ def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch)
         ('{"places": []}', "application/json", 422),
         (b"\xff\xfe", "application/json", 422),
         ('{"places": [[1, 2, 1e300]]}', "application/json", 422),
+        ('{"places": [[1, 2, 1%s]]}' % ("0" * 400), "application/json", 422),
+        ('{"places": [[1, 2, true]]}', "application/json", 422),
+        ('{"places": [[1, 2, "3"]]}', "application/json", 422),
+        ('{"places": [[1, 2, 3]], "unit": "km"}', "application/json", 422),
+        ('{"places": ' + "[" * 60, "application/json", 422),
+        ('{"places": ' + "[" * 9000, "application/json", 413),
         (b"12345", RAW, 422),
         (np.full(3, np.inf, "<f4").tobytes(), RAW, 422),
         (np.zeros((65, 3), "<f4").tobytes(), RAW, 413),
@@ -177,7 +212,7 @@ def test_malformed_requests_are_refused_and_the_next_is_answered(served, body, k
 
 
 def test_one_bad_request_of_a_batch_spoils_no_other(powers):
-    with Served(powers, delay_s=0.3) as served, ThreadPoolExecutor(2) as clients:
+    with Served(powers, delay_ms=300) as served, ThreadPoolExecutor(2) as clients:
         good = clients.submit(served.post, as_json([[1, 2, 1]]))
         bad = clients.submit(served.post, as_json([[1, 2, 1e300]]))
         assert (good.result()[0], bad.result()[0]) == (200, 422)
@@ -199,44 +234,201 @@ def test_a_client_that_dies_is_no_matter(powers, caplog):
 
 def test_a_token_is_asked_for(powers):
     with Served(powers, token="secret") as served:
+        for path in ("/docs", "/openapi.json", "/nowhere"):
+            assert served.get(path) == 401 and served.get(path, authorization="Bearer secret") in (200, 404)
+        assert served.get("/healthz") == 200
         assert served.post(as_json([[1, 2, 1]]))[0] == 401
         assert served.post(as_json([[1, 2, 1]]), authorization="Bearer wrong")[0] == 401
         assert served.post(as_json([[1, 2, 1]]), authorization="Bearer secret")[0] == 200
+
+
+def test_raw_places_in_utm_metres_were_rounded_to_half_a_metre():
+    north = np.array([447_000.0, 4_500_000, 0])
+    rx = np.random.default_rng(0).uniform([0, 0, 0], [20, 20, 2], (40, 3))
+    level = -40 - 20 * np.log10(np.linalg.norm(rx - TX, axis=1))
+    utm = gsparc.fit(rx=rx + north, tx=TX + north, rssi=level, model="gp")
+    with Served(utm) as served:
+        status, body, _ = served.post((rx[:2] + north).astype("<f4").tobytes(), RAW)
+        assert status == 422 and "float32, which moves in steps of 0.5 m" in json.loads(body)["detail"]
+        assert served.post(as_json(rx[:2] + north))[0] == 200
+
+
+@pytest.fixture(scope="module")
+def spectra():
+    rng = np.random.default_rng(3)
+    given = {"rx": np.array([2.0, 1, 1]), "tx": rng.uniform(0, 4, (20, 3)), "model": "gp"}
+    return gsparc.fit(spectrum=rng.uniform(0, 1, (20, 18, 36)), **given)
+
+
+def test_numbers_of_an_answer_are_limited_and_large_ones_come_in_pieces(spectra):
+    places = np.random.default_rng(1).uniform(0, 4, (31, 3)).astype(np.float32)
+    with Served(spectra, numbers=20_000) as served:
+        status, body, _ = served.post(as_json(places))
+        assert status == 413 and json.loads(body)["detail"] == "at most 30 places, 648 numbers each"
+        expected = spectra.spectrum(tx=places[:30].astype(np.float64))
+        found = json.loads(served.post(as_json(places[:30]))[1])
+        assert found["shape"] == [30, 18, 36]
+        np.testing.assert_allclose(found["values"], expected, rtol=1e-4, atol=1e-6)
+        raw = np.frombuffer(served.post(places[:30].tobytes(), RAW)[1], "<f4")
+        np.testing.assert_allclose(raw.reshape(30, 18, 36), expected, rtol=1e-4, atol=1e-6)
+    with pytest.raises(ValueError, match="numbers=600: an answer at one place holds 648"):
+        application(spectra, Limits(numbers=600), None)
+
+
+def test_few_places_do_not_wait_for_many(powers, monkeypatch):
+    sizes, own = [], powers.rssi
+    with Served(powers, most=40) as served, ThreadPoolExecutor(12) as clients:
+
+        def slow(rx):
+            sizes.append(len(rx))
+            time.sleep(0.2)
+            return own(rx=rx)
+
+        monkeypatch.setattr(powers, "rssi", slow)
+        large = [clients.submit(served.post, as_json(np.ones((40, 3)))) for _ in range(8)]
+        assert served.within(5, lambda: len(sizes) > 0)
+        started = time.monotonic()
+        assert served.post(as_json([[1, 2, 1]]))[0] == 200
+        assert time.monotonic() - started < 1  # two of eight batches
+        assert {one.result()[0] for one in large} == {200}
+
+
+HALF = b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: 500\r\n\r\n{"
+
+
+def test_half_sent_requests_took_all_files(powers):
+    with Served(powers, connections=8) as served:
+        clients = [served.send(HALF[: 10 + i]) for i in range(60)]
+        assert served.post(as_json([[1, 2, 1]]))[0] == 200
+        assert served.connections <= 8
+        for client in clients:
+            client.close()
+
+
+def test_heads_and_bodies_that_do_not_come_are_not_waited_for(powers):
+    with Served(powers, request_s=0.5) as served:
+        clients = [served.send(sent) for sent in (b"", HALF[:20], HALF)]
+        slow = served.send(HALF)
+        assert served.within(5, lambda: served.connections == 4)
+        for _ in range(20):  # a byte now and then buys no time
+            time.sleep(0.05)
+            with contextlib.suppress(OSError):
+                slow.sendall(b" ")
+        assert served.connections == 0
+        for client in (*clients, slow):
+            client.close()
+
+
+def test_clients_that_do_not_read_are_ended(spectra):
+    with Served(spectra, request_s=1, most=1500, numbers=1_000_000) as served:
+        body = as_json(np.ones((1500, 3))).encode()  # an answer of 19 MB
+        head = f"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: {len(body)}\r\n\r\n"
+        client = served.send(head.encode() + body)
+        assert served.within(5, lambda: served.connections == 1)
+        assert served.within(10, lambda: served.connections == 0)
+        client.close()
+
+
+def test_the_log_stays_open_while_there_are_files(powers, tmp_path):
+    """The server closed it, and opened it again to say that there are no files."""
+    log = logging.FileHandler(tmp_path / "log")
+    logging.getLogger().addHandler(log)
+    try:
+        with Served(powers):
+            assert log.stream is not None
+    finally:
+        logging.getLogger().removeHandler(log)
+        log.close()
 
 
 def test_others_reach_what_is_no_loopback():
     assert [loopback(host) for host in ("::1", "localhost", "0.0.0.0", "example.org")] == [1, 1, 0, 0]
 
 
-@pytest.mark.slow
-def test_the_command_serves_until_it_is_told_to_stop(powers, tmp_path):
-    checkpoint.save(tmp_path / "model.ckpt", powers.method)
+@contextlib.contextmanager
+def commanded(folder, predictor, *settings, files=None):
+    """The command in a process of its own that may open so many files, and its port."""
+    checkpoint.save(folder / "model.ckpt", predictor.method)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    line = [
-        sys.executable,
-        "-m",
-        "gsparc",
-        "serve",
-        f"ckpt={tmp_path}/model.ckpt",
-        f"port={port}",
-        "delay_ms=1000",
-    ]
-    served = subprocess.Popen(line, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    line = [sys.executable, "-m", "gsparc", "serve", f"ckpt={folder}/model.ckpt", f"port={port}", *settings]
+    allow = files and partial(resource.setrlimit, resource.RLIMIT_NOFILE, (files, files))
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    served = subprocess.Popen(line, cwd=folder, env=environment, preexec_fn=allow)
     try:
-        client = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-        for _ in range(300):
-            try:
-                client.request("POST", "/predict", as_json([[1, 2, 1]]), {"content-type": "application/json"})
+        until = time.monotonic() + 60
+        while time.monotonic() < until and served.poll() is None:
+            with contextlib.suppress(OSError):
+                socket.create_connection(("127.0.0.1", port)).close()
                 break
-            except OSError:
-                client.close()
-                time.sleep(0.2)
-        time.sleep(0.3)
-        served.send_signal(signal.SIGTERM)  # while the request waits for others
-        assert client.getresponse().status == 200
-        assert served.wait(20) in (0, -signal.SIGTERM)
+            time.sleep(0.2)
+        yield served, port
     finally:
         served.kill()
         served.wait()
+
+
+def asked(port, places):
+    client = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    client.request("POST", "/predict", as_json(places), {"content-type": "application/json"})
+    with contextlib.closing(client):
+        answer = client.getresponse()
+        return answer.status, json.loads(answer.read())
+
+
+@pytest.mark.slow
+def test_the_command_serves_until_it_is_told_to_stop(powers, tmp_path):
+    with commanded(tmp_path, powers, "delay_ms=1000") as (served, port), ThreadPoolExecutor(1) as clients:
+        answer = clients.submit(asked, port, [[1, 2, 1]])
+        time.sleep(0.5)
+        served.send_signal(signal.SIGTERM)  # while the request waits for others
+        assert answer.result()[0] == 200
+        assert served.wait(20) in (0, -signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_75_half_sent_requests_ended_the_process(powers, tmp_path):
+    with commanded(tmp_path, powers, files=90) as (served, _):
+        assert served.wait(20) == 1  # 64 connections need more files, which is said
+    with commanded(tmp_path, powers, "connections=12", files=90) as (served, port):
+        clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(75)]
+        for client in clients:
+            client.sendall(HALF)
+        assert asked(port, [[1, 2, 1]])[0] == 200 and served.poll() is None
+        for client in clients:
+            client.close()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200 + HOSTILE_S)
+@pytest.mark.parametrize("kind", ["powers", "spectra"])
+def test_an_honest_client_is_answered_among_hostile_ones(kind, tmp_path, request, capsys):
+    """`GSPARC_HOSTILE_S=60`: for a minute."""
+    predictor = request.getfixturevalue(kind)
+    ask = partial(getattr(predictor, predictor.site.kind))
+    attack, late, memory = [sys.executable, str(HOSTILE)], [], []
+    with commanded(tmp_path, predictor) as (served, port):
+        assert asked(port, [[1, 2, 1]])[0] == 200
+        hostile = subprocess.Popen(
+            [*attack, str(port), str(HOSTILE_S), "4096" if kind == "powers" else "200"]
+        )
+        draw, started = np.random.default_rng(0), time.monotonic()
+        while hostile.poll() is None:
+            place = draw.uniform(0, 4, (1, 3))
+            before = time.monotonic()
+            status, answer = asked(port, place)
+            late.append(time.monotonic() - before)
+            assert status == 200
+            expected = ask(**{predictor.site.moving_end: place})
+            np.testing.assert_allclose(answer["values"], expected, rtol=1e-4, atol=1e-6)
+            pages = int(Path(f"/proc/{served.pid}/statm").read_text().split()[1])
+            memory.append((time.monotonic() - started, pages * resource.getpagesize() / 1e6))
+            time.sleep(0.05)
+    after = [mb for when, mb in memory if when > min(10, HOSTILE_S / 2)]
+    with capsys.disabled():
+        times = f"{np.median(late):.3f}, {np.quantile(late, 0.99):.3f}, {max(late):.3f} s"
+        sys.stderr.write(
+            f"{len(late)} answers, median, p99, last {times}; {after[0]:.0f}, {max(after):.0f} MB\n"
+        )
+    assert hostile.returncode == 0 and max(late) < 1 and max(after) - after[0] < 20

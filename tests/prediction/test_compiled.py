@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import shutil
-import struct
+import signal
 import subprocess
+import sys
+import time
 import zlib
 from functools import partial
 from pathlib import Path
 
 import campaigns
+import field_files
 import numpy as np
 import pytest
 import torch
@@ -29,6 +31,7 @@ from gsparc.processes.neighbourhood import Neighbourhood
 ROOT = Path(__file__).parents[2]
 SOURCES, EXAMPLES = ROOT / "ops" / "csrc" / "field", ROOT / "examples" / "c-library"
 LIGHT, PLACES, SCALE = 299_792_458.0, int(os.environ.get("GSPARC_PLACES", "400")), 1e-5
+FUZZ_S = int(os.environ.get("GSPARC_FUZZ_S", "10"))
 
 
 def of_powers(count, model="gp", **settings):
@@ -111,7 +114,7 @@ def test_a_form_says_what_it_is_and_its_file_is_checked(tmp_path):
     assert (found.form.kind, found.error) == (4, 0) and found.summary == "a process of powers, exactly"
     blob = packed(found.form, predictor.site.origin, found.error)
     magic, version, checksum, size, _ = HEAD.unpack(blob[: HEAD.size])
-    assert (magic, version, size) == (b"GSPARC\r\n", 1, len(blob))
+    assert (magic, version, size) == (b"GSPARC\r\n", 2, len(blob))
     assert checksum == zlib.crc32(blob[CHECKED:])
 
 
@@ -187,24 +190,19 @@ def test_the_library_answers_as_the_model(name, library, example, tmp_path, monk
     field.close()
 
 
-def mutated(blob, draw, mended):
-    """One to four bytes otherwise, or an end cut off; with a checksum that is right where `mended`."""
+def damaged(blob, draw):
+    """One to four bytes otherwise, or an end cut off."""
     found = bytearray(blob)
-    for at in draw.integers(
-        HEAD.size if mended else 0, len(blob) if draw.random() < 0.5 else 600, draw.integers(1, 5)
-    ):
+    for at in draw.integers(0, len(blob) if draw.random() < 0.5 else 600, draw.integers(1, 5)):
         found[at] ^= int(draw.integers(1, 256))
-    if not mended:
-        return bytes(found[: draw.integers(len(found))] if draw.random() < 0.2 else found)
-    found[12:16] = struct.pack("<I", zlib.crc32(bytes(found[CHECKED:])))
-    return bytes(found)
+    return bytes(found[: draw.integers(len(found))] if draw.random() < 0.2 else found)
 
 
-def files(folder, blob, count, mended):
-    draw, names = np.random.default_rng(0), []
-    for number in range(count):
-        names.append(folder / f"{mended}-{number}")
-        names[-1].write_bytes(mutated(blob, draw, mended))
+def files(folder, count, make_one, seed=0):
+    """Of `make_one(draw)`."""
+    draw, names = np.random.default_rng(seed), [folder / f"{number}" for number in range(count)]
+    for name in names:
+        name.write_bytes(make_one(draw))
     return names
 
 
@@ -218,27 +216,34 @@ def test_threads_agree_nothing_is_allocated_and_damage_is_refused(library, tmp_p
     asked = driver(library)
     said = run([asked, path, "8", "10000000"]).stdout  # of a tenth two threads' collision was often missed
     assert said.split() == ["queries", "10000000", "wrong", "0", "allocations", "0"]
-    damaged = files(tmp_path, blob, 1000, False)
-    assert run([asked, *damaged]).stdout.split() == ["refused", "1000"]
+    cut = files(tmp_path, 1000, partial(damaged, blob))
+    assert run([asked, *cut]).stdout.split() == ["refused", "1000"]
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_sanitizers_see_nothing(tmp_path):
-    """Sound files, and damaged ones whose checksums are right: refused, or answered from within."""
-    library = built(tmp_path / "library", "-DGSPARC_SANITIZE=ON")
+@pytest.mark.timeout(900 + FUZZ_S)
+@pytest.mark.parametrize("portable", ["OFF", "ON"])
+def test_sanitizers_see_nothing(tmp_path, portable, capsys):
+    """Sound files, and those with several fields changed whose checksums are right: refused, or answered from
+    within. `GSPARC_FUZZ_S=3600`: for an hour."""
+    library = built(tmp_path / "library", "-DGSPARC_SANITIZE=ON", f"-DGSPARC_PORTABLE={portable}")
     asked = driver(library, "-fsanitize=address,undefined", "-DGSPARC_WATCHED")
-    models = (of_powers(60), of_sources(5), of_images("gp"))
-    for number, predictor in enumerate(models):
-        blob = packed(make.compiled(predictor).form, predictor.site.origin, 0.0)
-        path = tmp_path / f"{number}.gsparc"
-        path.write_bytes(blob)
-        (folder := tmp_path / str(number)).mkdir()
-        given = [path, *files(folder, blob, 200, True)]
-        found = subprocess.run([asked, *given], capture_output=True, text=True, timeout=300)
-        assert found.returncode == 0, found.stderr[-2000:]
-        assert int(found.stdout.split()[1]) < len(given)  # the sound one was answered
-        shutil.rmtree(folder)
+    models = (of_powers(60), of_powers(40, "idw"), of_sources(5), of_sources(3, 4), of_images("gp"))
+    forms = [field_files.an_array(), *(make.compiled(predictor, 64).form for predictor in models)]
+    until, seed, slow, refused = time.monotonic() + FUZZ_S, 0, 0, 0
+    while seed < 2 or time.monotonic() < until:
+        for number, form in enumerate(forms):
+            (sound := tmp_path / "sound").write_bytes(packed(form, np.zeros(3)))
+            given = [sound, *files(tmp_path, 100, partial(field_files.mutated, form), (seed, number))]
+            found = subprocess.run([asked, *given], capture_output=True, text=True, timeout=300)
+            slow += found.returncode == -signal.SIGALRM
+            assert found.returncode in (0, -signal.SIGALRM), (seed, number, found.stderr[-2000:])
+            if not found.returncode:
+                refused += int(found.stdout.split()[1])
+                assert int(found.stdout.split()[1]) < len(given)  # the sound one was answered
+        seed += 1
+    with capsys.disabled():
+        sys.stderr.write(f"{seed * len(forms) * 100} files, {refused} refused, {slow} slow\n")
 
 
 @pytest.mark.slow

@@ -60,7 +60,8 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
     for value in arrays.values():
         value[silent] = np.nan
     for name, value in (arrays | {"rx_pos": place, "tx_pos": still[None]}).items():
-        np.savez_compressed(folder / f"{name}_t000_tx000_r001.npz", **{name: value.astype(np.float32)})
+        kind = np.float64 if name.endswith("pos") else np.float32  # in UTM float32 moves in steps of .5 m
+        np.savez_compressed(folder / f"{name}_t000_tx000_r001.npz", **{name: value.astype(kind)})
     np.savez_compressed(folder / "vertices.npz", vertices=np.zeros((0, 3), np.float32))
     (folder / "objects.json").write_text("[]")
     (folder / "params.json").write_text(json.dumps(_parameters(paths.reference_hz, place, silent), indent=1))

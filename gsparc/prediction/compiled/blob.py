@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.data.files import whole_file
 from gsparc.prediction.predictor import Predictor
 
-MAGIC, VERSION, LINE = b"GSPARC\r\n", 1, 64
+MAGIC, VERSION, LINE = b"GSPARC\r\n", 2, 64
 TYPES = {np.dtype(t): i for i, t in enumerate((np.float32, np.float64, np.int32, np.int64))}
 HEAD, SECTION = struct.Struct("<8sIIqq"), struct.Struct("<24sIIqq")
 CHECKED = 16  # bytes before those that the checksum is of
@@ -35,9 +35,9 @@ class Form:
     predictor: Predictor | None = None
 
 
-def packed(form: Form, origin: np.ndarray, error: float) -> bytes:
-    """The file's bytes; places are from `origin` (3,) [m], `error` is `Compiled.error`."""
-    numbers = np.array([form.kind, error, *origin, *form.numbers], np.float64)
+def packed(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.0) -> bytes:
+    """The file's bytes; places are from `origin` (3,) [m], errors are those of `Compiled`."""
+    numbers = np.array([form.kind, error, worst, *origin, *form.numbers], np.float64)
     arrays = {"numbers": numbers, **{name: value for name, value in form.arrays.items() if value.size}}
     at = HEAD.size + SECTION.size * len(arrays)
     table, body = [], []
@@ -50,9 +50,9 @@ def packed(form: Form, origin: np.ndarray, error: float) -> bytes:
     return HEAD.pack(MAGIC, VERSION, zlib.crc32(checked), at, len(arrays))[:CHECKED] + checked
 
 
-def write(path: Path, form: Form, origin: np.ndarray, error: float) -> int:
+def write(path: Path, form: Form, origin: np.ndarray, error: float, worst: float) -> int:
     """Write `packed` whole or not at all; returns its bytes."""
-    blob = packed(form, origin, error)
+    blob = packed(form, origin, error, worst)
     with whole_file(path) as partial:
         partial.write_bytes(blob)
     return len(blob)

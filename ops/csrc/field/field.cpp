@@ -40,6 +40,13 @@ std::unique_ptr<gsparc::Form> form_of(const gsparc::Blob& blob) {
     return nullptr;
 }
 
+// What a query reads and writes is no larger than the interface says, and can be had.
+void check(const gsparc_facts& facts) {
+    if (facts.axes != 3 && facts.axes != 6) gsparc::refuse("places of %d coordinates", facts.axes);
+    if (facts.values > (GSPARC_MOST_BYTES - facts.scratch) / int64_t(sizeof(float)))
+        gsparc::refuse("an answer of %lld numbers, %lld bytes of scratch memory", (long long)facts.values, (long long)facts.scratch);
+}
+
 }  // namespace
 
 #define GSPARC_EXPORT extern "C" __attribute__((visibility("default")))
@@ -49,6 +56,7 @@ GSPARC_EXPORT gsparc_field* gsparc_open(const void* bytes, size_t size, char* wh
         auto found = std::make_unique<gsparc_field>();
         found->blob = std::make_unique<gsparc::Blob>(bytes, int64_t(size));
         found->form = form_of(*found->blob);
+        check(found->form->facts);
         return found.release();
     } catch (const gsparc::Refused& refused) {
         say(why, room, refused.why);
@@ -82,6 +90,6 @@ GSPARC_EXPORT int gsparc_query(const gsparc_field* field, const float* place, fl
                                void* scratch) {
     const gsparc::Form& form = *field->form;
     for (int axis = 0; axis < form.facts.axes; ++axis)
-        if (!isfinite(place[axis])) return GSPARC_BAD_PLACE;
+        if (!(fabs(place[axis] + form.facts.origin[axis % 3]) <= GSPARC_FARTHEST_M)) return GSPARC_BAD_PLACE;
     return form.answer(place, values, variance, unknown, gsparc::Scratch{reinterpret_cast<uintptr_t>(scratch)});
 }

@@ -9,7 +9,7 @@ namespace gsparc {
 struct Form {
     gsparc_facts facts{};
     virtual ~Form() = default;
-    // `place` is finite; `variance` and `unknown` may be null.
+    // `place` is finite and on Earth; `variance` and `unknown` may be null.
     virtual int answer(const float* place, float* values, float* variance, float* unknown, Scratch scratch) const = 0;
 };
 

@@ -9,16 +9,15 @@ namespace GSPARC_ISA {
 extern Form* form_of(const Blob& blob) {
     Numbers in(blob);
     const int kind = in.size(4);
-    const double error = in.next();
-    double origin[3];
-    in.values(origin[0], origin[1], origin[2]);
+    double error, worst, origin[3];
+    in.values(error, worst, origin[0], origin[1], origin[2]);
     Form* found = nullptr;
     if (kind == 1) found = new SpectrumForm(blob, in);
     if (kind == 2) found = new ImageForm(blob, in);
     if (kind == 3) found = new SourcesForm(blob, in);
     if (kind == 4) found = new PowersForm(blob, in);
     if (!found) refuse("form %d is none of this library's", kind);
-    found->facts.error = error;
+    found->facts.error = error, found->facts.worst = worst;
     for (int axis = 0; axis < 3; ++axis) found->facts.origin[axis] = origin[axis];
     return found;
 }

@@ -13,12 +13,14 @@
 extern "C" {
 #endif
 
-#define GSPARC_FIELD_VERSION 1
+#define GSPARC_FIELD_VERSION 2
+#define GSPARC_FARTHEST_M 1e7              /* from the origin of the world: no place in metres lies beyond, as in Python */
+#define GSPARC_MOST_BYTES (INT64_C(1) << 28) /* of an answer and its scratch memory: files of more are refused, as damaged */
 
 typedef struct gsparc_field gsparc_field;
 
 enum { GSPARC_SPECTRUM = 1, GSPARC_CHANNEL = 2, GSPARC_POWER = 3 };           /* kinds of values */
-enum { GSPARC_DONE = 0, GSPARC_BAD_PLACE = 1, GSPARC_UNSOLVED = 2 }; /* what queries return */
+enum { GSPARC_DONE = 0, GSPARC_BAD_PLACE = 1 /* not finite, or too far */, GSPARC_UNSOLVED = 2 }; /* what queries return */
 
 typedef struct {
     int32_t kind;
@@ -27,7 +29,8 @@ typedef struct {
     int64_t values;    /* floats of an answer: rows * columns; 2 * antennas * tones, real before imaginary; 1 */
     int64_t scratch;   /* bytes of scratch memory that a query needs, its start a multiple of 64 */
     double origin[3];  /* of the places in the world [m]: subtract it in double precision */
-    double error;      /* against the model, root mean square at random places, of that of its answers; 0: the same numbers */
+    double error;      /* against the model, over random places: MSE of spectra, NMSE of channels, RMSE of powers [dB]; 0: none */
+    double worst;      /* the same of the worst place; of a channel, over the mean power of all */
 } gsparc_facts;
 
 /* From a file, or from its bytes, which are copied; null where it is refused, and `why` (of `room` bytes) says so. */

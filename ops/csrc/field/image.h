@@ -31,7 +31,6 @@ struct ImageForm final : Form {
 
     ImageForm(const Blob& blob, Numbers& in) {
         read_features(blob, in, process);
-        if (process.axes > 6) refuse("places of %d coordinates", process.axes);
         in.sizes(view.seen, view.height, view.width, activation);
         log_distance = in.flag(), inverse_distance = in.flag(), tells_unknown = in.flag();
         in.values(gain, least_squared, per_reference_squared);

@@ -54,8 +54,10 @@ struct SourcesForm final : Form {
         blob.read("level", level, int64_t(count) * 2 * outputs);
         blob.read("weights", weights, int64_t(count) * 2 * outputs * padded);
         blob.read("offsets", offsets, still > 1 ? int64_t(still) * 3 : 0);
-        facts.axes = 3, facts.shape[0] = antennas * still * outputs, facts.shape[1] = 0;
-        blob.read("factors", factors, 2 * int64_t(facts.shape[0]));
+        const int64_t entries = int64_t(antennas) * still * outputs;
+        blob.read("factors", factors, 2 * entries);
+        if (entries > INT32_MAX) refuse("%lld entries of a channel", (long long)entries);
+        facts.axes = 3, facts.shape[0] = int(entries), facts.shape[1] = 0;
         int most = 0;
         for (int i = 0; i < combs; ++i) {
             const double tones = comb[3 * i + 2];
@@ -103,7 +105,7 @@ private:
                 add_sources(outputs, wide, own.phases, own.scaled, own.sums);
             }
             for (int o = 0; o < outputs; ++o) {
-                const float *re = own.sums + 2 * int64_t(o) * wide, *im = re + wide, *factor = factors + 2 * (e * outputs + o);
+                const float *re = own.sums + 2 * int64_t(o) * wide, *im = re + wide, *factor = factors + 2 * (int64_t(e) * outputs + o);
                 float* to = values + 2 * ((int64_t(e) * outputs + o) * width + at);
                 for (int t = 0; t < tones_wanted; ++t) {
                     const float scale = float(carrier / (first + t * step)), x = scale * re[t], y = scale * im[t];

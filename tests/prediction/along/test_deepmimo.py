@@ -66,6 +66,19 @@ def towards(start, end):
     return (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
 
 
+def test_places_in_utm_metres_were_rounded_to_half_a_metre(tmp_path, monkeypatch):
+    utm = np.array([447_000.25, 4_500_000.25, 0])
+    monkeypatch.setattr(Site, "origin", Site.origin + utm)
+    monkeypatch.setattr(Mirror, "paths", lambda self, rx, paths=Mirror.paths: paths(self, rx - utm))
+    deepmimo.write(tmp_path, Mirror(), PLACES + utm)
+    at, still, meets = (
+        np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name] for name in ("rx_pos", "tx_pos", "inter_pos")
+    )
+    np.testing.assert_allclose(at, PLACES + utm, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(still[0], STILL + utm, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(meets[:, 1, 0, 0], WALL + utm[0], rtol=0, atol=1e-3)
+
+
 def test_a_mirror_is_found_where_it_is(scenario):
     _, held = scenario
     np.testing.assert_array_equal(held["inter"][:, :2], [[0, 1], [0, 1]])
