@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from shutil import disk_usage
+from tokenize import TokenError
 from typing import Any, NamedTuple
 
 import h5py
@@ -34,6 +35,7 @@ from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+UNREADABLE = (SyntaxError, TokenError)  # of a header that is no Python literal
 COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
@@ -230,7 +232,7 @@ def _stated_npz(path: Path) -> Stated:
     stated = {}
     with suppress(*DAMAGED), zipfile.ZipFile(path) as archive:  # what is damaged is said where it is read
         for entry in archive.infolist():
-            with suppress(*DAMAGED), archive.open(entry) as file:
+            with suppress(*DAMAGED, *UNREADABLE), archive.open(entry) as file:
                 file.seek(len(MAGIC_PREFIX))
                 shape, _, dtype = (header_1 if file.read(2)[0] == 1 else header_2)(file)
                 stated[entry.filename.removesuffix(".npy")] = shape, math.prod(shape) * dtype.itemsize

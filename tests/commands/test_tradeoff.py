@@ -147,4 +147,4 @@ def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
 
 def test_a_model_of_several_stations_could_not_be_timed():
     ask = gsparc.load(town_model()).cycling(np.array([[10.0, 20.0, 1.5], [30.0, 20.0, 1.5]]))
-    assert ask(0) > 0 and ask(1) != ask(2)
+    assert np.isfinite(ask(0)) and ask(1) != ask(2)

@@ -15,6 +15,7 @@ from contexts import trained
 from gsparc.commands.train import train
 
 PRUNE = (
+    "init=sphere",  # of emissions that were solved for, no Gaussian goes that changes what is rendered
     "callbacks=densify",
     "callbacks.densify.start=4",
     "callbacks.densify.interval=4",

@@ -40,6 +40,7 @@ DECLARED = {
     "complex_gp": "",
     "directional_gp": "HasPaths",
     "image_source_gp": "HasPaths Reducible",
+    "splat": "Reducible",
     "array": "Reducible",
     "moving_array": "Reducible",
     "gsparc": "HasPaths Reducible",
@@ -66,7 +67,7 @@ def data_of(name: str, folder: Path) -> Measurements:
         return directed(60)[0]
     if name in ("image_source_gp", "gsparc of sources"):
         return shoebox(60)[1]
-    if name == "array":
+    if name in ("array", "splat"):
         return kinds.static_array(folder)
     if name == "moving_array":
         return kinds.moving_array(folder)

@@ -81,7 +81,8 @@ def understand_table(
     about = {}
     if power is not None and power.unit is not None:
         about = {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
-        about["unit"] = power.unit.name
+        if not power.unit.name.startswith("x "):  # a column that is scaled has the schema's unit
+            about["unit"] = power.unit.name
     return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
