@@ -14,6 +14,7 @@ from gsparc.field.frozen import seen_by_array
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.ops import Pose
+from gsparc.processes.factor import Factor
 
 RIDGE = 1e-3  # of the mean energy of a view: footprints overlap, and less lets weights cancel each other
 
@@ -56,7 +57,7 @@ def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solve
     gram = (view @ view.mH).to(torch.complex128 if view.is_complex() else torch.float64)
     ridge = RIDGE * gram.diagonal().real.mean() * torch.eye(len(gram), device=gram.device)
     missing = (rendered - _lines(trial) @ view) @ view.mH
-    lines = torch.linalg.solve(gram + ridge, missing.to(gram.dtype).mH).mH.to(view.dtype)
+    lines = Factor.of(gram + ridge).solved(missing.to(gram.dtype).mH).mH.to(view.dtype)
     correction = torch.view_as_real(lines) if lines.is_complex() else lines.unsqueeze(-1)
     trial.emission.weight2.add_(correction[:-1].transpose(0, 1))
     trial.emission.bias2.add_(correction[-1])
