@@ -120,7 +120,7 @@ class Server(uvicorn.Server):
 class Asked(NamedTuple):
     """A request that waits: how many places its body holds if it is sound, and where its answer comes."""
 
-    count: int
+    places: int
     body: bytes
     raw: bool
     answer: asyncio.Future[np.ndarray]
@@ -163,8 +163,8 @@ class Batcher:
         """The request that waits longest, and the smallest others: few places do not wait for many."""
         waiting = [one for one in self.waiting if not one.answer.done()]
         batch, left = waiting[:1], self.most
-        for one in sorted(waiting[1:], key=lambda one: one.count):
-            left -= one.count
+        for one in sorted(waiting[1:], key=lambda one: one.places):
+            left -= one.places
             batch += [one] if left >= 0 else []
         self.waiting = [one for one in waiting if one not in batch]
         if not self.waiting:
