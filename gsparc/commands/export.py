@@ -60,7 +60,11 @@ def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) 
     size = write(folder / "field.gsparc", result.form, origin, result.error, result.worst)
     shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
     shutil.copytree(SOURCES, folder / "source", ignore=OTHERS)
-    facts = {"export/bytes": size, "export/form": result.form.kind, "export/error": result.error}
+    facts: dict[str, Any] = {
+        "export/bytes": size,
+        "export/form": result.form.kind,
+        "export/error": result.error,
+    }
     facts |= {"export/worst": result.worst, "export/figure": FIGURES[predictor.site.kind]}
     build = f"cmake -S {out}/source/field -B {out}/build && cmake --build {out}/build"
     return facts, [result.summary, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
