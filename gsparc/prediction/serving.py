@@ -45,7 +45,7 @@ class Limits(Checked):
         delay_ms: that a request waits for others, to be computed with them.
     """
 
-    most: int = setting(4096, whole(1))
+    most: int = setting(1024, whole(1))
     numbers: int = setting(131_072, whole(1))
     connections: int = setting(64, whole(1))
     request_s: float = setting(10.0, POSITIVE)
@@ -74,10 +74,9 @@ class Connection(H11Protocol):
             return
         others = [one for one in self.connections if isinstance(one, Connection) and one is not self]
         works = [one for one in others if one.works()]
-        if (
-            2 * len(works) > self.limits.connections
-        ):  # half the room is for those whose request is not read yet
-            other = max(works, key=lambda one: one.cycle.scope.get("places", 0))
+        # Half the room is for those whose request is not read yet.
+        if 2 * len(works) > self.limits.connections:
+            other = max(works, key=lambda one: int(one.cycle.scope.get("places", 0)))  # type: ignore[call-overload]
         else:
             other = min((one for one in others if not one.works()), key=lambda one: one.end.when())
         self.connections.discard(other)
@@ -120,7 +119,7 @@ class Server(uvicorn.Server):
 class Asked(NamedTuple):
     """A request that waits: how many places its body holds if it is sound, and where its answer comes."""
 
-    places: int
+    size: int
     body: bytes
     raw: bool
     answer: asyncio.Future[np.ndarray]
@@ -142,9 +141,9 @@ class Batcher:
         self.waiting: list[Asked] = []
         self.some = asyncio.Event()
 
-    async def ask(self, count: int, body: bytes, raw: bool) -> np.ndarray:
+    async def ask(self, size: int, body: bytes, raw: bool) -> np.ndarray:
         """Answers (n, ...) at the world places (n, 3) [m] of a body; raises what reading and the model do."""
-        self.waiting.append(Asked(count, body, raw, asyncio.get_running_loop().create_future()))
+        self.waiting.append(Asked(size, body, raw, asyncio.get_running_loop().create_future()))
         self.some.set()
         return await self.waiting[-1].answer
 
@@ -163,8 +162,8 @@ class Batcher:
         """The request that waits longest, and the smallest others: few places do not wait for many."""
         waiting = [one for one in self.waiting if not one.answer.done()]
         batch, left = waiting[:1], self.most
-        for one in sorted(waiting[1:], key=lambda one: one.places):
-            left -= one.places
+        for one in sorted(waiting[1:], key=lambda one: one.size):
+            left -= one.size
             batch += [one] if left >= 0 else []
         self.waiting = [one for one in waiting if one not in batch]
         if not self.waiting:

@@ -146,7 +146,7 @@ def _other_table(blob: bytearray, draw: np.random.Generator) -> None:
         at = HEAD.size + SECTION.size * int(draw.integers(many))
         name, kind, unused, offset, count = SECTION.unpack(blob[at : at + SECTION.size])
         other = SECTION.unpack_from(blob, HEAD.size + SECTION.size * int(draw.integers(many)))
-        some = [count + 1, 2 * count, 0, 2**62, -1, (len(blob) - offset) // 4, other[4]]
+        some = [count % 2**40 + 1, 2 * (count % 2**40), 0, 2**62, -1, (len(blob) - offset) // 4, other[4]]
         fields = [
             (other[0], kind, unused, offset, count), (name, int(draw.integers(6)), unused, offset, count),
             (name, kind, unused, int(draw.choice([0, 64, len(blob) // 64 * 64, -64, 2**62])), count),

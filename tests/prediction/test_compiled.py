@@ -21,10 +21,11 @@ import torch
 import gsparc
 from gsparc.commands import export
 from gsparc.commands.train import train
+from gsparc.data.assemble import FARTHEST
 from gsparc.models import checkpoint
 from gsparc.models.terms import EffectSettings
 from gsparc.prediction.compiled import make
-from gsparc.prediction.compiled.blob import CHECKED, HEAD, packed
+from gsparc.prediction.compiled.blob import CHECKED, HEAD, Form, packed
 from gsparc.processes import powers
 from gsparc.processes.neighbourhood import Neighbourhood
 
@@ -218,6 +219,60 @@ def test_threads_agree_nothing_is_allocated_and_damage_is_refused(library, tmp_p
     assert said.split() == ["queries", "10000000", "wrong", "0", "allocations", "0"]
     cut = files(tmp_path, 1000, partial(damaged, blob))
     assert run([asked, *cut]).stdout.split() == ["refused", "1000"]
+
+
+@pytest.mark.slow
+def test_sizes_whose_product_left_32_bits_were_written_beyond(library, example, tmp_path):
+    """65,536 x 65,536 entries: none in 32 bits: no factors were needed, and answers had no room."""
+    sizes = [1, 1, 65536, 65536, 1, 1]
+    arrays = {
+        name: np.ones(count) for name, count in field_files.needed(3, sizes).items() if name != "factors"
+    }
+    double = ("moving", "sources", "images", "combs", "offsets")
+    arrays = {name: value.astype("f8" if name in double else "f4") for name, value in arrays.items()}
+    form = Form(3, [*map(float, sizes), 1e9], arrays | {"middle": np.zeros(3)})
+    (path := tmp_path / "field.gsparc").write_bytes(packed(form, np.zeros(3)))
+    with pytest.raises(ValueError, match="factors is missing"):
+        example.Field(path, library)
+    arrays = arrays | {"middle": np.zeros(3), "factors": np.ones(2 << 20, "f4")}
+    sizes = [1, 1, 1, 1 << 20, 1, 1]
+    fits = {name: np.resize(arrays[name], count) for name, count in field_files.needed(3, sizes).items()}
+    fits |= {"middle": np.zeros(3), "combs": np.array([1e9, 1e6, 1e5])}
+    path.write_bytes(packed(Form(3, [*map(float, sizes), 1e9], fits), np.zeros(3)))
+    with pytest.raises(ValueError, match="an answer of 209715200000 numbers"):
+        example.Field(path, library)
+
+
+@pytest.mark.slow
+def test_places_that_python_refuses_were_answered_by_the_library(library, example, tmp_path):
+    predictor = of_powers(60)
+    path = tmp_path / "field.gsparc"
+    path.write_bytes(packed(make.compiled(predictor).form, predictor.site.origin))
+    field = example.Field(path, library)
+    for place in ([FARTHEST * 1.01, 0, 0], [0, 0, -2 * FARTHEST], [0, np.nan, 0]):
+        with pytest.raises(ValueError, match="status 1"):
+            field(np.array(place))
+        with pytest.raises(ValueError, match=r"^rx= holds"):
+            predictor.rssi(rx=place)
+    field(np.array([FARTHEST * 0.99, 0, 0]))
+    field.close()
+
+
+def test_the_stated_error_missed_the_metres_under_a_station():
+    """Of 256 draws over 400 x 400 m none was there; and it was linear, which a few strong places decide."""
+    rng, tx = np.random.default_rng(0), np.array([200.0, 200, 3])
+    rx = rng.uniform([0, 0, 0], [400, 400, 2], (300, 3))
+    level = -40 - 20 * np.log10(np.linalg.norm(rx - tx, axis=1))
+    predictor = gsparc.fit(rx=rx, tx=tx, rssi=level, model="idw")
+    found = make.compiled(predictor, 1024)
+    assert found.form.predictor is not None and "RMSE dB" in found.summary and "at the worst" in found.summary
+    places = make.random_places(predictor.site, 20_000, 9)
+    own, whole = (make.answers(one, places)[:, 0] for one in (found.form.predictor, predictor))
+    apart = 10 * np.log10(own / whole)
+    assert found.error == pytest.approx(np.sqrt(np.mean(apart**2)), rel=0.1)
+    assert found.worst > 0.7 * np.abs(apart).max()
+    near = make.near_places(predictor.site, 400, 1) - predictor.site.static_position
+    assert np.median(np.linalg.norm(near[:, :2], axis=1)) < 10
 
 
 @pytest.mark.slow

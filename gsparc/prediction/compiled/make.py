@@ -50,11 +50,8 @@ class Compiled:
     summary: str
 
 
-FIGURES: dict[Kind, str] = {
-    "spectrum": "MSE",
-    "csi": "NMSE",
-    "rssi": "RMSE dB",
-}  # as `gsparc evaluate` has them
+# As `gsparc evaluate` has them.
+FIGURES: dict[Kind, str] = {"spectrum": "MSE", "csi": "NMSE", "rssi": "RMSE dB"}
 NEAREST = 1e-3  # of the way to the other end: where the largest errors are looked for
 SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
 
