@@ -84,7 +84,7 @@ def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> i
             raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     given = [*([] if steps is None else [steps]), *([] if epochs is None else [epochs * -(-rows // size)])]
-    return min(given) if given else own
+    return min(given) if given and own != 0 else own  # 0 of either is the start alone
 
 
 class ReturnMetrics(L.Callback):

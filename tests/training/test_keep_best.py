@@ -69,6 +69,11 @@ def test_a_budget_spent_before_the_first_step_took_steps_that_nothing_spoke_for(
     assert late.steps == 0 and "first step of stage train" in caplog.text and "stage refit" not in caplog.text
 
 
+def test_no_steps_of_the_model_took_those_of_the_trainer(measured, tmp_path):
+    """`model=array`, which is solved, took as many gradient steps as `trainer.max_steps` said."""
+    assert fitted(measured, tmp_path, "init=images", "model.steps=0", steps=20).steps_taken == 0
+
+
 @pytest.mark.parametrize(
     ("errors", "kept"),
     [([1, 1, 1, 0.9], False), ([0.9, 0.8, 0.9, 0.85], True), ([1.1, 1.0, 1.2, 1.1], False)],
