@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 TINY_M = 1e-6  # distance that has a logarithm
+LEAST_SPREAD = 0.1  # decades: rows at nearly one distance say nothing of a slope that holds far away
 LEVEL = 0.7  # upward part of a floor's normal
 
 
@@ -94,7 +95,8 @@ class Trend:
     Attributes:
         level: the mean where there is no law [dB].
         law: the distance law, or None.
-        middle, spread: mean and deviation of the rows' decades of distance: its slope is uncertain in these.
+        middle, spread: mean and deviation of the rows' decades of distance: by one deviation its uncertain slope
+            changes powers as much as the process does.
         walls: that are known; what one takes is uncertain, and what one floor takes.
     """
 
@@ -108,7 +110,7 @@ class Trend:
     def about(cls, law: Law, places: Tensor) -> Trend:
         """About a law that was fitted to rows at places (n, 3) or (n, 6) float64 [m]."""
         decades = law.decades(places)
-        return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), 1e-6))
+        return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), LEAST_SPREAD))
 
     def mean(self, places: Tensor) -> Tensor:
         """Powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""

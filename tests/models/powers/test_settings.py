@@ -171,3 +171,17 @@ def test_settings_of_many_rows_come_from_near_rows_too():
     process, notes = fit_powers(rows_of(data, np.arange(len(data))), data.site)
     assert any("given its nearest" in note for note in notes)
     assert process.kernel.lengths[0] < 20
+
+
+def test_rows_within_centimetres_said_infinite_powers_a_kilometre_away():
+    """The slope of a law was free by the spread of the rows' distances, here a hundredth of a decade."""
+    rng = np.random.default_rng(3)
+    places = np.repeat([[0.0, 0.70, 0.6], [0.1, 0.72, -0.6]], 4, axis=0)
+    decibels = np.repeat([-68.6, -66.4], 4) + 0.3 * rng.standard_normal(8)
+    still = np.array([-1.0, -0.7, 0.0])
+    data = from_arrays({"rx_position": places, "tx_position": still, "rssi_db": decibels}, {"name": "shelf"})
+    for mean in ("auto", "distance"):
+        process, _ = fit_powers(rows_of(data, np.arange(8)), data.site, mean=mean)
+        far = torch.eye(3, dtype=torch.float64) * 1000.0
+        found, *_ = process.answer(far)
+        assert (found + 67.5).abs().max() < 150, (mean, found)
