@@ -33,12 +33,15 @@ class Stations:
         name: (T,) what a user calls them.
         rotation: (T, 3, 3) float64, local to world; None where receivers are not turned, or transmit.
         carrier_hz: (T,) [Hz]; None where all have the site's.
+        sector: (T, 5) azimuth from north, tilt below the horizon, widths of the beam across and in height
+            [deg], and power [dB], NaN where unknown; None where nothing of it is known.
     """
 
     position: np.ndarray
     name: tuple[str, ...]
     rotation: np.ndarray | None = None
     carrier_hz: np.ndarray | None = None
+    sector: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -371,8 +374,13 @@ FIELDS: dict[str, Field] = {
         Field("station_longitude", "(T,)", "deg", "no", "together with station_latitude"),
         Field("station_name", "(T,)", "1", "no", "what you call each station"),
         Field("station_orientation", "(T, 4)", "1", "no", "quaternions (w, x, y, z) of receiving stations"),
+        Field("station_azimuth", "(T,)", "deg", "no", "of a sector's beam, from north (y) to east (x)"),
+        Field("station_tilt", "(T,)", "deg", "no", "of a sector's beam below the horizon"),
+        Field("station_width", "(T,)", "deg", "no", "of a sector's beam across, between half powers"),
+        Field("station_thickness", "(T,)", "deg", "no", "of a sector's beam in height, between half powers"),
+        Field("station_power_db", "(T,)", "dB", "no", "that a station transmits; differences count"),
         Field("station", "(S,)", "1", "no", "which station each row is of, from 0; else a column for each"),
-        Field("sensitivity_db", "() or (T,)", "dB", "no", "level below which nothing is heard: NaN is that"),
+        Field("sensitivity_db", "(), (T,) or (S,)", "dB", "no", "level that is not reached where NaN is"),
         Field("run", "(S,)", "1", "no", "name or number; channels of a run share an unknown factor"),
         Field("time_s", "(S,)", "s", "no", "when each row was measured; kept, not read"),
         Field("spectrum", "(S, H, W)", "1", "one of", "power by direction, linear; or uint8 with 255 = 1"),

@@ -37,7 +37,7 @@ class Law:
 
     def decades(self, places: Tensor) -> Tensor:
         """log10 of the distance in metres, floored, (n,) at places (n, 3), or of both ends (n, 6) [m]."""
-        still = places[:, 3:] if self.place is None else places.new_tensor(self.place)
+        still = places[:, 3:6] if self.place is None else places.new_tensor(self.place)
         squared = (places[:, :3] - still).square().sum(1)
         return 0.5 * torch.log10(squared.clamp_min(max(self.floor, TINY_M) ** 2))
 
@@ -95,8 +95,8 @@ class Trend:
     Attributes:
         level: the mean where there is no law [dB].
         law: the distance law, or None.
-        middle, spread: mean and deviation of the rows' decades of distance: by one deviation its uncertain slope
-            changes powers as much as the process does.
+        middle, spread: mean and deviation of the rows' decades of distance: by one deviation its uncertain
+            slope changes powers as much as the process does.
         walls: that are known; what one takes is uncertain, and what one floor takes.
     """
 

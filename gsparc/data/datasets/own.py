@@ -29,7 +29,7 @@ def raw_of_own(
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
     not_heard: Sequence[float] | None = None,
-    absent: str = "unknown",
+    absent: str = "auto",
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
 
@@ -39,7 +39,8 @@ def raw_of_own(
         stations_file: of a table, a second one that lists the stations.
         cell_m: of Parquet, also a folder or a URL of it: means of rows [dB] by cells of this side [m].
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
-        absent: `silent`: a station without a row at a place where others have one was not heard there.
+        absent: `silent`: a station without a row at a place where others have one was not heard there;
+            `auto`: one that a list of the strongest leaves out is below its weakest; `unknown`: neither.
 
     Raises:
         DataError: bad input, or a file of another campaign.
@@ -55,11 +56,11 @@ def raw_of_own(
     return raw
 
 
-def understood(raw: Raw, not_heard: Sequence[float] | None = None, absent: str = "unknown") -> Raw:
+def understood(raw: Raw, not_heard: Sequence[float] | None = None, absent: str = "auto") -> Raw:
     """The same with what settings say of rows and cells without a level; see `raw_of_own`."""
-    choice("unknown", "silent").check("dataset.absent", absent)
+    choice("auto", "unknown", "silent").check("dataset.absent", absent)
     said: dict[str, Any] = {} if not_heard is None else {"not_heard": [float(mark) for mark in not_heard]}
-    said |= {} if absent == "unknown" else {"absent": absent}
+    said |= {} if absent == "auto" else {"absent": absent}
     return replace(raw, attributes={**raw.attributes, **said})
 
 

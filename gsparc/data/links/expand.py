@@ -14,7 +14,8 @@ from gsparc.data.blocks import is_big
 from gsparc.data.checks.plausibility import degree_warnings, not_heard
 from gsparc.data.errors import Caution, lines_of, some
 from gsparc.data.links.georeference import Georeference, bad_degrees
-from gsparc.data.links.stations import by_carrier, ends_of, numbered, station_of_row, station_table
+from gsparc.data.links.stations import SECTOR, by_carrier, ends_of, numbered, station_of_row, station_table
+from gsparc.data.links.strongest import Lists, moments
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links
@@ -23,7 +24,16 @@ from gsparc.data.selection import take_rows
 POWERS = ("rssi", "rssi_db")
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
-STATION_FIELDS = ("station", "station_position", "station_name", "station_orientation", "sensitivity_db")
+LEAST_LISTED = 3  # stations, for lists of the strongest
+UNLISTED_EACH = 2  # rows of what is not listed for one that is
+STATION_FIELDS = (
+    "station",
+    "station_position",
+    "station_name",
+    "station_orientation",
+    *SECTOR,
+    "sensitivity_db",
+)
 
 
 def expand(check: Checker, measured: str) -> Links | None:
@@ -121,26 +131,81 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         check.raw.arrays.pop(name, None)
     if long and check.raw.attributes.get("absent") == "silent":
         links, of_level = _with_absent(check, measured, links)
+    if check.raw.attributes.get("absent", "auto") == "auto" and measured == "rssi_db":
+        links, of_level = _with_unlisted(check, links, of_level)  # type: ignore[arg-type]
     return _valid(check, measured, links, of_level, count)  # type: ignore[arg-type]
 
 
 def _with_absent(check: Checker, measured: str, links: Links) -> tuple[Links, np.ndarray | None]:
     """A row that was not heard for each place and station without one, and the stations of all rows."""
     assert links.stations is not None and links.station is not None and links.place is not None
-    arrays, count, rows = check.raw.arrays, len(links.stations), len(links.station)
+    count, rows = len(links.stations), len(links.station)
     if measured != "rssi_db":
         check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
     _, first, of_place = np.unique(links.place, return_index=True, return_inverse=True)
     lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + links.station)
-    like = np.concatenate([np.arange(rows), first[lost // count]])
     station = np.concatenate([links.station, lost % count])
-    arrays = take_rows(arrays, like, rows)
-    arrays[measured] = np.where(np.arange(len(like)) < rows, arrays[measured], -np.inf)
-    arrays[f"{links.static_end}_position"] = links.stations.position[station]
-    check.raw = replace(check.raw, arrays=arrays)
+    level = np.full(len(lost), -np.inf)
+    links = _repeated(check, links, np.r_[:rows, first[lost // count]], station, level)
     check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
+    return links, station
+
+
+def _repeated(
+    check: Checker, links: Links, like: np.ndarray, station: np.ndarray, level: np.ndarray
+) -> Links:
+    """Rows `like` (n,), of stations (n,); the last of them have levels (m,) [dB] of their own."""
+    assert links.stations is not None and links.station is not None and links.place is not None
+    arrays = take_rows(check.raw.arrays, like, len(links.station))
+    levels = arrays["rssi_db"].astype(np.float64)
+    levels[len(like) - len(level) :] = level
+    stand = {f"{links.static_end}_position": links.stations.position[station]}
+    check.raw = replace(check.raw, arrays={**arrays, "rssi_db": levels, **stand})
     run = None if links.run is None else links.run[like]
-    return replace(links, station=station, place=links.place[like], run=run), station
+    return replace(links, station=station, place=links.place[like], run=run)
+
+
+def _with_unlisted(check: Checker, links: Links, of_level: np.ndarray) -> tuple[Links, np.ndarray]:
+    """Lists of the strongest with rows, twice as many as are listed, of stations that they leave out.
+
+    Returns:
+        The links, and the stations of all rows; as they were where there are no such lists.
+    """
+    arrays, levels = check.raw.arrays, check.raw.arrays["rssi_db"]
+    count, rows = len(links.stations or ()), len(levels)
+    whole = levels.ndim == 1 and levels.dtype.kind in "iuf" and "mask" not in arrays
+    if not whole or count < LEAST_LISTED or "rx_rotation" in arrays:
+        return links, of_level
+    assert links.stations is not None and links.station is not None and links.place is not None
+    level = check.real("sensitivity_db", (), (max(of_level.max(initial=0) + 1, 1),), (rows,))
+    heard = np.flatnonzero(np.isfinite(levels))
+    if ("sensitivity_db" in arrays and (level is None or level.shape == (rows,))) or not len(heard):
+        return links, of_level
+    moving = check.real(f"{OTHER[links.static_end]}_position", (rows, 3))  # type: ignore[index]
+    if moving is None:
+        return links, of_level
+    moment = moments(links.place[heard], links.station[heard])
+    lists = Lists.of(moment, links.station[heard], levels[heard], moving[heard], count)
+    if not lists.recognised():
+        return links, of_level
+    floor = np.full(count, levels[heard].min() if level is None else np.min(level))
+    if level is not None:
+        floor[links.station] = np.broadcast_to(level, (len(np.atleast_1d(level)),))[
+            of_level * (level.size > 1)
+        ]
+    most = UNLISTED_EACH * len(heard)
+    of_list, station, below = lists.unlisted(floor, links.stations.position, most)
+    like = np.r_[heard, heard[lists.first[of_list]]]
+    station = np.r_[links.station[heard], station]
+    arrays.pop("sensitivity_db", None)
+    links = _repeated(check, links, like, station, np.full(len(below), -np.inf))
+    check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
+    check.notes.append(
+        f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
+        f" below its weakest, in others below {floor.min():.4g} dB; {len(below)} such rows beside"
+        f" {len(heard)} listed, those that tell most (dataset.absent=unknown takes none)"
+    )
+    return links, station
 
 
 def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
@@ -215,11 +280,14 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
 def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
     """Rows without a missing value; censored ones hold the level below which nothing is heard, masked."""
     values, arrays = check.raw.arrays[measured], check.raw.arrays
-    level = check.real("sensitivity_db", (), (count,))
+    level = check.real("sensitivity_db", (), (count,), values.shape[:1])
     if "sensitivity_db" in arrays and level is None:
         return None
     if level is not None and measured != "rssi_db":
         return check.refuse("sensitivity_db", f"goes with rssi_db, not with {measured}")
+    by_row = level is not None and level.shape == values.shape != (count,)
+    if level is not None and by_row:  # what was heard needs none
+        level = np.where(np.isnan(level) & np.isfinite(values), values, level)
     if level is not None and not (np.isfinite(level) & (np.abs(level) <= 400)).all():
         return check.refuse("sensitivity_db", "expected dB between -400 and 400")
     arrays.pop("sensitivity_db", None)
@@ -243,7 +311,8 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
             level, censored = values[~unheard & np.isfinite(values)].min(), unheard
     if level is not None:
         censored = censored if censored.any() else unknown & marked
-        floor = np.broadcast_to(np.atleast_1d(level)[of_level if level.size > 1 else 0], (len(values),))
+        of_row = level if by_row else np.atleast_1d(level)[of_level if level.size > 1 else 0]
+        floor = np.broadcast_to(of_row, (len(values),))
         below = ~unknown & marked & (values < floor)
         if below.any():
             row = int(np.flatnonzero(below)[0])

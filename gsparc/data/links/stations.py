@@ -10,6 +10,9 @@ import numpy as np
 from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker, is_unit, quaternion_to_matrix
 from gsparc.data.schema import ENDS, OTHER, End, Links, Stations
 
+# Of a station's beam, in the order of `Stations.sector`.
+SECTOR = ("station_azimuth", "station_tilt", "station_width", "station_thickness", "station_power_db")
+FULL_TURN = 360.0
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 
 
@@ -85,9 +88,15 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
         return check.refuse(
             "station_orientation", f"row {row}: expected a quaternion (w, x, y, z) of length 1"
         )
-    return Stations(
-        places, called, None if turned is None else quaternion_to_matrix(turned, scalar_first=True)
-    )
+    rotation = None if turned is None else quaternion_to_matrix(turned, scalar_first=True)
+    parts = [check.real(name, (count,)) for name in SECTOR]
+    sector = None
+    if any(part is not None for part in parts):
+        sector = np.stack([np.full(count, np.nan) if part is None else part for part in parts], 1)
+        wrong = np.abs(sector[:, :4]).max(initial=0, where=np.isfinite(sector[:, :4]))
+        if wrong > FULL_TURN:
+            return check.refuse("station_azimuth", f"{wrong:g}; expected degrees, none beyond {FULL_TURN:g}")
+    return Stations(places, called, rotation, sector=sector)
 
 
 def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
@@ -150,7 +159,9 @@ def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: 
     if len(np.unique(carrier)) == 1:
         check.raw.arrays["carrier_hz"] = np.array(carrier[0])
         return links
-    names = tuple(f"{stations.name[i]} at {c / 1e6:g} MHz" for i, c in zip(first, carrier, strict=True))
-    turned = None if stations.rotation is None else stations.rotation[first]
-    table = Stations(stations.position[first], names, turned, carrier)
+    several = np.bincount(first)[first] > 1  # a station of one carrier keeps its name
+    called = zip(first, carrier, several, strict=True)
+    names = tuple(stations.name[i] + f" at {c / 1e6:g} MHz" * bool(more) for i, c, more in called)
+    parts = [None if one is None else one[first] for one in (stations.rotation, stations.sector)]
+    table = Stations(stations.position[first], names, parts[0], carrier, parts[1])
     return replace(links, stations=table, station=which.reshape(-1).astype(np.int64))

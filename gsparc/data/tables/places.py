@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsparc.data.tables.columns import Chosen, as_station, choose
+from gsparc.data.errors import Caution, some
+from gsparc.data.tables.columns import Chosen, as_station, choose, station_names
+from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, understand, words_of
+from gsparc.data.tables.sectors import TILTS, meaning, read_sectors
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
@@ -129,7 +132,9 @@ def one_each(
     return None
 
 
-PER_STATION = ("sensitivity_db", "carrier_hz")
+SECTOR = ("station_azimuth", "station_tilt", "station_width", "station_thickness", "station_power_db")
+LEAST_LISTED = 10  # stations of a drive: of fewer, one that the list lacks is a mistake
+PER_STATION = ("sensitivity_db", "carrier_hz", *SECTOR)
 
 
 @dataclass(frozen=True)
@@ -139,30 +144,71 @@ class StationList:
     Attributes:
         names: (T,).
         places: (T,).
-        extra: (T,) arrays by name: `sensitivity_db`, `carrier_hz`.
+        extra: (T,) arrays by name: `PER_STATION`.
         index: (S,) which station each row of another table is of; None where each has a column there.
+        aliases: other names of all of them.
     """
 
     names: tuple[str, ...]
     places: Places
     extra: dict[str, np.ndarray] = field(default_factory=dict)
     index: np.ndarray | None = None
+    aliases: tuple[tuple[str, ...], ...] = ()
+
+    def called(self, words: np.ndarray) -> StationList:
+        """The same under the names that most of words (S,) are of, its own first."""
+        known = set(words.tolist())
+        names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
+        return replace(self, names=names)
+
+    def with_lacking(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
+        """The same with those of words (S,) that it lacks, if few, at unknown places; these, and a note."""
+        names = [word for word in dict.fromkeys(words.tolist()) if word]
+        lost = [word for word in names if word not in self.names]
+        if not lost or len(names) < LEAST_LISTED or len(names) < 3 * len(lost):
+            return self, [], []
+        rows, more = int(np.isin(words, lost).sum()), len(lost)
+        said = f"{more} of {len(names)} stations are not in the list, with {rows} of {len(words)} rows"
+        height = None if self.places.height is None else np.r_[self.places.height, np.full(more, np.nan)]
+        across = np.concatenate([self.places.across, np.full((more, 2), np.nan)])
+        extra = {
+            name: np.r_[array, np.full(more, np.nan if name in SECTOR else array[0])]
+            for name, array in self.extra.items()
+        }
+        where = Places(across, height, self.places.degrees)
+        grown = replace(self, names=(*self.names, *lost), places=where, extra=extra)
+        return grown, lost, [Caution(f"{said}: {some(lost)}; their places are unknown")]
 
 
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     """The stations of a table: name, and x, y, z or latitude, longitude, height, empty where nobody knows."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
-    chosen, notes = choose(sheet, {"station": called[0]} if len(called) == 1 else {})
+    naming = [head for head in sheet.heads if head and understand(head).role == "station"]
+    if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
+        called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
+    # What is of a beam is no measurement, whatever its head says besides.
+    heads = tuple("" if meaning(head) in (*SECTOR, *TILTS) else head for head in sheet.heads)
+    chosen, notes = choose(replace(sheet, heads=heads), {"station": called[0]} if len(called) == 1 else {})
     chosen = {columns[0].role: columns for columns in (tuple(map(as_station, c)) for c in chosen.values())}
-    notes = [f"{sheet.source}: {note}" for note in notes if not note.startswith("not used")]
+    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if head and meaning(head))]
+    notes = [type(note)(f"{sheet.source}: {note}") for note in notes if not note.startswith(tuple(said))]
     if "station" not in chosen:
         return sheet.refuse("no column of names; expected one called name or station"), notes
     coordinates = places(sheet, chosen, "station_", unknown=True)
+    used = {column.head for columns in chosen.values() for column in columns}
+    aliases = _aliases(sheet, used)
+    sectors, more = read_sectors(sheet, {head for head in used if head} | {pair[0] for pair in aliases})
+    notes += more
+    if coordinates is not None and coordinates.height is None and "height" in sectors:
+        coordinates = replace(coordinates, height=np.nan_to_num(sectors["height"], nan=UNKNOWN_HEIGHT))
     if coordinates is None:
         if not sheet.problems:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
         return None, notes
-    names = sheet.words(chosen["station"][0].head or "")
+    names = station_names(sheet, chosen["station"])
+    other = [each for each in (_named(sheet, heads) for heads in aliases) if len(set(each)) == len(each)]
+    if other and len(set(names.tolist())) < len(names) and (names != "").all():
+        names = np.array(other[0])
     for i in np.flatnonzero(names == ""):
         sheet.problems.add(f"{sheet.source}, {sheet.rows[i]}", "no name; expected the station's")
     values, counts = np.unique(names, return_counts=True)
@@ -171,7 +217,24 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
     extra = {}
     for role in PER_STATION:
-        array = chosen[role][0].numbers(sheet) if role in chosen else None
+        array = chosen[role][0].numbers(sheet) if role in chosen else sectors.get(role)
         if array is not None:
             extra[role] = array
-    return StationList(tuple(map(str, names)), coordinates, extra), notes
+    return StationList(tuple(map(str, names)), coordinates, extra, aliases=tuple(other)), notes
+
+
+def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
+    """Columns, alone and with those that make them unique, that may name the stations of a list besides."""
+    result: list[tuple[str, ...]] = []
+    for head in sheet.heads:
+        words = set(words_of(head)) & STATION_WORDS
+        if not head or not words:
+            continue
+        result += [(head,)] if head not in used else []
+        beside = TOGETHER.get(min(words), set())
+        result += [(head, other) for other in sheet.heads if other != head and set(words_of(other)) & beside]
+    return result
+
+
+def _named(sheet: Sheet, heads: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(" ".join(row) for row in zip(*(sheet.words(head).tolist() for head in heads), strict=True))

@@ -40,6 +40,7 @@ from gsparc.data.tables.places import (
     read_stations,
 )
 from gsparc.data.tables.sheet import Sheet, read_parquet, sheet_of
+from gsparc.data.tables.slots import unfolded
 
 NOTHING: Mapping[str, object] = {}
 
@@ -63,6 +64,8 @@ def understand_table(
         DataError: all problems, with row and column.
     """
     sheet, notes = sheet_of(path) if cell_m is None else (read_parquet(str(path), LOOKED_AT), [])
+    sheet, unfolding = unfolded(sheet, {str(value) for value in columns.values()})
+    notes = [*notes, *unfolding]
     listed = None
     if stations_file is not None:
         second, _ = sheet_of(stations_file, sheet.problems)
@@ -307,9 +310,12 @@ class Builder:
                 where = self._second_in_degrees(end_places)
             return None if where is None else self._unnamed(where)
         words, head = station_names(self.sheet, columns), columns[0].head or ""
-        if columns[0].label == JOINED and columns[0].word and self.listed is not None:
+        if self.listed is not None:
             plain = self.sheet.words(head)
-            words = plain if set(plain) <= set(self.listed.names) else words
+            listed, joined = self.listed.called(plain), self.listed.called(words)
+            exact = columns[0].label == JOINED and bool(columns[0].word)
+            words = plain if exact and set(plain) <= set(listed.names) else words
+            self.listed = listed if words is plain else joined
         self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
         self._rounded(words, head)
         if self.listed is not None:
@@ -374,8 +380,12 @@ class Builder:
     def _all_listed(self, words: np.ndarray, head: str | None) -> None:
         """Refuse names that the list of stations does not have."""
         assert self.listed is not None
+        lacking: list[str] = []
+        if head is not None:
+            self.listed, lacking, said = self.listed.with_lacking(words)
+            self.notes += said
         for word in dict.fromkeys(words[words != ""].tolist()):
-            if word in self.listed.names:
+            if word in self.listed.names or word in lacking:
                 continue
             hint = nearest(word, self.listed.names)
             place = "the heads"
@@ -393,7 +403,10 @@ class Builder:
 
     def _note_silent(self, where: str, names: list[str]) -> None:
         if names:
-            self.notes.append(f"listed, but {where}: {', '.join(names[:8])}{', ...' * (len(names) > 8)}")
+            many = f"{len(names)} " * (len(names) > 8)
+            self.notes.append(
+                f"{many}listed, but {where}: {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
+            )
 
     def _second_in_degrees(self, ends: dict[str, Places]) -> Places | None:
         """Of two ends in degrees, the one with fewer places, which are then stations."""

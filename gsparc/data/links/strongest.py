@@ -1,0 +1,136 @@
+"""Lists of the strongest: drive tests that list a bounded number of stations at each moment.
+
+A station that a full list leaves out is at most as strong as the weakest that it holds: a level of its own
+row. In a list that is not full it is below what the receiver hears.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import log_ndtr
+
+FULL = 0.3  # of the moments, that hold as many as any
+LEAST_MOMENTS = 20
+LOOKED_AT = 2_000  # moments whose neighbours are looked at
+ABOVE_DB = 6.0  # of a neighbour's weakest, where a station drops out of lists, at most
+WHOLE = 0.5  # of the rows, those of moments that leave none out
+RUN = 3  # such moments in a row: how alike neighbours are
+FALL_DB = 35.0  # a decade: what a level far from its station is expected below one near it
+NEAREST_M = 20.0  # to a station: nearer, levels rise no more
+SHADOWING_DB, ALIKE_M = 10.0, 100.0  # deviation of levels far apart, and what is not far
+
+
+def moments(place: np.ndarray, station: np.ndarray) -> np.ndarray:
+    """Number (n,) of the list that each row belongs to: rows of one place, in the file's order.
+
+    Args:
+        place: (n,) int64, number of each row's place.
+        station: (n,) of each row: one that comes again begins another list.
+    """
+    first = np.r_[True, np.diff(place) != 0]
+    if first.sum() > 2 * len(np.unique(place)):  # not in the order of time
+        return np.unique(place, return_inverse=True)[1].reshape(-1)
+    number, seen, result = -1, set[int](), np.empty(len(place), np.int64)
+    for row, (begins, who) in enumerate(zip(first.tolist(), station.tolist(), strict=True)):
+        if begins or who in seen:
+            number, seen = number + 1, set()
+        seen.add(who)
+        result[row] = number
+    return result
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Lists of the strongest of T stations.
+
+    Attributes:
+        length: stations of a full list.
+        first: (M,) a row of each.
+        level: (M, T) [dB], NaN where a station is not listed.
+        place: (M, 3) [m].
+    """
+
+    length: int
+    first: np.ndarray
+    level: np.ndarray
+    place: np.ndarray
+
+    @classmethod
+    def of(
+        cls, moment: np.ndarray, station: np.ndarray, level: np.ndarray, place: np.ndarray, count: int
+    ) -> Lists:
+        """Of rows (n,) of lists `moment`, `count` stations, levels [dB] and places (n, 3) [m]."""
+        number, first, which = np.unique(moment, return_index=True, return_inverse=True)
+        table = np.full((len(number), count), np.nan)
+        table[which.reshape(-1), station] = level
+        return cls(int(np.isfinite(table).sum(1).max()), first, table, place[first])
+
+    @property
+    def full(self) -> np.ndarray:
+        """(M,) bool."""
+        return np.isfinite(self.level).sum(1) == self.length
+
+    def recognised(self) -> bool:
+        """Whether many hold as many as any, fewer than there are, and stations drop out of them when weak."""
+        moments_, count = self.level.shape
+        sizes = np.isfinite(self.level).sum(1)
+        piled = self.full.mean() >= FULL and self.full.sum() > (sizes == self.length - 1).sum()
+        if moments_ < LEAST_MOMENTS or not 2 <= self.length < count or not piled:
+            return False
+        used = np.unique(np.linspace(0, moments_ - 1, LOOKED_AT).astype(np.int64))
+        used = used[np.isfinite(self.place[used]).all(1)]
+        if len(used) < 2:
+            return False
+        near = used[cKDTree(self.place[used]).query(self.place[used], k=2)[1][:, 1]]
+        gone = np.isfinite(self.level[used]) & ~np.isfinite(self.level[near]) & self.full[near, None]
+        above = (self.level[used] - np.nanmin(self.level[near], 1)[:, None])[gone]
+        return bool(len(above) and np.median(above) <= ABOVE_DB)
+
+    def unlisted(
+        self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Moments (m,), stations (m,) and levels (m,) [dB] that these are below.
+
+        Half of them are all that some moments leave out, spread over the drive: only those tell how strong
+        stations are that are seldom listed. The rest tell most: a row does where the nearest that lists its
+        station lets expect it, by distances to the station, and less for each other row nearby that does.
+
+        Args:
+            sensitivity: () or (T,) level of lists that are not full [dB].
+            stations: (T, 3) places [m], NaN where unknown.
+            most: of all.
+        """
+        weakest = np.nanmin(self.level, 1)[:, None]
+        below = np.where(self.full[:, None], weakest, np.minimum(weakest, sensitivity))
+        known = np.isfinite(self.place).all(1)
+        square = np.floor(np.where(known[:, None], self.place, 0)[:, :2] / ALIKE_M)
+        square = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)
+        whole = max(round(WHOLE * most / (self.level.shape[1] - self.length)), 1)
+        start = np.linspace(0, len(self.level) - RUN, max(whole // RUN, 1)).astype(np.int64)
+        several = np.unique(start[:, None] + np.arange(RUN))
+        parts = []
+        for t in range(self.level.shape[1]):
+            listed = np.isfinite(self.level[:, t])
+            own, heard = np.flatnonzero(~listed & known), np.flatnonzero(listed & known)
+            if not len(own):
+                continue
+            expected = np.full(len(own), -FALL_DB)
+            if len(heard):
+                far, near = cKDTree(self.place[heard]).query(self.place[own])
+                expected = self.level[heard[near], t] - below[own, t]
+                if np.isfinite(stations[t]).all():
+                    away = np.linalg.norm(self.place - stations[t], axis=1).clip(NEAREST_M)
+                    expected -= FALL_DB * np.log10(away[own] / away[heard[near]])
+                expected /= SHADOWING_DB * np.sqrt(1.2 - np.exp(-far / ALIKE_M))
+            tells = -log_ndtr(-expected)
+            order = np.lexsort((-tells, square[own]))
+            turn = np.arange(len(order)) - np.searchsorted(square[own][order], square[own][order])
+            parts.append(np.stack([own[order], np.full(len(own), t), tells[order] / (1 + turn)], 1))
+        moment, station, tells = np.concatenate(parts).T if parts else np.zeros((3, 0))
+        tells = np.where(np.isin(moment, several), np.inf, tells)
+        chosen = np.sort(np.argsort(-tells, kind="stable")[:most])
+        moment, station = moment[chosen].astype(np.int64), station[chosen].astype(np.int64)
+        return moment, station, below[moment, station]

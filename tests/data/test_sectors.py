@@ -1,0 +1,117 @@
+"""Lists of sites with their sectors, and slots of scanners."""
+
+import csv
+
+import numpy as np
+import pytest
+from networks import network
+
+from gsparc.data.datasets.own import read_any
+from gsparc.data.errors import Caution
+from gsparc.data.tables.sectors import band_hz, earfcn_hz, meaning
+
+
+def write(path, heads, rows):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([heads, *rows])
+    return path
+
+
+def drive_of(folder, count=4, moments=120):
+    """Rows that name their cells by PCI and EARFCN, PCIs used twice; and a list of sites."""
+    one = network(0)
+    listed = one.listed(count)[:moments]
+    rows = [
+        [*one.moment[m, :2].round(2), c % 15, 1300 if c < 15 else 6300, one.measured[m, c].round(1)]
+        for m, c in zip(*np.nonzero(listed), strict=True)
+    ]
+    sites = [
+        [f"S{c // 3}", f"S{c // 3}_{c % 3}", c % 15, 1300 if c < 15 else 6300, *place.round(1), azimuth, 2,
+         tilt - 2, 65, 43, "N"]
+        for c, (place, azimuth, tilt) in enumerate(zip(one.place, one.azimuth, one.tilt, strict=True))
+    ]  # fmt: skip
+    heads = ["Site", "Cell Name", "PCI", "DL EARFCN", "x", "y", "Antenna Height [m]", "Azimuth", "M-Tilt",
+             "E-Tilt", "HBW", "Tx Power [dBm]", "Vendor"]  # fmt: skip
+    drive = write(folder / "drive.csv", ["x", "y", "PCI", "EARFCN", "RSRP [dBm]"], rows)
+    return one, drive, heads, sites
+
+
+def test_a_list_of_sites_is_read_whole(tmp_path):
+    """Azimuth, tilt and band were read nowhere, and nothing said so."""
+    one, drive, heads, sites = drive_of(tmp_path)
+    reading = read_any(drive, stations_file=write(tmp_path / "sites.csv", heads, sites))
+    stations = reading.data.site.stations
+    number = [
+        int(pci) + 15 * (channel == "6300") for pci, channel in (name.split() for name in stations.name)
+    ]
+    np.testing.assert_allclose(stations.sector[:, 0], one.azimuth[number])
+    np.testing.assert_allclose(stations.sector[:, 1], one.tilt[number])
+    np.testing.assert_allclose(stations.position + reading.data.site.origin, one.place[number], atol=0.06)
+    assert set(stations.carrier_hz) == {1815e6, 806e6} and set(stations.sector[:, 4]) == {43}
+    unread = [note for note in reading.notes if "not read: column 'Vendor'" in note]
+    assert len(unread) == 1 and isinstance(unread[0], Caution)
+    assert not any("Height" in note and "not used" in note for note in reading.notes)
+
+
+def test_cells_that_a_list_lacks_are_counted(tmp_path):
+    _, drive, heads, sites = drive_of(tmp_path)
+    seen = {(row[2], row[3]) for row in csv.reader(drive.open())}
+    lost = next(i for i, site in enumerate(sites) if (str(site[2]), str(site[3])) in seen)
+    reading = read_any(
+        drive, stations_file=write(tmp_path / "sites.csv", heads, sites[:lost] + sites[lost + 1 :])
+    )
+    assert any(note.startswith("1 of ") and "not in the list, with" in note for note in reading.notes)
+    assert np.isnan(reading.data.site.stations.position).any(axis=1).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        *(("Azimuth (deg)", "station_azimuth"), ("E-Tilt", "electrical"), ("Mechanical Tilt", "mechanical")),
+        *(
+            ("Antenna Downtilt", "total"),
+            ("HBW", "station_width"),
+            ("Vertical Beamwidth", "station_thickness"),
+        ),
+        *(
+            ("EIRP [dBm]", "station_power_db"),
+            ("Band", "band"),
+            ("Antenna Height", "height"),
+            ("Vendor", None),
+        ),
+    ],
+)
+def test_heads_of_lists(head, said):
+    assert meaning(head) == said
+
+
+def test_channels_and_bands():
+    found = earfcn_hz(np.array([100.0, 1300, 6300, 38000, np.nan]))
+    np.testing.assert_allclose(found[:4], [2120e6, 1815e6, 806e6, 2595e6])
+    assert np.isnan(found[4])
+    np.testing.assert_allclose(band_hz(np.array([3.0, 20, 1800])), [1805e6, 791e6, 1800e6])
+
+
+def test_slots_of_neighbours_become_rows(tmp_path):
+    """`Serving` and `N1` were taken for stations."""
+    one = network(0)
+    order = np.argsort(-one.measured, 1)[:100, :3]
+    heads = [
+        "x",
+        "y",
+        "Serving PCI",
+        "Serving RSRP [dBm]",
+        "N1 PCI",
+        "N1 RSRP [dBm]",
+        "N2 PCI",
+        "N2 RSRP [dBm]",
+    ]
+    rows = [
+        [*place[:2].round(2), *(v for c in cells for v in (c + 10, level[c].round(1)))]
+        for place, cells, level in zip(one.moment, order, one.measured, strict=False)
+    ]
+    rows[3][6:8] = ["", ""]
+    reading = read_any(write(tmp_path / "drive.csv", heads, rows))
+    data = reading.data
+    assert set(data.site.stations.name) == {str(c + 10) for c in np.unique(order)} | set()
+    assert (~data.censored).sum() == 299 and "299 rows of 100 moments" in " ".join(reading.notes)
