@@ -190,13 +190,17 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _without_unknown_places(part: Any) -> Any:
-    """A site with 0 for NaN in places of stations: what nobody knows; anything else as it is."""
+    """A site with 0 for NaN in places and sectors of stations: what nobody knows; else as it is."""
     stations = part.get("stations") if isinstance(part, Mapping) else None
-    place = stations.get("position") if isinstance(stations, Mapping) else None
-    if not isinstance(place, Tensor) or not place.is_floating_point():
+    if not isinstance(stations, Mapping):
         return part
-    known = torch.where(torch.isnan(place), 0, place)
-    return {**part, "stations": {**stations, "position": known}}  # type: ignore[dict-item]
+    facts = {name: stations.get(name) for name in ("position", "sector")}
+    known = {
+        name: torch.where(torch.isnan(fact), 0, fact)
+        for name, fact in facts.items()
+        if isinstance(fact, Tensor) and fact.is_floating_point()
+    }
+    return {**part, "stations": {**stations, **known}}
 
 
 def _stored(content: Mapping[str, Any], path: Path) -> Stored:

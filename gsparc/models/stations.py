@@ -19,6 +19,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import INITIALISERS
 from gsparc.models.per_station import of_station
+from gsparc.models.powers.together.network import network_of
 from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext
 
@@ -38,6 +39,8 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
     assert data.station is not None
     if data.site.kind == "csi":
         return "together", "channels at all stations share waves and the frame of places"
+    if network_of(data) is not None:
+        return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"
     if not np.isin(data.station[fold.test], data.station[fold.train]).any() and len(fold.test):
         return "together", "no station of the test rows was heard, and what stations share answers for them"
     known = heard(data, np.sort(np.concatenate([fold.train, fold.val])))

@@ -115,17 +115,20 @@ class ConditionalGaussian:
         evidence = -0.5 * (white @ white + factor.log_determinant + len(white) * math.log(2 * math.pi))
         return cls(cross.T @ white, gram[unknown][:, unknown] - cross.T @ cross, float(evidence))
 
-    def uncertain(self, level: Tensor) -> Tensor:
-        """Entries (m,) bool that the known ones leave in doubt to lie below `level` (m,)."""
-        return level - self.mean < CERTAIN * self.covariance.diagonal().sqrt()
+    def doubt(self, level: Tensor) -> Tensor:
+        """Deviations (m,) that entries lie below `level` (m,) by: beyond `CERTAIN` nothing is told."""
+        return (level - self.mean) / self.covariance.diagonal().sqrt()
 
     def at(self, rows: Tensor) -> ConditionalGaussian:
         """The entries `rows` alone."""
         return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
 
 
-def log_evidence(gram: Tensor, values: Tensor, unknown: Tensor) -> tuple[float, Tensor]:
-    """Logarithm of the probability of known values and of the rest below their levels; slopes by `gram`.
+def log_evidence(gram: Tensor, values: Tensor, unknown: Tensor) -> tuple[float, Tensor, Tensor]:
+    """Logarithm of the probability of known values and of the rest below their levels.
+
+    Returns:
+        It, its slopes by `gram`, and minus its slopes by values and levels.
 
     At the fixed point the stand-ins' own change has no effect (Rasmussen and Williams 2006, section 5.5.2).
 
@@ -134,9 +137,14 @@ def log_evidence(gram: Tensor, values: Tensor, unknown: Tensor) -> tuple[float, 
         values: (n,) known values, levels where `unknown`.
         unknown: (n,) bool.
     """
+    if not unknown.any():
+        factor = Factor.of(gram, "raise")
+        weights = factor.solved(values[:, None])[:, 0]
+        value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
+        return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
     known = ConditionalGaussian.of(gram, values, unknown)
     sites = propagate(known, values[unknown])
     extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
     inverse = Factor.of(gram + torch.diag(extra), "raise").inverse
     weights = inverse @ values.masked_scatter(unknown, sites.value)
-    return known.log_evidence + sites.log_evidence, 0.5 * (torch.outer(weights, weights) - inverse)
+    return known.log_evidence + sites.log_evidence, 0.5 * (torch.outer(weights, weights) - inverse), weights

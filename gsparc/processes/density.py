@@ -79,14 +79,15 @@ class Evidence(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gram: Tensor, values: Tensor, unknown: Tensor) -> Tensor:
         """See `log_evidence`."""
-        value, slope = log_evidence(gram.detach(), values, unknown)
-        ctx.save_for_backward(slope)
+        value, slope, weights = log_evidence(gram.detach(), values.detach(), unknown)
+        ctx.save_for_backward(slope, weights)
         return gram.new_tensor(-value)
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        """By the covariance alone."""
-        return -slopes[0] * ctx.saved_tensors[0], None, None
+        """By the covariance, and by values and levels."""
+        slope, weights = ctx.saved_tensors
+        return -slopes[0] * slope, slopes[0] * weights, None
 
 
 def gram_of(parameters: Tensor, distance: Tensor, columns: Tensor | None = None) -> Tensor:

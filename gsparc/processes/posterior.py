@@ -69,7 +69,7 @@ class Exact(Posterior):
     def answer(self, queries: Tensor, exact: bool = False) -> Answer:
         """See `Posterior`."""
         own = self.prior.columns(queries)
-        cross, prior = self._cross(queries, own), self.prior.variance(own)
+        cross, prior = self.cross(queries, own), self.prior.variance(own)
         if self._near is not None:
             return Answer(self._mean(queries, cross), self._near.answer(queries).left.minimum(prior))
         known = self.factor.whitened(cross.T).square().sum(0)
@@ -88,7 +88,7 @@ class Exact(Posterior):
 
     def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
         """See `Posterior`."""
-        return self._mean(queries, self._cross(queries, self.prior.columns(queries)))
+        return self._mean(queries, self.cross(queries, self.prior.columns(queries)))
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
@@ -98,7 +98,8 @@ class Exact(Posterior):
         result = weighted(cross, self.weights)
         return result if self.prior.trend is None else self.prior.mean(queries) + result
 
-    def _cross(self, queries: Tensor, own: Tensor) -> Tensor:
+    def cross(self, queries: Tensor, own: Tensor) -> Tensor:
+        """Covariances (B, n) of places (B, D), whose terms are `own` (B, Q), with the rows."""
         result = self.prior.kernel.between(queries, self.rows)
         return result if self.prior.trend is None else result.addmm(own, self._columns.T)
 
@@ -123,7 +124,7 @@ class Exact(Posterior):
     @torch.no_grad()
     def covariance(self, queries: Tensor) -> Tensor:
         """(B, B) of the signal at places (B, D), in the kernel's units."""
-        cross = self._cross(queries, self.prior.columns(queries))
+        cross = self.cross(queries, self.prior.columns(queries))
         white = self.factor.whitened(cross.T)
         return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
 

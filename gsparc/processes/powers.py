@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.processes.censored import ConditionalGaussian, propagate
+from gsparc.processes.censored import CERTAIN, ConditionalGaussian, propagate
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values, given
@@ -21,7 +21,10 @@ from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
 
 MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
-MOST_SILENT = 3_000  # of them, where nothing was heard
+LEAST_SILENT, MOST_SILENT = (
+    200,
+    3_000,
+)  # of them, where nothing was heard: no more than were heard, but for few
 REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
 
 
@@ -202,10 +205,12 @@ def _with_pseudo_values(
     gram.diagonal().add_(prior.kernel.noise)
     unit = (decibels - mean) / deviation
     known, level = ConditionalGaussian.of(gram, unit, silent), unit[silent]
-    near = known.uncertain(level).nonzero()[:, 0]
-    if len(near) > MOST_SILENT:
-        notes.append(f"{MOST_SILENT} of {len(near)} rows near the level are used, drawn evenly")
-        near = near[np.sort(np.random.default_rng(seed).permutation(len(near))[:MOST_SILENT])]
+    doubt = known.doubt(level)
+    near = (doubt < CERTAIN).nonzero()[:, 0]
+    most = min(max(int((~silent).sum()), LEAST_SILENT), MOST_SILENT)
+    if len(near) > most:
+        notes.append(f"{most} of {len(near)} rows near the level are used, those in doubt")
+        near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):
         sites = propagate(known.at(near), level[near])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import Kernel, WaveKernel
+from gsparc.processes.sectors import SectorKernel, with_sectors
 from gsparc.processes.trend import Trend, trend_of
 
 
@@ -50,8 +51,12 @@ class Prior:
     @classmethod
     def read(cls, state: dict[str, Any]) -> Prior:
         """The prior whose `state()` this was."""
-        kernel = WaveKernel.read(state) if "wave" in state else Kernel.read(state)
-        return cls(kernel, trend_of(state) if "trend" in state else None)
+        kinds: dict[str, Any] = {"wave": WaveKernel, "site_kernel": SectorKernel}  # the last as a kernel does
+        kind = next((kinds[name] for name in kinds if name in state), Kernel)
+        trend = trend_of(state) if "trend" in state else None
+        if trend is not None and "sectors" in state:
+            trend = with_sectors(trend, state["sectors"])
+        return cls(kind.read(state), trend)
 
 
 @dataclass(frozen=True)

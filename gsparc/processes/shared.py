@@ -86,9 +86,10 @@ class Shared:
         prior = self.never if block is None else block.process.prior
         columns = self.columns(queries)
         mean = prior.mean(queries)[:, 0] + columns @ self.mean
-        left = prior.kernel.amplitude * prior.variance(prior.columns(queries))
+        own = prior.columns(queries)
+        left = prior.kernel.amplitude * prior.variance(own)
         if block is not None:
-            cross = deviation_of(prior) * prior.between(queries, block.process.rows)
+            cross = deviation_of(prior) * block.process.cross(queries, own)
             white = block.process.factor.whitened(cross.T).T
             mean = mean + white @ (block.values - block.columns @ self.mean)
             left = (left - white.square().sum(1)).clamp_min(0.0)

@@ -1,4 +1,4 @@
-"""Simulated networks of sectors with a known truth, and what a few lines of numpy make of their drive tests."""
+"""Simulated networks of sectors with a known truth, and what a few lines of numpy make of their drives."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -72,12 +72,13 @@ def _streets(rng: np.random.Generator, count: int) -> np.ndarray:
     places, steps = [], np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
     while len(places) < count:
         blocks = rng.integers(2, 7)
-        if not ((at + steps[way] * blocks * BLOCK_M >= 0) & (at + steps[way] * blocks * BLOCK_M <= SIDE_M)).all():
+        end = at + steps[way] * blocks * BLOCK_M
+        if not ((end >= 0) & (end <= SIDE_M)).all():
             way = (way + rng.choice([1, 3])) % 4
             continue
         far = np.arange(0, blocks * BLOCK_M, STEP_M)[:, None]
         places += list(at + steps[way] * far + rng.normal(0, 2, (len(far), 2)))
-        at, way = at + steps[way] * blocks * BLOCK_M, (way + rng.choice([1, 3])) % 4
+        at, way = end, (way + rng.choice([1, 3])) % 4
     return np.array(places[:count])
 
 
@@ -154,7 +155,7 @@ def _matern(scaled: np.ndarray) -> np.ndarray:
 
 
 def judged(one: Network, count: int, mean: np.ndarray, spread: np.ndarray) -> dict[str, float]:
-    """Figures of predictions (Q, T): cells that the places' own lists would have, those they would not, all."""
+    """Figures of predictions (Q, T): of cells that a list there would have, of those it would not, of all."""
     least = one.listed(count).sum(0) >= 20
     rank = np.argsort(np.argsort(-one.truth, 1), 1)
     listed, error = rank < count, mean - one.truth

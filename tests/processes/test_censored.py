@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from gsparc.processes import censored
-from gsparc.processes.censored import ConditionalGaussian, log_evidence, propagate, truncated
+from gsparc.processes.censored import CERTAIN, ConditionalGaussian, log_evidence, propagate, truncated
 from gsparc.processes.powers import draw
 
 
@@ -59,7 +59,7 @@ def test_rows_certain_to_be_silent_change_nothing():
     gram, values, unknown = small_vector()
     level = values[unknown] + torch.tensor([0.0, 60.0, 0.0])
     told = ConditionalGaussian.of(gram, values, unknown)
-    kept = told.uncertain(level)
+    kept = told.doubt(level) < CERTAIN
     assert kept.tolist() == [True, False, True]
     every, rest = propagate(told, level), propagate(told.at(kept), level[kept])
     assert np.allclose(every.value[kept], rest.value, atol=1e-2)

@@ -56,7 +56,9 @@ def test_each_operation_is_in_its_place_alone():
                     where["systems of nearest rows"].add(name)
     assert where["factor"] == {FACTOR}
     assert where["general"] == set(EXCEPTIONS), where["general"] ^ set(EXCEPTIONS)
-    silence = {"gsparc/locate/likelihood.py"}  # the probability of a silent row alone, nothing is propagated
+    # The probability of a silent row alone, nothing is propagated.
+    silence = {"gsparc/locate/likelihood.py", "gsparc/data/links/strongest.py"}
+    silence.add("gsparc/models/powers/together/network.py")
     assert where["expectation propagation"] == {"gsparc/processes/censored.py"} | silence
     assert defined["left_out_group"] == ["gsparc/processes/left_out.py"]
     assert defined["propagate"] == ["gsparc/processes/censored.py"]

@@ -19,6 +19,7 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.models.per_station import SAME_PLACE_M
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
+from gsparc.models.powers.together.network import Network, by_site, learn_network, network_of
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.ops import Pose
@@ -49,6 +50,7 @@ class JointPowerField(ConditionalField):
         unheard: those for all others.
         inflation: of their variances.
         seed: of rows drawn.
+        network: whose sectors have processes that those of a site share; None: each station has its own.
     """
 
     kind = "joint_powers"
@@ -63,8 +65,9 @@ class JointPowerField(ConditionalField):
         unheard: Terms,
         inflation: float = 1.0,
         seed: int = 0,
+        network: Network | None = None,
     ) -> None:
-        self.site, self.places, self.own, self.seed = site, places, own, seed
+        self.site, self.places, self.own, self.seed, self.network = site, places, own, seed, network
         self.heard, self.unheard, self.inflation = heard, unheard, inflation
         self.posterior: Shared | None = None
         self.elsewhere: Shared | None = None
@@ -85,6 +88,7 @@ class JointPowerField(ConditionalField):
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`; silent rows say that powers are below a level."""
         every = link_rows(data, rows, self.places)
+        every = every if self.network is None else by_site(every, self.network)
         used = every.thinned(most_each(len(every.stations)), self.seed)
         few = used.thinned(UNHEARD_EACH, self.seed)
         self.posterior, self._reach = self.own.given(used, self.heard, self.seed), None
@@ -107,6 +111,9 @@ class JointPowerField(ConditionalField):
         """
         posterior, elsewhere = self._conditioned()
         places, number = self._ends(tx, rx, station)
+        if self.network is not None:
+            places = torch.cat([places, number[:, None].clamp_min(0)], 1)
+            number = torch.where(number < 0, NEVER, torch.from_numpy(self.network.site)[number.clamp_min(0)])
         mean, spread, share = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
         for one in number.unique().tolist():
             of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
@@ -146,6 +153,7 @@ class JointPowerField(ConditionalField):
             "places": torch.from_numpy(self.places), "never": self.own.never.state(), "own": heard,
             "heard": self.heard.state(), "unheard": self.unheard.state(), "inflation": self.inflation,
             "seed": self.seed, "whole": self.whole,
+            "network": {} if self.network is None else self.network.state(),
             "rows": {str(number): rows for number, rows in self.rows.items()},
         }  # fmt: skip
         if self.posterior is not None and self.elsewhere is not None:
@@ -230,14 +238,20 @@ def initialise(
         raise ValueError("a field of powers needs at least one row")
     places, notes = places_of(data, rows)
     every = link_rows(data, rows, places)
-    own, remarks = learn_own(every, seed, budget)
+    network = network_of(data, places)
+    if network is None:
+        own, remarks = learn_own(every, seed, budget)
+    else:
+        every = by_site(every, network)
+        prior, remarks = learn_network(every, network, data.site.stations.name, seed, budget)
+        own = Own(prior, {})
     most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
     if largest > most:
         remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
     assert own.never.trend is not None
     plain = Terms.over(every, own.never.trend, 1.0, 0, seed)
-    field = JointPowerField(data.site, places, own, plain, plain, 1.0, seed)
-    if not shared:
+    field = JointPowerField(data.site, places, own, plain, plain, 1.0, seed, network)
+    if not shared or network is not None:
         return field, (*notes, *remarks)
     terms, field.inflation, gain = learn_strength(every, own, seed, budget)
     if gain is None:
@@ -259,8 +273,17 @@ def restored(site: Site, state: dict[str, Any]) -> JointPowerField:
     assert never.trend is not None
     own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
     heard, unheard = (Terms.read(never.trend, state[name]) for name in ("heard", "unheard"))
+    stored = {name: value.numpy() for name, value in state.get("network", {}).items()}
+    network = Network(**stored) if stored else None
     field = JointPowerField(
-        site, state["places"].numpy(), own, heard, unheard, float(state["inflation"]), int(state["seed"])
+        site,
+        state["places"].numpy(),
+        own,
+        heard,
+        unheard,
+        float(state["inflation"]),
+        int(state["seed"]),
+        network,
     )
     field.rows = {int(number): rows for number, rows in state["rows"].items()}
     field.whole = float(state["whole"])

@@ -44,16 +44,24 @@ ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone
 WIDEST = 4.0  # factor that variances are corrected by at most
 
 
+PLAIN = Trend(0.0)
+
+
 @dataclass(frozen=True)
 class WithTerms(Trend):
     """A trend with what all stations share among its uncertain terms, in units of `unit` [dB]."""
 
+    inner: Trend = PLAIN
     shared: Callable[[Tensor], Tensor] = torch.zeros_like
     unit: float = 1.0
 
+    def mean(self, places: Tensor) -> Tensor:
+        """See `Trend`."""
+        return self.inner.mean(places)
+
     def terms(self, places: Tensor) -> Tensor:
         """See `Trend`."""
-        return torch.cat([super().terms(places), self.shared(places) / self.unit], 1)
+        return torch.cat([self.inner.terms(places), self.shared(places) / self.unit], 1)
 
 
 @dataclass(frozen=True)
@@ -80,8 +88,8 @@ class Own:
             places, extra = torch.from_numpy(part.places), None
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
-                wide = WithTerms(**vars(_trend(prior)), shared=terms.columns, unit=deviation_of(prior))
-                known = conditioned(part, wide, _kernel(prior), seed)[0].posterior
+                wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
+                known = conditioned(part, wide, prior.kernel, seed)[0].posterior  # type: ignore[arg-type]
                 assert isinstance(known, Exact)
                 places, values, extra = known.rows, known.values(), known.extra
             result[number] = Exact.of(prior, places, values, extra)

@@ -21,6 +21,7 @@ from gsparc.models.target_rows import rows_of
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart, matern32
 from gsparc.processes.powers import Rows
+from gsparc.processes.sectors import Sectors
 from gsparc.processes.trend import Trend
 
 LAW_DB = (5.0, 5.0)  # deviations a decade from the middle, of a slope and of a bend
@@ -126,7 +127,9 @@ class Terms:
         return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
 
     def columns(self, places: Tensor) -> Tensor:
-        """(n, P) [dB] at places of both ends (n, 6) [m]."""
+        """(n, P) [dB] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
+        if isinstance(self.trend, Sectors):
+            return places.new_zeros(len(places), 1)  # each site has its own
         decades = _decades(self.trend, places)
         inside = decades.clamp(self.nearest, self.farthest)
         bend = inside.square() + 2 * inside * (decades - inside)

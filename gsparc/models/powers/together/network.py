@@ -1,0 +1,296 @@
+"""Settings of a network's model of powers, from what its lists hold and from what they leave out.
+
+First laws, patterns and gains as if rows were independent (a Tobit model), which also says where an azimuth
+contradicts the data; then all settings by the evidence of processes that sectors of a site share, in which
+rows that are only below a level count by expectation propagation.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.models.baselines.distance_law import fit_law
+from gsparc.models.powers.together.terms import LinkRows
+from gsparc.processes.censored import ConditionalGaussian, propagate
+from gsparc.processes.density import Evidence, walked
+from gsparc.processes.factor import Factor
+from gsparc.processes.prior import Prior
+from gsparc.processes.sectors import NO_AZIMUTH, SHARED, SHARED_SPREAD, Pairs, SectorKernel, Sectors
+from gsparc.processes.trend import LEAST_SPREAD
+from gsparc.processes.worker import late_when
+from gsparc.training.time_budget import TimeBudget
+
+SAME_SITE_M = 5.0  # stations closer than this are of one site
+USUAL = (0.0, 0.0, 65.0, 10.0, 0.0)  # of `Stations.sector` where it is not known
+NO_PATTERN = 1e9  # width [deg] of a beam in height whose tilt nobody gave
+ONE_BAND = 1.1  # ratio of carriers of one band
+GAIN_DB = 4.0  # deviation of a sector's level, before it is learned
+CONTRADICTED_DEG = 30.0
+SURE = 10.0, 0.1  # nats, and nats a row, by which another azimuth must be likelier
+TURNS, GAINS = torch.arange(-180.0, 180.0, 10.0), torch.arange(-12.0, 12.5, 2.0)
+ROUGH_LOOKS, LOOKS, SETTLED = 150, 40, 1e-5
+ROUGH_ON, LEARNED_ON = 20_000, 160  # rows of all sites; of each site, whose covariance is factored
+LEAST_WHOLE = 30  # places that leave no sector out, for settings by these alone
+STRETCH = 4  # places in the order of the drive that are drawn as one
+
+
+@dataclass(frozen=True)
+class Network:
+    """Which of T stations are of one site.
+
+    Attributes:
+        site: (T,) int64.
+        rank: (T,) of each among those of its site.
+        band: (T,) int64.
+        table: (T, 5) float64, as `Sectors.table`.
+    """
+
+    site: np.ndarray
+    rank: np.ndarray
+    band: np.ndarray
+    table: np.ndarray
+
+    def state(self) -> dict[str, Tensor]:
+        """Its arrays."""
+        return {name: torch.from_numpy(value) for name, value in vars(self).items()}
+
+
+def network_of(data: Measurements, places: np.ndarray | None = None) -> Network | None:
+    """The network of the stations; None where neither beams are known, nor lists of sites with several.
+
+    Args:
+        data: powers of several stations.
+        places: (T, 3) of the stations [m]; None: those that are given.
+    """
+    stations = data.site.stations
+    assert stations is not None
+    places = stations.position if places is None else places
+    sector = np.full((len(places), len(USUAL)), np.nan) if stations.sector is None else stations.sector
+    near = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1) <= SAME_SITE_M
+    near |= np.eye(len(places), dtype=bool)  # at an unknown place, too
+    site = np.unique(near.argmax(1), return_inverse=True)[1].reshape(-1).astype(np.int64)
+    levels = () if data.censored is None else np.unique(data.target[data.censored])
+    several = 2 * (np.bincount(site)[site] > 1).sum() >= len(site) and len(levels) > len(site)
+    if not several and not np.isfinite(sector[:, 0]).any():
+        return None  # levels of rows are of lists: a receiver has one for each station
+    rank = np.array([int((site[:t] == site[t]).sum()) for t in range(len(site))])
+    band = np.zeros(len(site), np.int64)
+    if stations.carrier_hz is not None:
+        order = np.argsort(stations.carrier_hz)
+        steps = np.diff(stations.carrier_hz[order], prepend=stations.carrier_hz[order[:1]])
+        band[order] = np.cumsum(steps > (ONE_BAND - 1) * stations.carrier_hz[order])
+    table = np.where(np.isfinite(sector), sector, USUAL)
+    table[:, 3] = np.where(np.isfinite(sector[:, 1]), table[:, 3], NO_PATTERN)
+    table[:, 0] = np.where(np.isfinite(sector[:, 0]), sector[:, 0] % 360, NO_AZIMUTH)
+    table[:, 4] -= table[:, 4].mean()
+    return Network(site, rank, band, table)
+
+
+def by_site(rows: LinkRows, network: Network) -> LinkRows:
+    """The same by sites; places (n, 7) say which station a row is of."""
+    places = np.concatenate([rows.places[:, :6], rows.station[:, None]], 1)
+    return replace(rows, places=places, station=network.site[rows.station])
+
+
+def learn_network(
+    rows: LinkRows, network: Network, names: tuple[str, ...], seed: int, budget: TimeBudget | None
+) -> tuple[Prior, list[str]]:
+    """The prior of every site of a network, and what must be said of it.
+
+    Args:
+        rows: by sites, see `by_site`.
+        network: of the stations.
+        names: (T,) of the stations.
+        seed: of rows drawn.
+        budget: searches end with what they have when it is over.
+    """
+    few = rows.at(np.sort(np.random.default_rng(seed).permutation(len(rows.index))[:ROUGH_ON]))
+    law = replace(fit_law(few, None), level=0.0, exponent=0.0)
+    loud = few if few.silent.all() else few.loud
+    decades = law.decades(torch.from_numpy(loud.places))
+    start = Sectors(
+        0.0, law, float(decades.mean()), max(float(decades.std()), LEAST_SPREAD),
+        table=torch.from_numpy(network.table), rank=torch.from_numpy(network.rank),
+        band=torch.from_numpy(network.band),
+        levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
+        shared=torch.tensor(SHARED, dtype=torch.float64), gain=GAIN_DB,
+    )  # fmt: skip
+    with nullcontext() if budget is None else late_when(budget.over):
+        rough, gains, scale = _rough(few, start)
+        turned, notes = _turned(few, rough, gains, scale, names)
+        if notes:
+            rough, gains, scale = _rough(few, turned)
+        prior = _by_evidence(rows, rough, gains, scale, seed)
+    trend, kernel = prior.trend, prior.kernel
+    assert isinstance(trend, Sectors) and isinstance(kernel, SectorKernel)  # type: ignore[unreachable]
+    parts = kernel.amplitude * np.array([*kernel.shares, kernel.noise])
+    site, own, bearing, noise = np.sqrt(parts)
+    law_note = (
+        f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: exponent "
+        f"{float(trend.shared[0]):.3g}, levels +- {trend.gain:.2g} dB, shadowing of a site {site:.2g} dB over"
+        f" {kernel.lengths[0]:.3g} m, of a sector {own:.2g} dB over {kernel.lengths[1]:.3g} m and"
+        f" {bearing:.2g} dB by bearing, noise {noise:.2g} dB"
+    )
+    width, height = (float(trend.shared[i].exp()) for i in (2, 3))
+    beams = (
+        f"beams {width:.2f} times as wide and {height:.2f} times as high as said, floor "
+        f"{float(trend.shared[4]):.3g} dB, tilts {float(trend.shared[5]):+.2g} deg"
+    )
+    aimed = [beams] if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else []
+    return prior, [law_note, *aimed, *notes]
+
+
+def _misfit(mean: Tensor, rows: LinkRows, scale: Tensor) -> Tensor:
+    """Negative log likelihood of each row (..., n), independent of the others."""
+    z = (torch.from_numpy(rows.decibels) - mean) / scale
+    below = -torch.special.log_ndtr(z)
+    return torch.where(torch.from_numpy(rows.silent), below, 0.5 * z.square() + torch.log(scale))
+
+
+def _off(shared: Tensor) -> Tensor:
+    """Negative log prior of what sectors share."""
+    usual, spread = (torch.tensor(part, dtype=torch.float64) for part in (SHARED, SHARED_SPREAD))
+    return 0.5 * ((shared - usual) / spread).square().sum()
+
+
+def _rough(rows: LinkRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
+    """Shared parameters, gains (T,) and the deviation [dB] of rows taken as independent."""
+    places, number = torch.from_numpy(rows.places), torch.from_numpy(rows.places[:, 6].astype(np.int64))
+    bands, count = len(start.levels), len(start.table)
+
+    def objective(at: Tensor) -> Tensor:
+        shared, levels, scale, gains = at.split((len(SHARED), bands, 1, count))
+        mean = start.at(places, shared, levels) + gains[number]
+        return _misfit(mean, rows, scale.exp()).sum() + _off(shared) + 0.5 * (gains / GAIN_DB).square().sum()
+
+    begin = np.r_[start.shared.numpy(), start.levels.numpy(), math.log(8.0), np.zeros(count)]
+    low = [0.5, -20.0, -1.0, -1.2, 10.0, -6.0]
+    high = [7.0, 20.0, 1.0, 1.5, 40.0, 6.0]
+    free = [(-400.0, 400.0)] * bands + [(0.0, 4.0)] + [(-40.0, 40.0)] * count
+    best, _ = walked(objective, [begin], [*zip(low, high, strict=True), *free], ROUGH_LOOKS, SETTLED)
+    shared, levels, scale, gains = torch.from_numpy(best).split((len(SHARED), bands, 1, count))
+    return replace(start, shared=shared.clone(), levels=levels.clone()), gains, float(scale.exp())
+
+
+@torch.no_grad()
+def _turned(
+    rows: LinkRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
+) -> tuple[Sectors, list[str]]:
+    """Azimuths that rows contradict turned to where they fit, and a note of each."""
+    table, notes = trend.table.clone(), []
+    for t in range(len(table)):
+        part = rows.at(np.flatnonzero(rows.places[:, 6] == t))
+        if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
+            continue
+        places, likely = torch.from_numpy(part.places), []
+        for turn in TURNS.tolist():
+            own = torch.tensor([turn, 0.0, 0.0], dtype=torch.float64)
+            mean = trend.at(places, trend.shared, trend.levels, own) + gains[t] + GAINS[:, None]
+            prior = 0.5 * ((gains[t] + GAINS) / GAIN_DB).square()
+            likely.append(float((_misfit(mean, part, torch.tensor(scale)).sum(1) + prior).min()))
+        best = int(np.argmin(likely))
+        gained, said = likely[len(TURNS) // 2] - likely[best], float(TURNS[best])
+        if abs(said) >= CONTRADICTED_DEG and gained > SURE[0] + SURE[1] * len(part.index):
+            found = float((table[t, 0] + said) % 360)
+            notes.append(
+                f"azimuth of {names[t]}: {float(table[t, 0]):.0f} deg is contradicted by its levels, which "
+                f"fit {found:.0f} deg, used instead"
+            )
+            table[t, 0] = found
+    return replace(trend, table=table), notes
+
+
+def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, seed: int) -> Prior:
+    """All settings of largest evidence of some rows of each site."""
+    rows = _whole(rows)
+    parts = [_stretches(rows.of(number), LEARNED_ON, seed) for number in rows.stations]
+    places = [torch.from_numpy(part.places) for part in parts]
+    pairs = [Pairs.of(at, at) for at in places]
+    values = [torch.from_numpy(part.decibels) for part in parts]
+    silent = [torch.from_numpy(part.silent) for part in parts]
+    rough = replace(rough, doubt=torch.zeros(len(SHARED) + len(rough.levels), 0, dtype=torch.float64))
+    own = [rough.terms(at) * rough.unit for at in places]
+    bands, count = len(rough.levels), sum(len(part.index) for part in parts)
+    kinds = own[0].shape[1] // (int(rough.rank.max()) + 1)
+    is_gain = torch.arange(own[0].shape[1]) % kinds == 0
+
+    def unpacked(at: Tensor) -> tuple[Tensor, ...]:
+        return at.split((len(SHARED), bands, 2, 3, 1, 1))
+
+    def covariance(i: int, at: Tensor) -> Tensor:
+        _, _, lengths, variances, noise, gain = unpacked(at)
+        columns = own[i] * torch.where(is_gain, gain.exp() / rough.gain, 1.0)
+        result = SectorKernel.of(pairs[i], lengths.exp(), variances.exp()) + columns @ columns.T
+        return result + noise.exp() * torch.eye(len(columns), dtype=torch.float64)
+
+    def objective(at: Tensor) -> Tensor:
+        shared, levels = unpacked(at)[:2]
+        total = _off(shared) + 0.5 * ((at[-7:] - usual[-7:]) / loose[-7:]).square().sum()
+        for i, at_ in enumerate(places):
+            rest = values[i] - rough.at(at_, shared, levels)
+            total = total + Evidence.apply(covariance(i, at), rest, silent[i])  # type: ignore[no-untyped-call]
+        return total / count
+
+    middle = float(np.median(pairs[0].distance.numpy())) or 1.0
+    spread = max(float(gains.std()), 1.0)
+    variance = max(scale**2, 1.0)
+    bearing = 0.1 if bool((rough.table[:, 0] != NO_AZIMUTH).any()) else 0.5
+    start = np.r_[
+        rough.shared.numpy(), rough.levels.numpy(), np.log([0.1 * middle] * 2),
+        np.log([0.5 * variance, 0.3 * variance, bearing * variance, 0.1 * variance]), math.log(spread),
+    ]  # fmt: skip
+    usual, loose = torch.from_numpy(start), torch.tensor([1.5] * len(start), dtype=torch.float64)
+    low = [0.5, -20.0, -1.0, -1.2, 10.0, -6.0]
+    high = [7.0, 20.0, 1.0, 1.5, 40.0, 6.0]
+    wide = [(-400.0, 400.0)] * bands + [(math.log(middle * 1e-3), math.log(middle * 3))] * 2
+    wide += [(math.log(1e-2), math.log(1e3))] * 4 + [(math.log(0.3), math.log(20.0))]
+    best, _ = walked(objective, [start], [*zip(low, high, strict=True), *wide], LOOKS, SETTLED)
+    at = torch.from_numpy(best)
+    shared, levels, lengths, variances, noise, gain = unpacked(at)
+    learned = replace(rough, shared=shared.clone(), levels=levels.clone())
+    precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
+    for i, at_ in enumerate(places):
+        gram, rest, quiet = covariance(i, at), values[i] - learned.mean(at_), silent[i]
+        if quiet.any():
+            known = ConditionalGaussian.of(gram, rest, quiet)
+            gram.diagonal()[quiet] += propagate(known, rest[quiet]).variance
+        columns = Factor.of(gram, "raise").whitened(learned.columns(at_))
+        precision += columns.T @ columns
+    doubt = Factor.of(precision, "raise").root.T
+    amplitude = float(variances.exp().sum())
+    shares = (variances.exp() / amplitude).tolist()
+    first, second = lengths.exp().tolist()
+    kernel = SectorKernel(
+        (first, second), (shares[0], shares[1], shares[2]), float(noise.exp()) / amplitude, amplitude
+    )
+    trend = replace(learned, doubt=doubt.contiguous(), gain=float(gain.exp()), unit=math.sqrt(amplitude))
+    return Prior(kernel, trend)  # type: ignore[arg-type]
+
+
+def _whole(rows: LinkRows) -> LinkRows:
+    """Those of places that have as many rows as any, if these are enough; else all."""
+    place = np.unique(rows.places[:, :3], axis=0, return_inverse=True)[1].reshape(-1)
+    sectors = np.unique(np.stack([place, rows.places[:, 6].astype(np.int64)], 1), axis=0)[:, 0]
+    count = np.bincount(sectors)
+    whole = count == count.max()
+    return rows.at(np.flatnonzero(whole[place])) if whole.sum() >= LEAST_WHOLE else rows
+
+
+def _stretches(rows: LinkRows, most: int, seed: int) -> LinkRows:
+    """At most so many rows, all that there are of places that follow each other in short stretches.
+
+    To take some of the rows of a place would tell of stronger or weaker ones than there are.
+    """
+    place = np.unique(rows.places[:, :3], axis=0, return_inverse=True)[1].reshape(-1)
+    first = np.full(int(place.max()) + 1, len(rows.index))
+    np.minimum.at(first, place, rows.index)
+    stretch = np.argsort(np.argsort(first)) // STRETCH
+    rank = np.random.default_rng(seed).permutation(int(stretch.max()) + 1)[stretch[place]]
+    return rows.at(np.sort(np.argsort(rank, kind="stable")[:most]))

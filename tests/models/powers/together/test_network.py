@@ -1,0 +1,131 @@
+"""A network of sectors: what lists of the strongest leave out, patterns, wrong azimuths, a known truth."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from networks import Network, judged, network, reference
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold
+from gsparc.data.units import in_decibels
+from gsparc.models import checkpoint, loading
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.per_station import PerStation, for_links
+from gsparc.models.powers.together.network import network_of
+from gsparc.ops import Pose
+from gsparc.processes.sectors import NO_AZIMUTH, SHARED, Pairs, SectorKernel, Sectors
+from gsparc.processes.trend import Law
+from gsparc.training.context import FitContext, FitReport
+
+NONE = np.zeros(0, np.int64)
+
+
+def fitted(one: Network, count: int, folder: Path, azimuths: bool = True) -> tuple[PerStation, FitReport]:
+    """The recommended model of a drive's lists."""
+    data = one.data(count, azimuths)
+    method = for_links(Gsparc, data)
+    assert isinstance(method, PerStation)
+    return method, method.fit(data, Fold(np.arange(len(data)), NONE, NONE), FitContext(folder))
+
+
+def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
+    """Levels and deviations (Q, T) [dB] of all sectors at the places that are asked."""
+    assert method.site is not None
+    site, places = method.site, torch.from_numpy(one.asked - method.site.origin).float()
+    rx, result = Pose(places, torch.eye(3).expand(len(places), 3, 3)), []
+    for number, still in enumerate(one.place):
+        tx = torch.from_numpy(still - site.origin).float().expand(len(places), 3)
+        said = method.of(number).predict(tx, rx)
+        assert said.variance is not None
+        result.append(in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy()))
+    mean, spread = (np.stack(part, 1) for part in zip(*result, strict=True))
+    return mean + 10 * np.log10(site.target_scale), spread
+
+
+def test_a_network_with_two_wrong_azimuths(tmp_path):
+    one = network(1, wrong=2, moments=300, asked=120)
+    method, report = fitted(one, 6, tmp_path)
+    found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6))
+    assert found["rmse"] < 0.7 * plain["rmse"] and abs(found["bias_unlisted"]) < 3
+    assert all(0.8 < found[name] < 0.97 for name in ("hold", "hold_listed", "hold_unlisted"))
+    wrong = one.azimuth != network(1, moments=300, asked=120).azimuth
+    named = [
+        note.split("azimuth of ")[1].split(":")[0]
+        for note in report.notes
+        if "is contradicted by its levels" in note
+    ]
+    assert method.site is not None and method.site.stations is not None
+    names = method.site.stations.name
+    assert named and set(named) <= {names[i] for i in np.flatnonzero(wrong)}
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    again, _ = loading.load(tmp_path / "model.ckpt")
+    assert np.allclose(levels(again, one)[0], levels(method, one)[0], atol=1e-3)
+
+
+def test_sites_without_azimuths_have_no_pattern(tmp_path):
+    one = network(2, moments=250, asked=100)
+    method, report = fitted(one, 6, tmp_path, azimuths=False)
+    found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6, azimuths=False))
+    assert found["rmse"] < 0.7 * plain["rmse"] and found["best"] > plain["best"]
+    assert not any("beams" in note for note in report.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("count", [3, 6, 10])
+@pytest.mark.parametrize(("azimuths", "wrong"), [(True, 0), (True, 2), (False, 0)])
+def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
+    one = network(seed, wrong)
+    method, _ = fitted(one, count, tmp_path, azimuths)
+    found, plain = (
+        judged(one, count, *levels(method, one)),
+        judged(one, count, *reference(one, count, azimuths)),
+    )
+    assert found["rmse"] < 0.9 * plain["rmse"] and abs(found["bias_unlisted"]) < 3, found
+    assert all(0.85 <= found[name] <= 0.95 for name in ("hold", "hold_listed", "hold_unlisted")), found
+    assert found["best"] > plain["best"] - 0.02, (found, plain)
+
+
+def test_stations_at_places_of_their_own_are_no_network():
+    one = network(0)
+    data = one.data(6, azimuths=False)
+    assert network_of(data, one.place).site.max() == 9
+    assert network_of(data, one.place + 50 * np.arange(30)[:, None]) is None
+    whole = from_arrays({"rx_position": one.moment, "station_position": one.place, "rssi_db": one.measured})
+    assert network_of(whole) is None  # of all stations, not of the strongest
+
+
+def sectors() -> Sectors:
+    """Two sectors of a site."""
+    table = torch.tensor([[90.0, 5, 65, 10, 0], [NO_AZIMUTH, 5, 65, 10, 3]], dtype=torch.float64)
+    return Sectors(
+        0.0, Law(0.0, 0.0, 1.0, 1.0, None), 2.0, 1.0, table=table, rank=torch.tensor([0, 1]),
+        band=torch.tensor([0, 0]), shared=torch.tensor(SHARED, dtype=torch.float64),
+        levels=torch.tensor([-50.0], dtype=torch.float64), doubt=torch.zeros(7, 1, dtype=torch.float64),
+    )  # fmt: skip
+
+
+def places(number: int, *bearings: float) -> torch.Tensor:
+    """At 100 m from the site, in its plane [deg from north]."""
+    turn = np.radians(bearings)
+    at = np.c_[100 * np.sin(turn), 100 * np.cos(turn), 0 * turn]
+    return torch.from_numpy(np.c_[at, np.zeros((len(turn), 3)), np.full(len(turn), number)])
+
+
+def test_the_pattern_of_a_sector():
+    trend = sectors()
+    ahead, edge, behind = (trend.mean(places(0, 90, 90 + 32.5, 270)) + 50).tolist()
+    assert (ahead, edge, behind) == pytest.approx((-3.0, -6.0, -25.0))  # tilted by half of 10 degrees
+    assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
+
+
+def test_sectors_of_a_site_share_shadowing():
+    kernel = SectorKernel((50.0, 50.0), (0.5, 0.3, 0.2), 0.1, 20.0)
+    here, there = places(0, 10.0), places(1, 10.0)
+    assert float(kernel.between(here, here)) == pytest.approx(1.0)
+    assert float(kernel.between(here, there)) == pytest.approx(0.5)
+    both = torch.cat([here, there, places(0, 200.0)])
+    assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
+    assert SectorKernel.read(kernel.state()) == kernel and Pairs.of(here, there).same.item() == 0
