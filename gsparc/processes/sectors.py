@@ -59,46 +59,40 @@ class Sectors(Trend):
         return self.at(places, self.shared, self.levels)
 
     def at(self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None) -> Tensor:
-        """Powers (n,) [dB] for other shared parameters and levels, and own azimuth, tilt and width (3,)."""
+        """Powers (..., n) [dB] for shared parameters (..., 6), levels, azimuth, tilt and width (..., 3)."""
         assert self.law is not None
         number = places[:, 6].long()
         azimuth, tilt, width, height, power = self.table[number].T
         decades = self.law.decades(places) - self.middle
-        level = levels[self.band[number]] + power - 10 * shared[0] * decades - shared[1] * decades.square()
+        exponent, bend, wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)
+        level = levels[self.band[number]] + power - 10 * exponent * decades - bend * decades.square()
         away = places[:, :3] - places[:, 3:6]
         flat = away[:, :2].norm(dim=1).clamp_min(1e-3)
         bearing = torch.rad2deg(torch.atan2(away[:, 0], away[:, 1]))
         down = torch.rad2deg(torch.atan2(-away[:, 2], flat))
-        turn, lean, wide = (0.0, 0.0, 0.0) if own is None else own
+        turn, lean, wide = torch.zeros(3, 1) if own is None else own.unsqueeze(-1).unbind(-2)
         across = torch.remainder(bearing - azimuth - turn + 180, 360) - 180
-        across = 12 * (across / (width * torch.exp(shared[2] + wide))).square()
-        over = 12 * ((down - tilt - shared[5] - lean) / (height * torch.exp(shared[3]))).square()
-        loss = across.minimum(shared[4]) + over.clamp_max(ELEVATION_FLOOR_DB)
-        return level - torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(shared[4]))
+        across = 12 * (across / (width * torch.exp(wider + wide))).square()
+        over = 12 * ((down - tilt - tilted - lean) / (height * torch.exp(higher))).square()
+        loss = across.minimum(floor) + over.clamp_max(ELEVATION_FLOOR_DB)
+        return level - torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
     def columns(self, places: Tensor) -> Tensor:
         """(n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
-        spread = torch.tensor(SHARED_SPREAD, dtype=torch.float64)
-        result = []
-        for i in range(len(spread)):
-            step = torch.zeros_like(self.shared)
-            step[i] = STEP * spread[i]
-            ends = [self.at(places, self.shared + sign * step, self.levels) for sign in (1, -1)]
-            result.append((ends[0] - ends[1]) / (2 * STEP))
+        steps = STEP * torch.tensor(SHARED_SPREAD, dtype=torch.float64).diag()
+        ends = self.at(places, self.shared + torch.cat([steps, -steps]), self.levels)
+        result = (ends[: len(steps)] - ends[len(steps) :]) / (2 * STEP)
         bands = torch.nn.functional.one_hot(self.band[places[:, 6].long()], len(self.levels)).to(places)
-        return torch.cat([torch.stack(result, 1), self.gain * bands], 1)
+        return torch.cat([result.T, self.gain * bands], 1)
 
     def terms(self, places: Tensor) -> Tensor:
         """See `Trend`: each sector's level, azimuth, tilt, width and slope; what all share."""
         assert self.law is not None
         number = places[:, 6].long()
-        parts = [torch.full_like(places[:, 0], self.gain)]
-        for i, spread in enumerate(OWN_SPREAD[:3]):
-            step = torch.zeros(3, dtype=torch.float64)
-            step[i] = STEP * spread
-            ends = [self.at(places, self.shared, self.levels, sign * step) for sign in (1, -1)]
-            parts.append((ends[0] - ends[1]) / (2 * STEP))
-        parts.append(OWN_SPREAD[3] * (self.law.decades(places) - self.middle))
+        steps = STEP * torch.tensor(OWN_SPREAD[:3], dtype=torch.float64).diag()
+        ends = self.at(places, self.shared, self.levels, torch.cat([steps, -steps]))
+        slope = OWN_SPREAD[3] * (self.law.decades(places) - self.middle)
+        parts = [torch.full_like(slope, self.gain), *((ends[:3] - ends[3:]) / (2 * STEP)), slope]
         own = torch.stack(parts, 1) / self.unit
         which = torch.nn.functional.one_hot(self.rank[number], int(self.rank.max()) + 1).to(places)
         shared = self.columns(places) @ self.doubt / self.unit
