@@ -331,7 +331,7 @@ def gaps(levels: LinkLevels) -> list[str]:
         who = _of([name for name, _, _ in faint], len(names))
         warnings.append(
             f"{count} levels missing{who}, beside the weakest ones: not heard? then give sensitivity_db "
-            f"(the least level is {least:.4g} dB), and they count as below it; where they have no row, "
+            f"(at most {np.floor(least):g} dB), and they count as below it; where they have no row, "
             "dataset.absent=silent"
         )
     if plain:

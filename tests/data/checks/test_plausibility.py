@@ -190,6 +190,8 @@ def test_outages_and_what_was_not_heard():
     found = plausibility.gaps(as_links(place, level, ["a", "b", "c"]))
     assert found[0].startswith("no level in the 60 rows from row 100 to row 159 of station a: an outage;")
     assert "of station b, beside the weakest ones: not heard? then give sensitivity_db (" in found[1]
+    advised = float(found[1].partition("(at most ")[2].split()[0])  # was rounded to one that is refused
+    assert advised <= np.nanmin(level[:, 1])
     assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
     assert plausibility.gaps(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == ["no level in any row"]
 
