@@ -62,7 +62,7 @@ COMMANDS = {
         Command("compare", "every method under the same data, metrics and clock"),
         Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
         Command("link", "rates and block errors with predicted channels: ckpt=FILE"),
-        Command("export", "the model for other programs: ckpt=FILE to=c, cir, deepmimo, sionna"),
+        Command("export", "the model for other programs: ckpt=FILE to=c, taps, deepmimo"),
         Command("serve", "answers over HTTP: ckpt=FILE"),
         Command("locate", "where rows were heard, by the field's likelihood: ckpt=FILE"),
         Command("map", "received power over an area with a promised error: ckpt=FILE"),
