@@ -69,7 +69,6 @@ COMMANDS = {
         Command("view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
         Command("plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"),
         Command("place", "where one more station serves an area best: ckpt=FILE"),
-        Command("llvm", "fetch the LLVM that ray tracing needs", "gsparc.simulate.llvm", configured=False),
         Command("report", "one page about many runs: RUN...", bare="runs"),
         Command("bench", "timings of kernels as ratios to the machine's limit"),
     )
