@@ -78,7 +78,7 @@ def test_no_steps_of_the_model_took_those_of_the_trainer(measured, tmp_path):
 
 
 @pytest.mark.parametrize("keep_best", [True, False])
-def test_a_second_stage_asked_for_figures_of_rows_it_has_not_and_took_more_steps(measured, tmp_path, keep_best):
+def test_a_second_stage_asked_for_figures_it_has_not_and_took_more_steps(measured, tmp_path, keep_best):
     """`callbacks=early_stopping` ended in an error; after `trainer.max_time` 391 of 281 steps were kept."""
     stop = partial(EarlyStopping, "val/error", min_delta=1.0, patience=2)  # the third look ends it
     more = ("init=images", "model.refit=true", f"model.keep_best={keep_best}")
