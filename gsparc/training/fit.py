@@ -98,6 +98,18 @@ class ReturnMetrics(L.Callback):
             trainer.callback_metrics.setdefault(KEPT[1], position)
 
 
+def stands(trainer: L.Trainer) -> bool:
+    """Whether a step is done with, at the end of its batch or of its look at validation rows.
+
+    Lightning leaves out a look that follows, where a run goes on from a state before it.
+    """
+    if trainer.validating:
+        return trainer.state.fn == "fit"
+    every = trainer.val_check_batch
+    due = isinstance(every, int) and (trainer.fit_loop.total_batch_idx + 1) % every == 0
+    return trainer.training and not (due and trainer.enable_validation)
+
+
 class _Stopped(BaseException):
     """Ends training from inside; Lightning would turn a KeyboardInterrupt into an exit without a word."""
 
@@ -122,9 +134,11 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write the checkpoint and end training when asked to."""
-        if self.requested:
+        if self.requested and stands(trainer):
             trainer.save_checkpoint(self.file)
             raise _Stopped
+
+    on_validation_end = on_train_batch_end  # type: ignore[assignment]
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         """Leave the state after the last step."""
