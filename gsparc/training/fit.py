@@ -54,7 +54,7 @@ class Ran:
     Attributes:
         seconds: that it took, validations too [s].
         steps: whose result is kept.
-        position: of that in the schedule [steps]; None where nothing was kept back.
+        position: of that in the schedule [steps]; None where it is the end of it.
         taken: steps in all.
         timed_out: whether `trainer.max_time` ended it.
     """
@@ -91,8 +91,23 @@ class ReturnMetrics(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """Also after a checkpoint with every step done."""
+        """Also after a checkpoint with every step done; where the schedule was not ended, where it stood."""
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
+        if module.position < module.total_steps:
+            position = torch.tensor(module.position, dtype=torch.float64)
+            trainer.callback_metrics.setdefault(KEPT[1], position)
+
+
+def stands(trainer: L.Trainer) -> bool:
+    """Whether a step is done with, at the end of its batch or of its look at validation rows.
+
+    Lightning leaves out a look that follows, where a run goes on from a state before it.
+    """
+    if trainer.validating:
+        return trainer.state.fn == "fit"
+    every = trainer.val_check_batch
+    due = isinstance(every, int) and (trainer.fit_loop.total_batch_idx + 1) % every == 0
+    return trainer.training and not (due and trainer.enable_validation)
 
 
 class _Stopped(BaseException):
@@ -119,9 +134,11 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write the checkpoint and end training when asked to."""
-        if self.requested:
+        if self.requested and stands(trainer):
             trainer.save_checkpoint(self.file)
             raise _Stopped
+
+    on_validation_end = on_train_batch_end  # type: ignore[assignment]
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         """Leave the state after the last step."""
@@ -172,7 +189,7 @@ def run_stage(
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
     pace = module.pace
-    callbacks = [Budget(pace, budget), *watch, *context.callbacks()]
+    callbacks = [Budget(pace, budget), *watch, *_told(context.callbacks(), len(fold.val))]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -223,6 +240,14 @@ def run_stage(
     if timed_out:
         log.warning("trainer.max_time ended training after %d of %d steps", taken, module.total_steps)
     return Ran((budget.counted - before).wall, taken if steps is None else steps, position, taken, timed_out)
+
+
+def _told(callbacks: Sequence[L.Callback], rows: int) -> Sequence[L.Callback]:
+    """Without those that look at figures of validation rows, where there are none."""
+    blind = [] if rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
+    if blind:
+        log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
+    return [one for one in callbacks if one not in blind]
 
 
 def _lost(error: ProcessException, advice: str) -> str:
