@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -50,11 +50,6 @@ class Signals:
         ends = data.tx, data.rx_position, data.rx_rotation
         return cls(data.target, data.mask, *ends, tones, None if tones is None else array, site.grid)
 
-    @property
-    def kind(self) -> str:
-        """Of the measurements."""
-        return "spectrum" if self.tones is None else "csi"
-
     def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Signals:
         """The same with entries of values and mask elsewhere."""
         return replace(
@@ -64,8 +59,9 @@ class Signals:
     def rows(self, part: slice | np.ndarray) -> Signals:
         """Some of the rows."""
         of_rows = ("values", "mask", "tx", "rx", "rotation")
-        parts = {name: getattr(self, name) for name in of_rows}
-        return replace(self, **{name: None if one is None else one[part] for name, one in parts.items()})
+        whole = {name: getattr(self, name) for name in of_rows}
+        parts: dict[str, Any] = {name: None if one is None else one[part] for name, one in whole.items()}
+        return replace(self, **parts)
 
     @property
     def wavelength(self) -> float:
@@ -79,22 +75,42 @@ class Convention:
     """One that a file may follow.
 
     Attributes:
-        kind: of the measurements.
         words: what it says of them.
         change: to the schema's.
         applies: whether it can be of these.
         tried: whether `check` scores it.
     """
 
-    kind: str
     words: str
     change: Callable[[Signals], Signals]
-    applies: Callable[[Signals], bool] = lambda _: True
-    tried: bool = True
+    applies: Callable[[Signals], bool]
+    tried: bool
 
 
-def _flipped(axis: int) -> Callable[[Signals], Signals]:
-    return lambda signals: signals.moved(lambda values: np.flip(values, axis))
+def _values(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Signals], Signals]:
+    return lambda signals: replace(signals, values=change(signals.values))
+
+
+def _moved(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Signals], Signals]:
+    return lambda signals: signals.moved(change)
+
+
+def _array(factor: Callable[[Signals], float]) -> Callable[[Signals], Signals]:
+    return lambda signals: replace(signals, array=np.asarray(signals.array) * factor(signals))
+
+
+def _grid(
+    first: Callable[[SphereGrid], tuple[float, float]], flipped: int = 0
+) -> Callable[[Signals], Signals]:
+    """The first elevation and azimuth changed, one axis reversed."""
+
+    def turned(signals: Signals) -> Signals:
+        assert signals.grid is not None
+        elevation, azimuth = first(signals.grid)
+        grid = replace(signals.grid, first_elevation=elevation, first_azimuth=azimuth)
+        return replace(signals.moved(lambda v: np.flip(v, flipped) if flipped else v), grid=grid)
+
+    return turned
 
 
 def _with_delays(signals: Signals) -> Signals:
@@ -109,13 +125,9 @@ def _without_zeros(signals: Signals) -> Signals:
     return replace(signals, mask=measured if signals.mask is None else measured & signals.mask)
 
 
-def _scaled_array(factor: Callable[[Signals], float]) -> Callable[[Signals], Signals]:
-    return lambda signals: replace(signals, array=np.asarray(signals.array) * factor(signals))
-
-
 def _along(signals: Signals) -> int:
     """Antennas along the axis of a planar array that runs faster in their list; 0 of other arrays."""
-    if not _is_array(signals):
+    if not _antennas(signals):
         return 0
     place = np.asarray(signals.array)
     cells = np.round((place - place[0]) / max(float(np.ptp(place, axis=0).max()), 1e-9), 4)
@@ -129,15 +141,9 @@ def _other_axis_first(signals: Signals) -> Signals:
     return signals.moved(lambda values: values[:, order])
 
 
-def _turned(
-    change: Callable[[SphereGrid], SphereGrid], axis: int | None = None
-) -> Callable[[Signals], Signals]:
-    def turned(signals: Signals) -> Signals:
-        assert signals.grid is not None
-        moved = signals if axis is None else _flipped(axis)(signals)
-        return replace(moved, grid=change(signals.grid))
-
-    return turned
+def _transposed(signals: Signals) -> Signals:
+    grid = SphereGrid.hemisphere(*signals.values.shape[:0:-1])
+    return replace(signals.moved(lambda values: values.swapaxes(1, 2)), grid=grid)
 
 
 def _last(grid: SphereGrid) -> tuple[float, float]:
@@ -146,76 +152,69 @@ def _last(grid: SphereGrid) -> tuple[float, float]:
     return elevation, grid.first_azimuth + (grid.width - 1) * grid.azimuth_step
 
 
-def _transposed(signals: Signals) -> Signals:
-    width, height = signals.values.shape[1:]
-    return replace(
-        signals.moved(lambda values: values.swapaxes(1, 2)), grid=SphereGrid.hemisphere(height, width)
-    )
+def _azimuth(turn: float) -> Callable[[Signals], Signals]:
+    return _grid(lambda grid: (grid.first_elevation, grid.first_azimuth + turn))
 
 
-def _is_array(signals: Signals) -> bool:
-    return (
-        signals.array is not None and len(signals.array) > 1 and signals.values.shape[1] == len(signals.array)
-    )
+def _channel(signals: Signals) -> bool:
+    return signals.tones is not None
 
 
-def _many_tones(signals: Signals) -> bool:
-    return signals.values.shape[2] > 2
+def _sphere(signals: Signals) -> bool:
+    return signals.grid is not None
 
 
-CONVENTIONS: dict[str, Convention] = {
-    "conjugate": Convention(
-        "csi", "conjugated channels, exp(+j 2 pi f d / c)", lambda s: replace(s, values=s.values.conj())
+def _above(signals: Signals) -> bool:
+    return signals.grid is not None and signals.grid.first_elevation >= 0
+
+
+def _hemisphere(signals: Signals) -> bool:
+    """Of the file, or of its transpose: no `grid_deg` says otherwise."""
+    height, width = signals.values.shape[1:]
+    return signals.grid in (SphereGrid.hemisphere(height, width), SphereGrid.hemisphere(width, height))
+
+
+def _tones(signals: Signals) -> bool:
+    return signals.tones is not None and signals.values.shape[2] > 1
+
+
+def _square(signals: Signals) -> bool:
+    return signals.tones is not None and 1 < signals.values.shape[1] == signals.values.shape[2]
+
+
+def _antennas(signals: Signals) -> bool:
+    return signals.tones is not None and signals.array is not None
+
+
+def _planar(signals: Signals) -> bool:
+    return _along(signals) > 0
+
+
+UNTRIED = ("swap_iq", "zeros_unmeasured", "decibels")  # as conjugate, or told by other means
+_ROWS: dict[str, tuple[str, Callable[[Signals], Signals], Callable[[Signals], bool]]] = {
+    "conjugate": ("conjugated channels, exp(+j 2 pi f d / c)", _values(np.conj), _channel),
+    "swap_iq": ("I and Q swapped", _values(lambda v: 1j * v.conj()), _channel),
+    "exchange_axes": ("axes of antennas and tones exchanged", _moved(lambda v: v.swapaxes(1, 2)), _square),
+    "fft_order": ("tones in the order of an FFT", _moved(lambda v: np.fft.fftshift(v, axes=2)), _tones),
+    "reverse_tones": ("tones from the highest to the lowest", _moved(lambda v: np.flip(v, 2)), _tones),
+    "reverse_antennas": ("antennas in reverse order", _moved(lambda v: np.flip(v, 1)), _antennas),
+    "exchange_array": ("antennas along the other axis of the planar array", _other_axis_first, _planar),
+    "array_mm": ("array_position in millimetres", _array(lambda _: 1e-3), _antennas),
+    "array_wavelengths": ("array_position in wavelengths", _array(lambda s: s.wavelength), _antennas),
+    "delays_removed": ("the delay of each row taken out", _with_delays, _tones),
+    "zeros_unmeasured": ("0 for tones that were not measured", _without_zeros, _tones),
+    "transposed": ("rows as azimuths, columns as elevations", _transposed, _hemisphere),
+    "zenith": (
+        "elevation from the zenith",
+        _grid(lambda g: (math.pi / 2 - _last(g)[0], g.first_azimuth), 1),
+        _above,
     ),
-    "exchange_axes": Convention(
-        "csi", "the axes of antennas and tones exchanged", lambda s: s.moved(lambda v: v.swapaxes(1, 2)),
-        lambda s: s.values.shape[1] == s.values.shape[2] > 1,
-    ),
-    "fft_order": Convention(
-        "csi", "tones in the order of an FFT",
-        lambda s: s.moved(lambda v: np.fft.fftshift(v, axes=2)), _many_tones,
-    ),
-    "reverse_tones": Convention("csi", "tones from the highest to the lowest", _flipped(2), _many_tones),
-    "reverse_antennas": Convention("csi", "antennas in reverse order", _flipped(1), _is_array),
-    "exchange_array": Convention(
-        "csi", "antennas numbered along the other axis of the planar array", _other_axis_first,
-        lambda s: _along(s) > 0,
-    ),
-    "array_mm": Convention(
-        "csi", "array_position in millimetres", _scaled_array(lambda _: 1e-3), _is_array
-    ),
-    "array_wavelengths": Convention(
-        "csi", "array_position in wavelengths", _scaled_array(lambda s: s.wavelength), _is_array
-    ),
-    "swap_iq": Convention(
-        "csi", "I and Q swapped", lambda s: replace(s, values=1j * s.values.conj()), tried=False
-    ),
-    "delays_removed": Convention(
-        "csi", "the delay of each row taken out", _with_delays, lambda s: s.values.shape[2] > 1
-    ),
-    "zeros_unmeasured": Convention("csi", "0 for tones that were not measured", _without_zeros, tried=False),
-    "transposed": Convention("spectrum", "rows as azimuths, columns as elevations", _transposed),
-    "zenith": Convention(
-        "spectrum", "elevation from the zenith",
-        _turned(lambda grid: replace(grid, first_elevation=math.pi / 2 - _last(grid)[0]), 1),
-        lambda s: s.grid is not None and s.grid.first_elevation >= 0,
-    ),
-    "clockwise": Convention(
-        "spectrum", "clockwise azimuth", _turned(lambda grid: replace(grid, first_azimuth=-_last(grid)[1]), 2)
-    ),
-    "azimuth_180": Convention(
-        "spectrum", "azimuth from -180 degrees",
-        _turned(lambda grid: replace(grid, first_azimuth=grid.first_azimuth - math.pi)),
-    ),
-    "azimuth_north": Convention(
-        "spectrum", "azimuth from the y axis",
-        _turned(lambda grid: replace(grid, first_azimuth=grid.first_azimuth + math.pi / 2)),
-    ),
-    "decibels": Convention(
-        "spectrum", "decibels",
-        lambda s: replace(s, values=10 ** (s.values.astype(np.float64) / 10)), tried=False,
-    ),
-}  # fmt: skip
+    "clockwise": ("clockwise azimuth", _grid(lambda g: (g.first_elevation, -_last(g)[1]), 2), _sphere),
+    "azimuth_180": ("azimuth from -180 degrees", _azimuth(-math.pi), _sphere),
+    "azimuth_north": ("azimuth from the y axis", _azimuth(math.pi / 2), _sphere),
+    "decibels": ("decibels", _values(lambda v: 10 ** (v.astype(np.float64) / 10)), _sphere),
+}
+CONVENTIONS = {name: Convention(*row, name not in UNTRIED) for name, row in _ROWS.items()}
 
 
 def mended(signals: Signals, names: Iterable[str]) -> Signals:
@@ -226,30 +225,26 @@ def mended(signals: Signals, names: Iterable[str]) -> Signals:
     """
     chosen = set(names)
     for name in chosen - set(CONVENTIONS):
-        raise DataError(
-            f"conventions: {name!r} is none of {', '.join(CONVENTIONS)}{nearest(name, CONVENTIONS, 0.4)}"
-        )
-    for name, one in CONVENTIONS.items():
-        if name not in chosen:
-            continue
-        if one.kind != signals.kind or not one.applies(signals):
+        hint = nearest(name, CONVENTIONS, 0.4)
+        raise DataError(f"conventions: {name!r} is none of {', '.join(CONVENTIONS)}{hint}")
+    for name in [name for name in CONVENTIONS if name in chosen]:
+        one = CONVENTIONS[name]
+        if not one.applies(signals):
             raise DataError(
-                f"dataset.{name}: {one.words}: these are {signals.kind} of shape {signals.values.shape[1:]}"
+                f"dataset.{name}: {one.words}: cannot be of rows of shape {signals.values.shape[1:]}"
             )
-        signals = _in_blocks(signals, one.change)
+        signals = _in_blocks(signals, one.change) if is_big(signals.values) else one.change(signals)
     return signals
 
 
 def _in_blocks(signals: Signals, change: Callable[[Signals], Signals]) -> Signals:
-    """The same, large values block by block and on disk."""
-    if not is_big(signals.values):
-        return change(signals)
+    """The same block by block, with values on disk."""
     first = change(signals.rows(slice(0, 1)))
     values = scratch((len(signals.values), *first.values.shape[1:]), first.values.dtype)
-    parts = []
+    masks = []
     for part in blocks(signals.values):
         changed = change(signals.rows(part))
         values[part] = changed.values
-        parts.append(changed.mask)
-    mask = None if parts[0] is None else np.concatenate(parts)
+        masks += [] if changed.mask is None else [changed.mask]
+    mask = np.concatenate(masks) if masks else None
     return replace(signals, values=values, mask=mask, array=first.array, grid=first.grid)

@@ -117,14 +117,14 @@ def _zeros(signals: Signals) -> list[str]:
     zero = np.flatnonzero(~measured.any(axis=(0, 1)))
     if not len(zero):
         return []
-    which = f"tones {some(zero)} (of {measured.shape[2]}, from 0) are 0 in all rows"
+    which = f"tones {some(zero.tolist())} (of {measured.shape[2]}, from 0) are 0 in all rows"
     return [f"{which}: guards, or the direct current? dataset.zeros_unmeasured=true: they were not measured"]
 
 
 def _rivals(signals: Signals, few: Signals, labels: np.ndarray) -> list[str]:
     """A warning where a rival fits far better than what is declared, with those that fit as well."""
-    kind, place = signals.kind, np.hstack([signals.tx, signals.rx])
-    names = [n for n, one in CONVENTIONS.items() if one.tried and one.kind == kind and one.applies(few)]
+    kind, place = "csi" if signals.grid is None else "spectrum", np.hstack([signals.tx, signals.rx])
+    names = [n for n, one in CONVENTIONS.items() if one.tried and one.applies(few)]
     groups, declared = _groups(place), _score(signals, labels)
     rivals = {}
     pairs = combinations(names, 2) if declared.fit < GOOD[kind] else ()
