@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from gsparc.data.assemble import FARTHEST, bad_positions
+from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.checks.plausibility import gathered, link_levels, plausibility_warnings, steps_of
 from gsparc.data.datamodule import DataModule
@@ -35,6 +36,7 @@ class Campaign(DataModule):
     """
 
     choice: ClassVar[str]  # of conf/dataset
+    switches: ClassVar[tuple[str, ...]] = ()  # settings that `reader` takes besides its arguments
     reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
 
     def __init__(
@@ -81,7 +83,7 @@ def _implausible(data: Measurements) -> list[str]:
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data)
-    return [] if levels is None else plausibility_warnings(levels, steps_of(levels))
+    return convention_warnings(data) if levels is None else plausibility_warnings(levels, steps_of(levels))
 
 
 class StandIn(Protocol):

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from gsparc.data.conventions import CONVENTIONS
 from gsparc.data.datasets.ble import raw_of_ble
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.datasets.newrf import raw_of_newrf
@@ -15,7 +16,7 @@ from gsparc.data.datasets.powder import raw_of_powder
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.errors import Caution, DataError
-from gsparc.data.limits import choice
+from gsparc.data.limits import choice, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
 from gsparc.data.tables import is_table
@@ -30,6 +31,7 @@ def raw_of_own(
     cell_m: float | None = None,
     not_heard: Sequence[float] | None = None,
     absent: str = "unknown",
+    **conventions: bool | None,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
 
@@ -40,13 +42,14 @@ def raw_of_own(
         cell_m: of Parquet, also a folder or a URL of it: means of rows [dB] by cells of this side [m].
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
         absent: `silent`: a station without a row at a place where others have one was not heard there.
+        **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
 
     Raises:
         DataError: bad input, or a file of another campaign.
         SettingError: another word for `absent`.
     """
     raw, notes = raw_of(path, columns, stations_file, cell_m)
-    raw = understood(raw, not_heard, absent)
+    raw = understood(raw, not_heard, absent, **conventions)
     campaign = campaign_of(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
@@ -55,18 +58,27 @@ def raw_of_own(
     return raw
 
 
-def understood(raw: Raw, not_heard: Sequence[float] | None = None, absent: str = "unknown") -> Raw:
-    """The same with what settings say of rows and cells without a level; see `raw_of_own`."""
+def understood(
+    raw: Raw,
+    not_heard: Sequence[float] | None = None,
+    absent: str = "unknown",
+    **conventions: bool | None,
+) -> Raw:
+    """The same with what settings say of the file; see `raw_of_own`."""
     choice("unknown", "silent").check("dataset.absent", absent)
     said: dict[str, Any] = {} if not_heard is None else {"not_heard": [float(mark) for mark in not_heard]}
     said |= {} if absent == "unknown" else {"absent": absent}
+    for name, follows in conventions.items():
+        or_null(switch()).check(f"dataset.{name}", follows)
+    followed = [name for name, follows in conventions.items() if follows]
+    said |= {"conventions": " ".join(followed)} if followed else {}
     return replace(raw, attributes={**raw.attributes, **said})
 
 
 class Own(Campaign):
     """Measurements of one's own; suspicious units are warned of. Settings of `raw_of_own` and `Campaign`."""
 
-    choice, reader = "own", staticmethod(raw_of_own)
+    choice, reader, switches = "own", staticmethod(raw_of_own), tuple(CONVENTIONS)
 
 
 LOADERS: dict[str, Callable[[Path], Raw]] = {
