@@ -66,7 +66,7 @@ class Screen(logging.StreamHandler):  # type: ignore[type-arg]
     def format(self, record: logging.LogRecord) -> str:
         """The message; of a warning or an error after its level."""
         level = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
-        return level + record.getMessage()
+        return level + record.getMessage().strip().partition("\n")[0]
 
 
 def warned_again() -> list[str]:
