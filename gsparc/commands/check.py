@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from gsparc.data.errors import Caution, DataError
+from gsparc.data.errors import Caution, DataError, gathered
 
 SETTINGS = ("dataset.stations_file=", "dataset.columns.", "dataset.not_heard=", "dataset.absent=")
 SWITCH = re.compile(r"dataset\.(\w+)=(true|false)", re.IGNORECASE)
@@ -34,7 +34,7 @@ def check(
     # Here: they bring torch, which --help does not need.
     from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
-    from gsparc.data.checks.plausibility import gathered, link_levels, plausibility_warnings, steps_of
+    from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
 

@@ -31,7 +31,8 @@ from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, 
 
 log = logging.getLogger(__name__)
 
-SAY_S = 2.0  # between lines about progress
+SAY_S = 2.0  # between lines about progress, at least
+LINES = 5  # about progress, more or less
 TRIES = 3  # of a piece whose process dies
 _Piece = TypeVar("_Piece")
 _Result = TypeVar("_Result")
@@ -107,9 +108,10 @@ def each(
             if isinstance(result, Exception):
                 raise result
             ended += cost(pieces[number])
-            if what and count < len(pieces) and time.monotonic() - logged > SAY_S:
-                logged = time.monotonic()
-                left = (logged - began) * (total / max(ended, 1e-9) - 1)
+            now = time.monotonic()
+            whole = (now - began) * total / max(ended, 1e-9)
+            if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
+                logged, left = now, whole - (now - began)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
             yield number, result
 

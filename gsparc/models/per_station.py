@@ -32,7 +32,7 @@ from gsparc.models.target_rows import heard
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import Spent, TimeBudget, less_repeatable
+from gsparc.training.time_budget import Spent, less_repeatable
 
 log = logging.getLogger(__name__)
 
@@ -143,9 +143,8 @@ class PerStation(Method):
                 share = max(even, LEAST_SHARE * whole / len(numbers))
             resume = None if left is None else left / folder
             own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
-            if local and self.wrapped.takes_budget and len(numbers) > 1:
-                turns = turn + 1, len(numbers), self._name_of(number), _rest(turn, len(numbers), budget)
-                log.info("station %d of %d: %s%s", *turns)
+            if len(numbers) > 1:
+                log.info("station %d of %d: %s", turn + 1, len(numbers), self._name_of(number))
             rows, part = self._part(data, number)
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             copy, before = self._make(), budget.counted.wall
@@ -163,7 +162,7 @@ class PerStation(Method):
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
-        fits = dict(each(fitted, range(len(numbers)), "" if local else "stations"))
+        fits = dict(each(fitted, range(len(numbers)), f"stations of {self.name}"))
         reports = [fits[turn][1] for turn in range(len(numbers))]
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
@@ -341,14 +340,6 @@ class OfStation(View):
         rows = torch.arange(len(tx))
         station = torch.full_like(rows, self.number)
         return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
-
-
-def _rest(turn: int, count: int, budget: TimeBudget) -> str:
-    """What a log says of the seconds that are left, before the station `turn` of so many."""
-    rest = budget.seconds - budget.spent
-    if math.isinf(rest):
-        rest = budget.spent / turn * (count - turn) if turn else math.inf
-    return "" if math.isinf(rest) else f", about {max(rest, 0.0):.0f} s left for all"
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:

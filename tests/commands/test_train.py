@@ -34,6 +34,7 @@ from gsparc.evaluation.experiment import run
 from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
+from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.loading import module_of
 from gsparc.models.parts import Origin
 from gsparc.models.splat.method import LearnedField
@@ -104,6 +105,18 @@ def test_a_method_without_a_gradient_is_trained_and_says_that_its_budget_is_not_
     assert np.isfinite(facts["test/psnr_db"]) and objects.checkpoints[0].exists()
     assert f"budget_s=5 is not used: the seconds of {model} cannot be chosen" in caplog.text
     assert facts["model/limited_by_clock"] is None
+
+
+@pytest.mark.parametrize("more, times", [([], 1), (["model.components=3"], 2)])
+def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
+    more, times, spectra_file, tmp_path, monkeypatch
+):
+    fits, fit = [], GaussianProcess.fit
+    monkeypatch.setattr(run, "platform_cache", lambda: None)
+    monkeypatch.setattr(GaussianProcess, "fit", lambda *given: fits.append(1) or fit(*given))
+    facts, _ = train(plain(spectra_file, "gp", "baselines=[gp]", *more), tmp_path)
+    assert len(fits) == times
+    assert (facts["test/psnr_db"] == facts["baseline/gp/psnr_db"]) == (times == 1)
 
 
 def test_a_checkpoint_evaluates_to_the_same_figures(field):

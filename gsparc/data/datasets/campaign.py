@@ -13,9 +13,9 @@ import numpy as np
 from gsparc.data.assemble import FARTHEST, bad_positions
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.describe import suspicious_values
-from gsparc.data.checks.plausibility import gathered, link_levels, plausibility_warnings, steps_of
+from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError, Problems
+from gsparc.data.errors import Caution, DataError, Problems
 from gsparc.data.files import read_text
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
@@ -66,8 +66,10 @@ class Campaign(DataModule):
         selected = select(raw, self.selection, self.file)
         reading = interpret(selected.raw, self.file)
         left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*left_out, *selected.notes, *reading.notes, *gathered(_implausible(reading.data))):
-            log.warning("%s: %s", self.file, note)
+        for note in (*left_out, *selected.notes, *reading.notes):
+            log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
+        for warning in _implausible(reading.data):
+            log.warning("%s: %s", self.file, warning)
         for hint in suspicious_values(reading.data):
             log.warning("%s: units? %s", self.file, hint)
         return reading.data

@@ -12,6 +12,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
 from gsparc.data.files import is_address, platform_cache
 from gsparc.data.instantiate import suggest
@@ -30,12 +31,13 @@ from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import new_run_id, provenance, result_rows, write_samples, write_summary
 from gsparc.models import checkpoint, parts
 from gsparc.models.method import Method, TrainsByGradient
-from gsparc.models.registry import build
+from gsparc.models.registry import build, known, method_node
 from gsparc.training import curve, tracking
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
+log_of_models = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
 
 LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 
@@ -76,9 +78,11 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     data = module.measurements
     objective_of(config, data.site.kind)  # refused now, not after the training
     walls = config.get("known_walls") or OmegaConf.select(config, "init.file")
-    known = None if walls is None else read_walls(walls)
+    known_walls = None if walls is None else read_walls(walls)
     split = split_for(plain(config.split), data)
     split.check()  # none without rows to learn from or to test on
+    for topic, sentence in in_short(data, split):
+        log.info("%-10s%s", topic, sentence)
     run_id = new_run_id()
     write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
     count = len(split.folds)
@@ -119,6 +123,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         evaluation = evaluate(
             methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=config.baselines, cache=platform_cache(),
+            shared=_as_baseline(config, methods[0]),
         )  # fmt: skip
         facts: dict[str, Any] = {
             **evaluation.facts, **provenance(), "run_id": run_id,
@@ -141,7 +146,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         tracking.table(loggers, "results", *result_rows(facts, label, config.eval_on))
         objects = methods[0].objects()
         if len(objects):
-            draw_found(data, objects, run_dir / "found.png", known)
+            draw_found(data, objects, run_dir / "found.png", known_walls)
             tracking.picture(loggers, "found", run_dir / "found.png")
     samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
     write_samples(run_dir / "per_sample.csv", samples)
@@ -168,6 +173,13 @@ def _data(config: DictConfig) -> DataModule:
     return module
 
 
+def _as_baseline(config: DictConfig, method: Method) -> str | None:
+    """Its name where a baseline of that name would be fitted in the same way."""
+    plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
+    kind = known().get(method.name)
+    return method.name if plainly and kind and plain(config.model) == method_node(kind) else None
+
+
 def _check_model(config: DictConfig, resumed: bool) -> None:
     """Say what the model guesses; refuse weights to start from, or a resume, where they mean nothing."""
     method = build(config.model)
@@ -176,7 +188,10 @@ def _check_model(config: DictConfig, resumed: bool) -> None:
     if resumed and not method.resumable and not Path(config.ckpt_path).is_dir():  # with parts that finished
         raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
     for guess in method.guesses:
-        log.info("guess: %s", guess)
+        log_of_models.info("guess: %s", guess)
+    guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
+    within = "" if config.budget_s is None else f", within {config.budget_s:g} s"
+    log.info("%-10s%s%s%s", "fitting", method.name, within, guessed)
 
 
 def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
@@ -206,7 +221,7 @@ def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
         text = "%s does not train by gradient: trainer options (%s) are not used"
         log.log(level, text, method.name, options)
     for note in report.notes:
-        log.info("%s", note)
+        log_of_models.info("%s", note)
 
 
 def objective_of(config: DictConfig, kind: Kind) -> str:

@@ -75,7 +75,7 @@ def through_array(task: InitTask) -> Start:
     assert task.receiver is not None
     if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
         raise ValueError(
-            "init=vectors solves a linear read-out: set model.emission.hidden=0 and "
+            "init=vectors solves a linear read-out: leave init=auto, or set model.emission.hidden=0 and "
             "model.attenuation.inverse_distance=false"
         )
     process = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
