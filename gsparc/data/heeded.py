@@ -80,10 +80,8 @@ def _noting(get: Callable[[Any, str], Any], own: Mapping[str, list[Option]]) -> 
     def noted(self: Any, name: str) -> Any:
         value = get(self, name)
         if name in own and _reads is not None:
-            caller = sys._getframe(1)
-            code = caller.f_code
-            own_init = code.co_name == "__init__" and caller.f_locals.get("self") is self
-            if code.co_filename not in COPIES and code.co_name not in UNUSED and not own_init:
+            code = sys._getframe(1).f_code  # of who reads
+            if code.co_filename not in COPIES and code.co_name not in UNUSED:
                 _reads.noted.update(o.path for o in own[name] if _same(value, o.value))
         return value
 
@@ -120,12 +118,12 @@ def compare(asked: set[str], decide: Callable[[Any], str]) -> None:
         return
     reads, every = _reads, [o for own in _reads.options.values() for each in own.values() for o in each]
     for option in (one for one in every if one.path in asked):
-        switch = isinstance(option.value, bool) or "auto" in (option.value, option.default)
-        others = {option.default, *((True, False) if switch else ())} - {option.value}
+        switch = (True, False) if isinstance(option.value, bool) else ()
+        others = {option.default, *switch} - {option.value}
         with apart():
             said = [_said(decide, reads, option.path, other) for other in (option.value, *others)]
         named = isinstance(option.value, str) and repr(option.value) in said[0]
-        if named or len({one for one in said if one}) > 1:
+        if named or not others or len({one for one in said if one}) > 1:
             count(option.path)
 
 

@@ -116,7 +116,8 @@ class PlannedField(LearnedField):
         self.runs = RunFactors.none()
         with heeded.apart() as asked:
             self.plan = self.planned(data)
-        heeded.compare(asked, lambda one: one._decided(data))
+        with heeded.apart() as decided:
+            heeded.compare(asked, lambda one: one._decided(data))
         for reason in self.plan.reasons:
             log.info("%s", reason)
         if "scene" in self.plan.parts:
@@ -125,11 +126,15 @@ class PlannedField(LearnedField):
             std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
         if std is not None and std[np.concatenate([fold.train, fold.val])].any():
             if not self.plan.rasterized and data.site.kind != "spectrum" and data.site.static_end is not None:
-                heeded.count(*asked)
+                heeded.count(*asked, *decided)
                 return self._fit_refined(self.plan, data, fold, context, std)
             log.warning("position_std is not used: it is for channels and powers of one end that moves")
         if self.plan.rasterized:
-            return self._fit_rasterized(data, fold, context)
+            report = self._fit_rasterized(data, fold, context)
+            # That a process came to stand for a field is what a switch asks for, and no option of the field.
+            heeded.count(*(path for path in decided if not self._alone or path.startswith("model.effects.")))
+            return report
+        heeded.count(*decided)
         return self._fit_conditional(self.plan, data, fold, context)
 
     def _decided(self, data: Measurements) -> str:
@@ -138,7 +143,7 @@ class PlannedField(LearnedField):
         if not plan.rasterized:
             return repr((plan, "diffuse" if init == "diffuse" or not self.settings.field.count else ""))
         settings = replace(self.settings, response=replace(self.settings.response, array=plan.array))
-        return repr((plan, resolve(settings, init, data.site)[0]))
+        return repr((plan, resolve(settings, init, data.site)[0].init))
 
     def _fit_refined(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext, std: np.ndarray

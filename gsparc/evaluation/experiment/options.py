@@ -40,7 +40,8 @@ def given() -> dict[str, str]:
     if not HydraConfig.initialized():
         return {}
     hydra = HydraConfig.get()
-    said = {path: f"{path}={value}" for path, value in _of_experiment(hydra.runtime)}
+    experiment = _of_experiment(hydra.runtime, hydra.runtime.choices.get("experiment"))
+    said = {path: f"{path}={value}" for path, value in experiment}
     for one in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
         path, value = one.key_or_group, one.value()
         inner = leaves(value, f"{path}.") if isinstance(value, dict) else [(path, value)]
@@ -49,12 +50,16 @@ def given() -> dict[str, str]:
     return {"init.name" if path == "init" else path: text.lstrip("+") for path, text in said.items()}
 
 
-def _of_experiment(runtime: Any) -> Iterator[tuple[str, Any]]:
-    choice = runtime.choices.get("experiment")
+def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]]:
+    """What an experiment file says itself, after those of its folder that it builds on."""
     for source in runtime.config_sources if choice else ():
         folder = Path(source.path) if source.schema == "file" else config_folder()
-        if (file := folder / "experiment" / f"{choice}.yaml").exists():
+        file = folder / "experiment" / f"{choice}.yaml"
+        if file.exists():
             text = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+            for one in text.get("defaults", ()):
+                if isinstance(one, str) and one != "_self_":
+                    yield from _of_experiment(runtime, one)
             yield from leaves({key: value for key, value in text.items() if key not in ("defaults", "hydra")})
             return
 

@@ -230,7 +230,7 @@ class LearnedField(Method):
             start = prepare(
                 InitTask(
                     settled(self.settings, self.choices), self.choices.closed_form, data,
-                    fold.train, self._receiver(), self._ends.get("tx_position"), self.loss.snapshot,
+                    fold.train, self._receiver(), self._ends.get("tx_position"),
                     context.seed, folder,
                 )
             )  # fmt: skip
