@@ -57,7 +57,7 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
     """
     left = context.resume
     if left is not None:  # what was read then is not known
-        heeded.count("model.*", "init.*", *(("*",) if left.is_dir() else ()))
+        heeded.count("*")
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
             return _restore(method, data, fold, context, left / checkpoint.MODEL)

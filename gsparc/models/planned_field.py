@@ -114,10 +114,9 @@ class PlannedField(LearnedField):
         """Choose the terms, initialise, weigh; take the steps that pay where Gaussians are rendered."""
         self.site, self.field, self._average, self._average_mean = data.site, None, None, None
         self.runs = RunFactors.none()
-        with heeded.apart() as asked:
+        with heeded.apart():
             self.plan = self.planned(data)
-        with heeded.apart() as decided:
-            heeded.compare(asked, lambda one: one._decided(data))
+        heeded.count(*self.plan.options)
         for reason in self.plan.reasons:
             log.info("%s", reason)
         if "scene" in self.plan.parts:
@@ -126,24 +125,12 @@ class PlannedField(LearnedField):
             std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
         if std is not None and std[np.concatenate([fold.train, fold.val])].any():
             if not self.plan.rasterized and data.site.kind != "spectrum" and data.site.static_end is not None:
-                heeded.count(*asked, *decided)
+                heeded.count(*asked)
                 return self._fit_refined(self.plan, data, fold, context, std)
             log.warning("position_std is not used: it is for channels and powers of one end that moves")
         if self.plan.rasterized:
-            report = self._fit_rasterized(data, fold, context)
-            # That a process came to stand for a field is what a switch asks for, and no option of the field.
-            heeded.count(*(path for path in decided if not self._alone or path.startswith("model.effects.")))
-            return report
-        heeded.count(*decided)
+            return self._fit_rasterized(data, fold, context)
         return self._fit_conditional(self.plan, data, fold, context)
-
-    def _decided(self, data: Measurements) -> str:
-        """What settings that no part reads decide."""
-        plan, init = replace(self.planned(data), reasons=()), self.init.name
-        if not plan.rasterized:
-            return repr((plan, "diffuse" if init == "diffuse" or not self.settings.field.count else ""))
-        settings = replace(self.settings, response=replace(self.settings.response, array=plan.array))
-        return repr((plan, resolve(settings, init, data.site)[0].init))
 
     def _fit_refined(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext, std: np.ndarray
@@ -166,7 +153,7 @@ class PlannedField(LearnedField):
 
     def _fit_rasterized(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         assert self.plan is not None
-        with heeded.apart():  # what they decide, `_decided` says
+        with heeded.apart():  # what these decide, `Plan.options` says
             response = replace(self.settings.response, array=self.plan.array)
             self.settings = replace(self.settings, response=response)
             if not self.settings.field.count:
@@ -181,8 +168,6 @@ class PlannedField(LearnedField):
             report = super().fit(data, fold, context)
         if not self._alone:
             heeded.count(*read)
-        elif not super().size():
-            heeded.count("model.field.count")
         self.started = self.choices.init if self.choices is not None else ""
         spent = dict(self.spent)
         if self._average is not None:
@@ -214,17 +199,11 @@ class PlannedField(LearnedField):
             self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
             self.explained = self.explained if explained is None else explained
             self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
-        if self._alone and super().size():
-            log.warning(
-                "the plain process has all the weight: no option of the field changes the result. The row of "
-                "the Gaussians alone shows what they do; model=splat is the field alone, and "
-                "model.effects.residual=false leaves the process out"
-            )
 
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
     ) -> FitReport:
-        with heeded.apart():  # see `_decided`
+        with heeded.apart():  # what these decide, `Plan.options` says
             known = self.init.name if self.init.name in ("diffuse", *chosen.parts) else "auto"
             init = replace(self.init, name=known if self.settings.field.count else "diffuse")
         solved = solve(chosen.parts, init, self.switches, data, fold, context)

@@ -207,7 +207,7 @@ def run_stage(
         **options,
     )
     if processes is not None:  # which note nothing here
-        heeded.count("model.*", "callbacks.*")
+        heeded.count("*")
     if trainer.world_size > 1 and processes is None:
         raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
     try:

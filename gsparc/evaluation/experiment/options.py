@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections import defaultdict
 from collections.abc import Iterator
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.heeded import Option, Reads
-from gsparc.data.instantiate import find, node_of
+from gsparc.data.instantiate import find
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.evaluation.console import config_folder
@@ -32,6 +30,10 @@ RENDERED = (  # settings of the model that only rasterized Gaussians have
     "field", "emission", "attenuation", "raster", "response", "confidence", "loss", "optimizer", "refit",
     "keep_best", "steps",
 )  # fmt: skip
+ALONE = "a plain process has all the weight: model=splat is the field alone, and "
+ALONE += "model.effects.residual=false leaves the process out"
+REDRAW = "the dataset names its test rows: say split.redraw=true"
+STEPS = "no gradient steps are asked for: say model.steps=auto"
 NAMES = ("_target_", "name", "guesses")  # settings that say nothing of what is done
 
 
@@ -66,48 +68,29 @@ def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]
 
 def noting(config: DictConfig) -> Reads:
     """What is to be noted of the options that were `given`."""
-    method, said = build(config.model), given()
-    settings: Any = OmegaConf.to_container(config, resolve=True)
-    options: dict[type, dict[str, list[Option]]] = defaultdict(lambda: defaultdict(list))
-    for path in said:
+    method, options = build(config.model), []
+    for path in given():
         group, _, name = path.rpartition(".")
         node = OmegaConf.select(config, group) if group else None
-        if not isinstance(node, DictConfig) or (name in NAMES and path != "init.name"):
-            continue
-        value = OmegaConf.select(config, path)
-        for kind, attribute in _holders(path, node, method):
-            options[kind][attribute].append(Option(path, value, node_of(kind).get(name)))
-
-    def variant(path: str, value: Any) -> Method:
-        model = node = deepcopy(settings["model"])
-        *groups, name = path.removeprefix("model.").split(".")
-        for one in groups:
-            node = node[one]
-        node[name] = value
-        return build(model)
-
-    return Reads(options, variant)
+        if isinstance(node, DictConfig) and (name not in NAMES or path == "init.name"):
+            value = OmegaConf.select(config, path)
+            options += [Option(path, value, *holder) for holder in _holders(path, node, method)]
+    return Reads(options)
 
 
 def _holders(path: str, node: DictConfig, method: Method) -> Iterator[tuple[type, str]]:
     """Classes and attributes that hold a setting, none where this is not known."""
     group, _, name = path.rpartition(".")
-    within = path.removeprefix("model.")
-    split = (FileSettings if node.get("name") == "file" else SplitSettings) if group == "split" else None
-    kind: Any = split or find(str(node.get("_target_")))
-    stored = method.stored_names.get(within, name) if group == "model" else name
-    if dataclasses.is_dataclass(kind) and name in {f.name for f in dataclasses.fields(kind)}:
+    stored = method.stored_names.get(path.removeprefix("model."))
+    kind: Any = find(str(node.get("_target_")))
+    if group == "split":
+        kind = FileSettings if node.name == "file" else SplitSettings
+    as_named = group == "model" and stored is None and vars(method).get(name, ...) == node[name]
+    if as_named or name in getattr(kind, "__dataclass_fields__", ()):
         yield kind, name
-    elif group == "model" and name in method.stored_names and stored:
-        yield kind, stored
-    elif group == "model" and vars(method).get(name, ...) == node[name]:
-        yield kind, name
-    if group.startswith("model.") and (stored := method.stored_names.get(within, "")):
-        *owners, attribute = stored.split(".")
-        held: Any = method
-        for owner in owners:
-            held = getattr(held, owner)
-        yield type(held), attribute
+    if stored:
+        owner, _, attribute = stored.rpartition(".")
+        yield type(getattr(method, owner) if owner else method), attribute
 
 
 def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
@@ -121,42 +104,49 @@ def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
     stations = data.site.stations is not None and len(data.site.stations) > 1
     counted = {"budget_s": method.takes_budget, "stations": stations}
     reads.noted |= {name for name, heeded in counted.items() if heeded}
-    known = {one.path for own in reads.options.values() for each in own.values() for one in each}
+    known = {option.path for option in reads.options}
     known |= {f"model.{name}" for name, stored in method.stored_names.items() if not stored}
     why: dict[str, list[str]] = defaultdict(list)
     for path, text in given().items():
         judged = path in known or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
         if judged and not reads.heeds(path):
             why[_instead(path, method, reads, data)].append(text)
-    if not why:
-        return None
     words = "; ".join(f"{', '.join(one)} ({text})" for text, one in why.items())
-    log.warning("options without effect here: %s", words)
-    return ", ".join(text for one in why.values() for text in one)
+    if why or _alone(method):
+        log.warning("%s", f"options without effect here: {words}" if why else ALONE)
+    return ", ".join(text for one in why.values() for text in one) or None
+
+
+def _alone(method: Method) -> bool:
+    return method.field_alone() is not None and not method.size()
 
 
 def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str:
     """Why an option has no effect, and what to set instead where that is known."""
-    group, _, name = path.partition(".")
-    if path == "budget_s":
-        return f"the seconds of {method.name} cannot be chosen"
-    if path == "stations":
-        return "there is one station"
-    if group == "split":
-        own = "the dataset names its test rows: say split.redraw=true"
-        return own if data.release_split is not None else "this split does not use it"
-    if method.field_alone() is not None and not method.size():
-        own = "model=splat is the field alone, model.effects.residual=false leaves the process out"
-        return f"a plain process has all the weight: {own}"
-    if path == "model.steps" and "trainer.max_steps" in reads.noted:
-        return "steps of the Trainer win"
-    if group in ("trainer", "callbacks", "dataset") or path == "model.steps":
-        if "trainer" in reads.noted:
-            return "this training does not call for it"
-        if {"model.steps", "trainer.max_steps"} & reads.noted:
-            return "no gradient steps are asked for: say model.steps=auto"
-        return f"{method.name} takes no gradient steps here: model=splat does"
-    if isinstance(method, TrainsByGradient) and name.partition(".")[0] in RENDERED and group == "model":
-        return "of rendered Gaussians alone: say model=splat"
+    (group, _, name), noted = path.partition("."), reads.noted
+    training = group in ("trainer", "callbacks", "dataset") or path == "model.steps"
+    rendered = group == "model" and name.partition(".")[0] in RENDERED
     started = method.facts()["model/init"] if group == "init" else None
-    return f"{method.name} does not use it here" if started is None else f"here it is init={started}"
+    reasons = (
+        (path == "budget_s", f"the seconds of {method.name} cannot be chosen"),
+        (path == "stations", "there is one station"),
+        (
+            group == "split" and data.release_split is not None,
+            REDRAW,
+        ),
+        (group == "split", "this split does not use it"),
+        (
+            method.field_alone() is not None and not method.size(),
+            ALONE,
+        ),
+        (path == "model.steps" and "trainer.max_steps" in noted, "steps of the Trainer win"),
+        (training and "trainer" in noted, "this training does not call for it"),
+        (
+            training and {"model.steps", "trainer.max_steps"} & noted,
+            STEPS,
+        ),
+        (training, f"{method.name} takes no gradient steps here: model=splat does"),
+        (rendered and isinstance(method, TrainsByGradient), "of rendered Gaussians alone: say model=splat"),
+        (started is not None, f"here it is init={started}"),
+    )
+    return next((text for holds, text in reasons if holds), f"{method.name} does not use it here")

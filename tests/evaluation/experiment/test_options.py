@@ -216,10 +216,11 @@ def warned(caplog) -> list[str]:
 def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
     """`model.attenuation.inverse_distance=true` on powers was ignored without a word."""
     falls = "model.attenuation.inverse_distance=true"
-    assert fitted("power", "model=gsparc", falls)[0] == {"model.attenuation.inverse_distance"}
+    unused, answers = fitted("power", "model=gsparc", falls)
+    assert unused == {"model.attenuation.inverse_distance"}
     said = f"options without effect here: {falls} (of rendered Gaussians alone: say model=splat)"
     assert warned(caplog) == [said]
-    assert torch.equal(fitted("power", "model=gsparc", falls)[1], fitted("power", "model=gsparc")[1])
+    assert torch.equal(answers, fitted("power", "model=gsparc")[1])
 
 
 def test_steps_mean_nothing_to_a_plain_method(caplog):
@@ -248,6 +249,11 @@ def test_callbacks_of_a_training_without_steps(none, caplog):
     assert warned(caplog)[0].endswith("(no gradient steps are asked for: say model.steps=auto)")
 
 
+def test_steps_that_closed_forms_do_not_take(caplog):
+    assert fitted("power", "model=gsparc", "model.steps=7")[0] == {"model.steps"}
+    assert warned(caplog)[0].endswith("model.steps=7 (gsparc takes no gradient steps here: model=splat does)")
+
+
 def test_an_initialiser_that_these_data_do_not_have(caplog):
     """`init=vectors` of powers was ignored without a word."""
     assert fitted("power", "model=gsparc", "init=vectors")[0] == {"init"}
@@ -256,7 +262,7 @@ def test_an_initialiser_that_these_data_do_not_have(caplog):
         assert not fitted("array", "model=gsparc", f"init={init}", "model.steps=0")[0]
 
 
-def test_switches_of_effects_count_where_another_value_decides_otherwise():
+def test_switches_of_effects_count_where_they_decide():
     assert fitted("power", "model=gsparc", "model.effects.phase=false")[0] == {"model.effects.phase"}
     assert not fitted("array", "model=gsparc", "model.effects.array=true", "model.steps=0")[0]
     assert not fitted("image", "model=gsparc", "model.effects.residual=false", "trainer.max_steps=1")[0]
