@@ -86,10 +86,10 @@ class Densify(Checked, L.Callback):
 
     def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any = None, *unused: Any) -> None:
         """Edit the field when the schedule says so, after the validation of the step before."""
+        if not self.statistics or self._ended:
+            return
         step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
         if step is None or not due(step, module.global_step, *when, module.total_steps):
-            return
-        if not self.statistics or self._ended:
             return
         model: GaussianModel = module.model
         with torch.no_grad():

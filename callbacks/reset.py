@@ -46,8 +46,9 @@ class OpacityReset(Checked, L.Callback):
 
     def on_train_batch_start(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Reset when the schedule says so, after the validation of the step before."""
-        step = module.schedule_step(self.interval)
-        if step is None or module.solved or module.total_steps < self.least_steps:
+        if module.solved or module.total_steps < self.least_steps:
+            return
+        if (step := module.schedule_step(self.interval)) is None:
             return
         interval = in_steps(self.interval, module.total_steps)
         if not due(step, module.global_step, 1, self.stop, self.interval, module.total_steps):

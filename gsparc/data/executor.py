@@ -26,6 +26,7 @@ import torch
 from joblib.externals.loky.process_executor import BrokenProcessPool
 from threadpoolctl import threadpool_limits
 
+from gsparc.data import heeded
 from gsparc.data.errors import reason
 from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, whole
 
@@ -101,7 +102,7 @@ def each(
         here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
         results = _jobs(here, threads, "threading")
     else:
-        blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
+        blob = cloudpickle.dumps((heeded.carried(work), os.getcwd(), torch.get_num_threads()))
         results = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
     with closing(results):  # what has begun is cancelled
         for count, (number, result) in enumerate(results, 1):
@@ -113,7 +114,7 @@ def each(
             if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
                 logged, left = now, whole - (now - began)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
-            yield number, result
+            yield number, heeded.brought(result) if elsewhere() else result
 
 
 @lru_cache(maxsize=1)

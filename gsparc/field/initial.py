@@ -65,7 +65,6 @@ class InitTask:
         rows: (n,) to learn from.
         receiver: the static one's pose; None where it moves.
         transmitter: (3,) [m], the static one's; None where it moves.
-        snapshot: what every snapshot has of its own.
         seed: of every random choice.
         run_dir: where reports go.
     """
@@ -76,7 +75,6 @@ class InitTask:
     rows: np.ndarray
     receiver: Pose | None
     transmitter: Tensor | None
-    snapshot: Snapshot
     seed: int
     run_dir: Path
 

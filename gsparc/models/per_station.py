@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data import heeded
 from gsparc.data.executor import each, elsewhere
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -183,7 +184,8 @@ class PerStation(Method):
         assert stations is not None
         how = context.stations
         if how == "auto":
-            how, why = self.wrapped.best_stations(data, fold, context)
+            with heeded.apart():
+                how, why = self.wrapped.best_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
         together, joint = how == "together", self.wrapped.shares(data.site)
         self._shared = together and joint

@@ -19,6 +19,7 @@ import torch
 from lightning.pytorch.plugins.io import CheckpointIO
 from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
 
+from gsparc.data import heeded
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -82,9 +83,13 @@ def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> i
     for name, value in (("max_steps", steps), ("max_epochs", epochs)):
         if value is not None and (type(value) is not int or value < 0):
             raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
+    if own == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
+        heeded.count("model.steps")
+        return own
+    heeded.count("trainer.max_steps", "trainer.max_epochs")
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
-    given = [*([] if steps is None else [steps]), *([] if epochs is None else [epochs * -(-rows // size)])]
-    return min(given) if given and own != 0 else own  # 0 of either is the start alone
+    of_epochs = None if epochs is None else epochs * -(-rows // size)
+    return min(one for one in (steps, of_epochs) if one is not None)
 
 
 class ReturnMetrics(L.Callback):
@@ -207,6 +212,7 @@ def run_stage(
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     options["max_steps"] = module.total_steps if pace is None else -1
     options["max_epochs"] = -1
+    heeded.count("trainer", "callbacks", "dataset.batch_size")
     processes = Processes.named(make.keywords.get("strategy"))
     if processes is not None:
         options["strategy"] = processes
@@ -217,6 +223,8 @@ def run_stage(
         default_root_dir=folder,
         **options,
     )
+    if processes is not None:  # which note nothing here
+        heeded.count("*")
     if trainer.world_size > 1 and processes is None:
         raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
     try:

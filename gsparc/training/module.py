@@ -95,7 +95,8 @@ class GaussianModule(L.LightningModule):
             if batch.mask is not None:
                 prediction = torch.where(batch.mask, prediction, batch.target)
             return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
-        return channel_loss(prediction, batch.target, batch.mask, self.loss.snapshot)
+        snapshot = self.loss.snapshot if self.model.site.kind == "csi" else "none"  # powers have no phase
+        return channel_loss(prediction, batch.target, batch.mask, snapshot)
 
     def _render(self, batch: Batch) -> Rendered:
         try:

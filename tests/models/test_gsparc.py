@@ -167,13 +167,6 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     assert f" of {fitted.report.seconds:.1f} s without weight" in last
 
 
-def test_steps_that_closed_forms_do_not_take_are_named():
-    fitted = fit("powers", "model.steps=7")
-    assert "model.steps=7 is not used: closed-form weights take no steps" in fitted.lines
-    assert fitted.method.facts()["model/steps"] == 0
-    assert not any("is not used" in line for line in default("powers").lines)
-
-
 @pytest.mark.parametrize("name", KINDS)
 def test_seconds_are_kept_to(name):
     """To a tenth and one step, and the least that is done in any case; validation is not counted."""

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-import re
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data import heeded
 from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
 from gsparc.data.files import is_address, platform_cache
@@ -22,12 +21,14 @@ from gsparc.data.splits import Split, write_split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.fit import context_of, fit_and_score
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
+from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import new_run_id, provenance, result_rows, write_samples, write_summary
 from gsparc.models import checkpoint, parts
 from gsparc.models.method import Method, TrainsByGradient
@@ -74,12 +75,14 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         ValueError: bad data, settings or checkpoint; one line each.
     """
     watch = TimeBudget(clock=config.budget_clock)
-    module = _data(config)
-    data = module.measurements
+    reads = options.noting(config)
+    with heeded.recording(reads):
+        module = _data(config)
+        data = module.measurements
+        split = split_for(plain(config.split), data)
     objective_of(config, data.site.kind)  # refused now, not after the training
     walls = config.get("known_walls") or OmegaConf.select(config, "init.file")
     known_walls = None if walls is None else read_walls(walls)
-    split = split_for(plain(config.split), data)
     split.check()  # none without rows to learn from or to test on
     for topic, sentence in in_short(data, split):
         log.info("%-10s%s", topic, sentence)
@@ -93,7 +96,8 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
-        _log_fit(method, report, config.budget_s)
+        for note in report.notes:
+            log_of_models.info("%s", note)
         if not curve.read(folders[number]):  # a method that trains in one piece
             context(number).curve(report.seconds, method.name, report.error)
         marks = parts.marks(report, data, split.folds[number], context(number))
@@ -113,13 +117,16 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
         try:
             make = partial(build, config.model)
-            fitted = fit_and_score(make, data, split, context, eval_on=None, keep=keep)
+            with heeded.recording(reads):
+                fitted = fit_and_score(make, data, split, context, eval_on=None, keep=keep)
+                fitted.methods[0].answer(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
         except KeyboardInterrupt as stopped:
             if count == 1:
                 raise
             cause = str(stopped).partition("; ")[0] or "interrupted"
             raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={run_dir}") from None
         methods = fitted.methods
+        unused = options.unheeded(reads, methods[0], data)
         evaluation = evaluate(
             methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=config.baselines, cache=platform_cache(),
@@ -128,6 +135,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         facts: dict[str, Any] = {
             **evaluation.facts, **provenance(), "run_id": run_id,
             "seed": int(config.seed), "model/limited_by_clock": fitted.limited_by,
+            "options/unused": unused,
         }  # fmt: skip
         if fitted.cost.stages:
             facts["time/cost"] = fitted.cost.described(fitted.limited_by)
@@ -207,21 +215,6 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
             f"ckpt_path={path}: split={config.split.name} has {folds} folds, give the run's folder"
         )
     return own if own.is_dir() else None
-
-
-def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
-    """What the fit found, and whether a budget or options of the Trainer were asked for and not used."""
-    if budget_s is not None and not method.takes_budget:
-        log.warning("budget_s=%g is not used: the seconds of %s cannot be chosen", budget_s, method.name)
-    if not (isinstance(method, TrainsByGradient) and method.trainer_options()):
-        overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-        unused = [o for o in overrides if re.match(r"[+~]*(trainer[.=]|init_from=)", o)]
-        options = ", ".join(unused) or "accelerator, devices, precision, max_steps, ..."
-        level = logging.WARNING if unused else logging.DEBUG
-        text = "%s does not train by gradient: trainer options (%s) are not used"
-        log.log(level, text, method.name, options)
-    for note in report.notes:
-        log_of_models.info("%s", note)
 
 
 def objective_of(config: DictConfig, kind: Kind) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsparc.data import heeded
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -76,8 +77,9 @@ def solve(
     share = solutions.CLOSED_SHARE * max(budget.seconds - budget.spent, solutions.LEAST_S)
     runs = _runs(data, known, init, replace(context, budget_s=share))
     data = runs.aligned(data)
-    fields, reports = solutions.find(parts, init, effects, data, fold, context, budget, until_s, cut)
+    fields, reports, read = solutions.find(parts, init, effects, data, fold, context, budget, until_s, cut)
     members = solutions.weighed(fields, data, fold, cut)
+    heeded.count(*(path for name in members for path in read[name]))
     field, started = solutions.joined(members), "+".join(members)
     field.site = data.site
     init_s = budget.counted.wall

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.data import heeded
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -42,14 +43,15 @@ HOPELESS = 1.5  # times the error of waves from all around, of few sources: more
 SEARCH_LOOKS = 60  # at a search's rows, that the shortest takes
 LEAST_S = 0.2  # of a part, though others left none
 OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
+CLUTTERED = ("sources", "scene", "joint_powers")  # initialisers to which `clutter` means something
 SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
 
 
 def find(
     parts: tuple[str, ...], init: InitSettings, effects: EffectSettings, data: Measurements, fold: Fold,
     context: FitContext, budget: TimeBudget, until_s: float, cut: InnerFolds | None,
-) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:  # fmt: skip
-    """What initialisers find, and what each cost.
+) -> tuple[dict[str, ConditionalField], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
+    """What initialisers find, what each cost, and which settings each read.
 
     Where they are several, training rows are cut into groups as the test was cut, and each solution
     predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
@@ -76,6 +78,7 @@ def find(
         plans.append((part, init, 1.0))
     fields: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
+    read: dict[str, set[str]] = {}
     for name, settings, share in plans:
         part = name.split()[-1]
         least = SEARCH_LOOKS * factor_s(settings.search_rows) if part in SEARCHES else 0.0
@@ -92,11 +95,11 @@ def find(
         try:
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
             within = replace(within, leave_out=leave_out, rival=least_error(reports.values()))
-            clutter = effects.visibility is not False
-            with late_when(budget.over):
+            with heeded.apart() as read[name], late_when(budget.over):
+                clutter = part not in CLUTTERED or effects.visibility is not False
                 field, report = INITIALISERS[part](data, rows, settings, clutter, within)
-            if effects.residual is False and isinstance(field, Mixture):
-                field = next(one for _, one in field.parts())
+                if isinstance(field, Mixture) and effects.residual is False:
+                    field = next(one for _, one in field.parts())
             fields[name] = field
             if part not in OPEN_ENDED:
                 field.held = _held(field, data, rows, groups, until_s, budget, report.seconds)
@@ -115,7 +118,7 @@ def find(
             miss = solution_weights.error(comparable(field.held.mean, data.site), target)
             report = replace(report, error=miss)
         reports[name] = report
-    return fields, reports
+    return fields, reports, read
 
 
 def least_error(reports: Iterable[FitReport]) -> float:

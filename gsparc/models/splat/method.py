@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import lightning.pytorch as L
 import numpy as np
@@ -74,6 +74,7 @@ class LearnedField(Method):
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = True
+    stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
@@ -229,7 +230,7 @@ class LearnedField(Method):
             start = prepare(
                 InitTask(
                     settled(self.settings, self.choices), self.choices.closed_form, data,
-                    fold.train, self._receiver(), self._ends.get("tx_position"), self.loss.snapshot,
+                    fold.train, self._receiver(), self._ends.get("tx_position"),
                     context.seed, folder,
                 )
             )  # fmt: skip
