@@ -6,6 +6,7 @@ import csv
 import logging
 import os
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
@@ -96,10 +97,12 @@ def public_sets() -> dict[str, PublicSet]:
         place = row["repository"], row["revision"], row["path"]
         sources.setdefault(row["dataset"], []).append(Source(*place, int(row["bytes"]), row["sha256"]))
     about = yaml.safe_load(here.joinpath("sets.yaml").read_text(encoding="utf-8"))
-    return {
-        name: PublicSet(name, by_hand=facts.pop("from", None), **facts, sources=tuple(sources.get(name, ())))
-        for name, facts in about.items()
-    }
+    sets = {}
+    for name, facts in about.items():
+        pinned, match = sources.get(facts.pop("of", name), ()), facts.pop("match", "*")
+        chosen = tuple(source for source in pinned if fnmatchcase(source.path, match))
+        sets[name] = PublicSet(name, by_hand=facts.pop("from", None), **facts, sources=chosen)
+    return sets
 
 
 def fetched(choice: str, setting: str = "file") -> Path:
