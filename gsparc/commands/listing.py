@@ -55,6 +55,7 @@ COMMANDS = {
         Command("train", "train a method on a dataset and test it beside baselines"),
         Command("evaluate", "test a checkpoint again: ckpt=FILE"),
         Command("check", "what is in files of measurements, or what is wrong: FILE...", configured=False),
+        Command("data", "public sets of measurements: listed, or fetched by NAME", configured=False),
         Command("predict", "predictions at places of a table: ckpt=FILE places=FILE"),
         Command("simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
         Command("study", "variants of one model: kind=effects, positions or measurements"),

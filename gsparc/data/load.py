@@ -161,6 +161,8 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
         return settings
     accepted, name = {}, settings.get("name")
     for key, value in settings.items():
+        if value == "???" and key in known and known[key].default is not inspect.Parameter.empty:
+            continue
         if key in known or key.startswith("_"):
             accepted[key] = value
         elif value is not None:

@@ -18,6 +18,7 @@ from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems
 from gsparc.data.files import read_text
 from gsparc.data.own import interpret
+from gsparc.data.public.fetch import fetched, found
 from gsparc.data.raw import Raw
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements
 from gsparc.data.selection import Selection, select
@@ -29,7 +30,7 @@ class Campaign(DataModule):
     """A published campaign with stations, of which all rows or a part are used.
 
     Args:
-        file: what `raw` reads.
+        file: what `raw` reads; None: what `gsparc data` fetched of it.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
         stations, runs, min_rssi_db, max_rows, level_steps: see `gsparc.data.selection.Selection`.
         **settings: what `reader` takes besides.
@@ -41,7 +42,7 @@ class Campaign(DataModule):
 
     def __init__(
         self,
-        file: str | Path,
+        file: str | Path | None = None,
         name: str | None = None,
         batch_size: int = 16,
         stations: Sequence[str | int] | None = None,
@@ -52,6 +53,7 @@ class Campaign(DataModule):
         **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
+        file = fetched(self.choice) if file in (None, "", "???") else file
         self.file = str(file) if "://" in str(file) else Path(file)  # which would make one of two slashes
         self.settings = settings
         self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
@@ -100,11 +102,11 @@ class StandIn(Protocol):
 
 
 class Release(DataModule):
-    """A folder of a published release or, where none is named, what stands in for it.
+    """A folder of a published release: one that is named, the fetched one, or what stands in for it.
 
     Args:
-        root: the folder; absent: the stand-in.
-        stand_in: used, loudly, when no root is given.
+        root: the folder; None: what `gsparc data` fetched of it, where it did.
+        stand_in: used, loudly, when there is neither.
         name, batch_size: see `DataModule`.
         **settings: what `reader` takes besides.
     """
@@ -122,7 +124,8 @@ class Release(DataModule):
         **settings: Any,
     ) -> None:
         super().__init__(name or self.called.lower(), batch_size)
-        self.root, self.stand_in, self.settings = None if root is None else Path(root), stand_in, settings
+        self.root = found(self.called.lower()) if root is None else Path(root)
+        self.stand_in, self.settings = stand_in, settings
 
     def missing(self) -> str:
         """Why the release is not used, and how to get it."""

@@ -11,10 +11,12 @@ from typing import Any
 from gsparc.data.conventions import CONVENTIONS
 from gsparc.data.datasets.ble import raw_of_ble
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.datasets.newrf import raw_of_newrf
+from gsparc.data.datasets.newrf import SUFFIXES, raw_of_newrf
 from gsparc.data.datasets.powder import raw_of_powder
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
+from gsparc.data.datasets.techtile_power import raw_of_techtile_power
+from gsparc.data.datasets.wsr import raw_of_wsr
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.limits import choice, or_null, switch
 from gsparc.data.own import Reading, interpret
@@ -86,7 +88,11 @@ LOADERS: dict[str, Callable[[Path], Raw]] = {
     "powder": raw_of_powder,
     "ble": raw_of_ble,
     "newrf": raw_of_newrf,
+    "techtile_power": raw_of_techtile_power,
+    "wsr": raw_of_wsr,
 }
+# What lies in folders of releases.
+FOLDERS = {"ble": "cnf/tetam.dev", "techtile_power": "*_positions.npy", "wsr": "**/csi_rx_*.dat"}
 PLANE = 2  # coordinates of places in POWDER's files
 
 
@@ -98,7 +104,18 @@ def campaign_of(raw: Raw) -> str | None:
     if {"mobile_position", "rssi_db"} <= set(arrays):
         flat = arrays["mobile_position"].ndim == 2 and arrays["mobile_position"].shape[1] == PLANE
         return "powder" if flat else "ble"
+    if {"h2", "root_sign"} <= set(arrays):
+        return "wsr"
     return "newrf" if {"tx_pos", "rx_pos"} <= set(arrays) else None
+
+
+def release_of(path: Path) -> str | None:
+    """The choice of conf/dataset that reads a file or folder of its makers' release; None where none does."""
+    if path.suffix.lower() in NETCDF_SUFFIXES:
+        return "techtile"
+    if path.suffix.lower() in SUFFIXES:
+        return "newrf"
+    return next((name for name, inside in FOLDERS.items() if path.is_dir() and any(path.glob(inside))), None)
 
 
 def read_any(
@@ -107,7 +124,7 @@ def read_any(
     stations_file: str | Path | None = None,
     **settings: Any,
 ) -> Reading:
-    """Read a folder of the RFID release, a file of another campaign, one of one's own, or a table.
+    """Read a folder or file of a release, a file of another campaign, one of one's own, or a table.
 
     Args:
         path: folder or file.
@@ -118,6 +135,10 @@ def read_any(
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
+    release = release_of(path)
+    if release is not None:
+        reading = interpret(LOADERS[release](path), path)
+        return Reading(reading.data, (f"this is the release of dataset={release}", *reading.notes))
     if path.is_dir():
         if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
             raise DataError(
@@ -125,8 +146,6 @@ def read_any(
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
-    if path.suffix.lower() in NETCDF_SUFFIXES:  # NetCDF, as Techtile's release is
-        return interpret(LOADERS["techtile"](path), path)
     raw, notes = raw_of(path, columns, stations_file)
     campaign = campaign_of(raw)
     if campaign is not None:

@@ -361,7 +361,7 @@ def test_settings_of_the_configuration(tmp_path, name):
         ({"max_rows": 1}, "dataset.max_rows=1: a whole number of at least 2"),
         ({"stations": []}, "dataset.stations=[]: a list of names like [A,B]"),
         ({"min_rssi_db": "x"}, "dataset.min_rssi_db='x': a number"),
-        ({"file": None}, "dataset.file is not set; say dataset.file=FILE for dataset=ble"),
+        ({"file": None}, "dataset.file is not set; .*say dataset.file=FILE for dataset=ble"),
         ({"root": "x"}, "dataset.root is not a setting of dataset=ble; say dataset.file=..."),
     ],
 )
