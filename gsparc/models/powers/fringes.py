@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.models.powers.groups import Gain, compared, folds, groups
+from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
 from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out, left_out_group
@@ -29,7 +29,7 @@ from gsparc.training.time_budget import TimeBudget
 
 SOLUTIONS, FOLDS = 20, 5
 SIDES = 8  # squares along the longer side
-BEFORE, SPREAD = 0.5, 0.25  # mean and deviation of a prior on the share of the solutions
+BEFORE = 0.5  # mean of a prior on the share of the solutions
 TRIED = 10  # solutions after which it must pay
 PROBES = 10  # one row of so many is kept from all solutions
 MOST_ROWS = 3_000

@@ -63,10 +63,10 @@ def small_field(data: Measurements, two: bool = True) -> PowerField:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
-def test_without_gaussians_it_is_the_plain_process(share):
+def test_of_few_rows_it_is_the_plain_process(share):
     data = town(160)
     data = weak(data, share) if share else data
-    rows = np.arange(120)
+    rows = np.arange(90)
     field, notes = initialise(data, rows)
     field.condition(data, rows)
     plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
