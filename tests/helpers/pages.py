@@ -177,6 +177,7 @@ class Tiny:
             words |= {key: here[key] for key in words if key in here}
         if name == "evaluate":
             words.pop("dataset.root", None)
+            words |= {"dataset.file": self.data("city")} if "dataset.file" in words else {}
         if name == "compare":
             for key in [key for key in words if key.startswith("datasets.")] or ["datasets.rfid.root"]:
                 words[key] = self.data(ALIKE.get(key.split(".")[1], key.split(".")[1]))
