@@ -32,8 +32,8 @@ from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, 
 
 log = logging.getLogger(__name__)
 
-SAY_S = 2.0  # between lines about progress, at least
-LINES = 5  # about progress, more or less
+SAY_S = 5.0  # between lines about progress, at least
+LINES = 4  # about progress, more or less
 TRIES = 3  # of a piece whose process dies
 _Piece = TypeVar("_Piece")
 _Result = TypeVar("_Result")

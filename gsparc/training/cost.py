@@ -51,7 +51,7 @@ class Cost:
             unused = f" ({self.unused[name]:.1f} without weight)" if name in self.unused else ""
             parts += [f"{name} {spent:.1f} s{unused}"] if spent >= LEAST_S else []
         if limited_by is None:
-            more = "more seconds would change nothing"
+            more = "no clock ended it: steps and searches are counted"
         elif self.gain is None:
             more = "seconds ended it; what more would bring is not known"
         else:

@@ -11,7 +11,7 @@ def test_the_line_names_stages_what_had_no_weight_and_the_gain():
     assert said.startswith("waves 3.0 s (3.0 without weight), sources 6.0 s; 33% of 9.0 s without weight; ")
     assert "took 20% off the held-out error" in said, said
     assert "weighing" not in said, "too short to be named"
-    assert cost.described(None).endswith("more seconds would change nothing")
+    assert cost.described(None).endswith("no clock ended it: steps and searches are counted")
 
 
 def test_a_gain_that_is_not_known_is_not_promised():
