@@ -58,7 +58,7 @@ wheel: setup ## a wheel that needs no compiler, into dist/, marked for the oldes
 
 $(VENV)/.sionna: $(VENV)/.installed
 	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna osmnx shapely trimesh mapbox_earcut
-	$(RUN) -m gsparc llvm
+	$(RUN) -m gsparc.simulate.llvm
 	@touch $@
 
 demo: setup ## train on a small simulated site, print the table, draw the spectra (half a minute)

@@ -177,6 +177,7 @@ class Tiny:
             words |= {key: here[key] for key in words if key in here}
         if name == "evaluate":
             words.pop("dataset.root", None)
+            words |= {"dataset.file": self.data("city")} if "dataset.file" in words else {}
         if name == "compare":
             table = words.get("experiment", "results/rfid").removeprefix("results/")
             sets = {"ceiling": ("exp005", "exp006"), "halls": ("hall_1", "hall_2")}.get(table, (table,))
