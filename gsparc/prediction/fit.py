@@ -80,13 +80,15 @@ def fit(
 def _of_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:
     """Arrays of the schema with powers in a unit: watts, or decibels as they are."""
     unknown = unit in ("dB", LINEAR)  # what they refer to
-    given = PowerUnit.of(unit, "dB" if unknown else "dBW")
+    given = PowerUnit.of(str(unit), "dB" if unknown else "dBW")
     if given.decibels:
         return Raw({**arrays, "rssi_db": powers}, {"level_unit": given.name})
     if "noise_variance" in arrays:
         arrays = {**arrays, "noise_variance": arrays["noise_variance"] / given.scale**2}
+    if powers.dtype.kind in "iuf":  # others are refused by name
+        powers = powers / given.scale
     about = {"unit": given.name, "level_unit": "dB" if unknown else "dBW"}
-    return Raw({**arrays, "rssi": powers / given.scale}, about)
+    return Raw({**arrays, "rssi": powers}, about)
 
 
 def _learned_from(data: Measurements, share: float, seed: int) -> Fold:
