@@ -29,7 +29,7 @@ FEWEST = {"csi": 32, "spectrum": 50}  # rows that tell
 COHERENT = 8  # antennas, tones or both with one factor: fewer fit anything
 ANY = {"csi": 0.01, "spectrum": 0.003}  # share that no path explains
 FIT = {"csi": 0.12, "spectrum": 0.8}  # of the median row, at least of a rival; a worse one says nothing
-FIXED = 0.7  # the same of one delay for all rows, which reflections alone fit, too
+ONE_DELAY, CLEAR = 0.7, 0.15  # the same of one delay for all rows, and its gain: reflections fit one, too
 GOOD = {"csi": 0.5, "spectrum": 0.95}  # of what is declared: with it no two conventions are tried together
 HALVINGS = 3  # of the places, into groups
 DROPPED = 2  # groups that speak most for a rival: the others must do so, too
@@ -132,17 +132,22 @@ def _rivals(signals: Signals, few: Signals, labels: np.ndarray) -> list[str]:
         with suppress(ValueError):  # a grid turned beyond a pole
             rivals[chosen] = _score(mended(signals, chosen), labels)
 
+    def may_be(chosen: tuple[str, ...], rival: Score) -> bool:
+        gain = float((rival.rows - declared.rows).mean())
+        clear = "delays_removed" not in chosen or (rival.fit > ONE_DELAY and gain > CLEAR)
+        return clear and rival.fit > FIT[kind]
+
     def wins(rival: Score, over: Score) -> bool:
         gain = rival.rows - over.rows
         of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
         return float(of_group[:-DROPPED].sum()) + (rival.phases - over.phases) / 2 > RATIO
 
+    rivals = {chosen: one for chosen, one in rivals.items() if may_be(chosen, one)}
     best: tuple[str, ...] = ()
     for count in (1, 2):
         fit = {chosen: one.total for chosen, one in rivals.items() if len(chosen) == count}
         first = max(fit, key=lambda chosen: fit[chosen], default=())
-        least = FIXED if "delays_removed" in first else FIT[kind]
-        if first and rivals[first].fit > least and wins(rivals[first], rivals[best] if best else declared):
+        if first and wins(rivals[first], rivals[best] if best else declared):
             best = first
     if not best:
         return []
