@@ -116,7 +116,7 @@ def unpickled_frame(path: Path) -> dict[str, np.ndarray]:
     try:
         blocks, (heads, _) = frame.state["_mgr"].made_with[:2]
         names = heads.made_with[1]["data"]
-        columns = {}
+        columns: dict[str, np.ndarray] = {}
         for values, place, *_ in (block.made_with for block in blocks):
             columns |= dict(zip(names[place], np.asarray(values), strict=True))
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
