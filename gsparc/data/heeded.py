@@ -75,7 +75,8 @@ def recording(reads: Reads) -> Iterator[None]:
 
 
 def _noting(kind: type, options: Sequence[Option]) -> Callable[[Any, str], Any]:
-    get, names = kind.__getattribute__, {option.attribute for option in options}
+    get: Any = kind.__getattribute__
+    names = {option.attribute for option in options}
 
     def noted(self: Any, name: str) -> Any:
         value = get(self, name)

@@ -140,10 +140,9 @@ class GaussianModel(nn.Module):
             self.confidence = Confidence(settings.confidence, of_position)
         static = receiver.position if receiver is not None else transmitter
         apart = None if static is None else float((static.float() - box.mean(0)).norm())
-        falls = settings.attenuation.inverse_distance
-        law = settings.attenuation if falls or settings.emission.log_distance else AttenuationSettings()
+        law = settings.attenuation
         self.d_ref = law.d_ref or (apart if apart and apart > 0.1 else 1.0)
-        law = law if falls else AttenuationSettings()
+        law = law if law.inverse_distance else AttenuationSettings()
         self.log_gain = nn.Parameter(torch.tensor(math.log(law.gain)), requires_grad=law.learn_gain)
         self.response = self._response(*(shape or (1, 1)), transmitter)
 
