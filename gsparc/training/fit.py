@@ -171,8 +171,7 @@ def run_stage(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    pace = module.pace
-    callbacks = [Budget(pace, budget), *watch, *context.callbacks()]
+    callbacks = [Budget(budget), *watch, *context.callbacks()]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -188,7 +187,7 @@ def run_stage(
     }
     if not len(fold.val):
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
-    options["max_steps"] = module.total_steps if pace is None else -1
+    options["max_steps"] = module.total_steps
     options["max_epochs"] = -1
     processes = Processes.named(make.keywords.get("strategy"))
     if processes is not None:
