@@ -62,7 +62,7 @@ class Densify(Checked, L.Callback):
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
         if module.rendered is None or module.rendered.raster is None:
             return
-        if module.position >= in_steps(self.stop, module.total_steps):
+        if module.global_step >= in_steps(self.stop, module.total_steps):
             return
         raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
@@ -88,8 +88,8 @@ class Densify(Checked, L.Callback):
         """Edit the field when the schedule says so, after the validation of the step before."""
         if not self.statistics or self._ended:
             return
-        step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
-        if step is None or not due(step, module.global_step, *when, module.total_steps):
+        step = module.global_step
+        if not due(step, self.start, self.stop, self.interval, module.total_steps):
             return
         model: GaussianModel = module.model
         with torch.no_grad():

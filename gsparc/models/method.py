@@ -135,10 +135,6 @@ class Method(ABC):
         """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
         return "each", ""
 
-    def usual_s(self, site: Site) -> float | None:
-        """Seconds of all stations together where `FitContext.budget_s` says nothing; None: no end [s]."""
-        return None
-
     def facts(self) -> dict[str, float | int | str | None]:
         """What `summary.json` says of a fitted model, None where it means nothing here."""
         return {

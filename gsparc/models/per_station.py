@@ -8,7 +8,6 @@ moving, so that its query is (tx, rx), where the method can do that.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import reduce
@@ -38,7 +37,6 @@ from gsparc.training.time_budget import Spent, less_repeatable
 log = logging.getLogger(__name__)
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
-LEAST_SHARE = 0.5  # of an even part of the seconds, which every station has though earlier ones took more
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
@@ -116,7 +114,7 @@ class PerStation(Method):
         return ", ".join(dict.fromkeys(effects)) if effects else self.wrapped.effects
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit every station that is asked for, or all together; seconds are shared.
+        """Fit every station that is asked for, or all together.
 
         Together, a method that shares stations learns them as they are, any other as if both ends moved.
         What an interrupted run finished is taken from its folder (`FitContext.resume`).
@@ -125,9 +123,8 @@ class PerStation(Method):
             ValueError: a station of the test rows has too few training rows, or all are learned together, and
                 the method cannot take both ends for moving.
         """
-        whole = self.wrapped.usual_s(data.site) if context.budget_s is None else context.budget_s
-        budget = context.time_budget(math.inf if whole is None else whole)
-        numbers = self._numbers(data, fold, replace(context, budget_s=whole))
+        budget = context.time_budget()
+        numbers = self._numbers(data, fold, context)
         self.site, notes = data.site, []
         left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
         resumable = self.wrapped.resumable and context.run_dir != Path()
@@ -137,13 +134,12 @@ class PerStation(Method):
         local = not elsewhere()
 
         def fitted(turn: int) -> tuple[Method, FitReport]:
-            number, share = numbers[turn], None
+            number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
-            if whole is not None:  # what earlier ones left, where these are known
-                even = (whole - budget.spent) / (len(numbers) - turn) if local else whole / len(numbers)
-                share = max(even, LEAST_SHARE * whole / len(numbers))
             resume = None if left is None else left / folder
-            own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
+            own = context.within(
+                folder, budget_s=budget.left_s if local else context.budget_s, datamodule=None, resume=resume
+            )
             if len(numbers) > 1:
                 log.info("station %d of %d: %s", turn + 1, len(numbers), self._name_of(number))
             rows, part = self._part(data, number)

@@ -30,7 +30,7 @@ from gsparc.models.fields import restored, stored
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.mixture import solutions
-from gsparc.models.mixture.closed_forms import DEFAULT_BUDGET_S, solve, with_cost
+from gsparc.models.mixture.closed_forms import solve, with_cost
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Blended, averaged, contributions, knobs, mean_alone, reduced
@@ -44,11 +44,9 @@ from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.module import GaussianModule
-from gsparc.training.time_budget import TimeBudget, less_repeatable
+from gsparc.training.time_budget import less_repeatable
 
 log = logging.getLogger(__name__)
-
-MEASURED_SHARE = 0.4  # of the seconds, for the fit that positions with errors are refined by
 
 
 class PlannedField(LearnedField):
@@ -135,16 +133,15 @@ class PlannedField(LearnedField):
     def _fit_refined(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext, std: np.ndarray
     ) -> FitReport:
-        """First where rows were measured, then, in the rest of the seconds, where they rather were."""
-        seconds = DEFAULT_BUDGET_S if context.budget_s is None else context.budget_s
-        budget = context.time_budget(seconds)
-        first = replace(context, run_dir=Path(), resume=None, budget_s=MEASURED_SHARE * seconds)
+        """First where rows were measured, then where they rather were."""
+        budget = context.time_budget()
+        first = replace(context, run_dir=Path(), resume=None)
         limited = self._fit_conditional(chosen, data, fold, first).limited_by
         assert self.field is not None
         rows, by, note = refined(self.field, self.runs.aligned(data), std)
         log.info("%s", note)
         spent = budget.counted.wall
-        rest = replace(context, budget_s=max(seconds - budget.spent, (1 - MEASURED_SHARE) * seconds / 2))
+        rest = replace(context, budget_s=budget.left_s)
         report = self._fit_conditional(chosen, displaced(data, rows, by), fold, rest)
         limited = less_repeatable(limited, report.limited_by)
         cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
@@ -193,12 +190,9 @@ class PlannedField(LearnedField):
         return not self._alone
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
-        self._reserve_s = 0.0
         if self.plan is not None and self.plan.plain:
-            watch = TimeBudget()
             self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
             self.explained = self.explained if explained is None else explained
-            self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
 
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
@@ -218,10 +212,6 @@ class PlannedField(LearnedField):
         if not self.shares(data.site) or self.init.name == "scene":
             return "each", ""
         return stations.best(data, fold, context)
-
-    def usual_s(self, site: Site) -> float | None:
-        """See `Method.usual_s`; steps, not seconds, are counted where Gaussians are rendered."""
-        return None if site.kind == "spectrum" else DEFAULT_BUDGET_S
 
     # -- answering ---------------------------------------------------------------------------------
 

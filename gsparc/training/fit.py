@@ -193,8 +193,7 @@ def run_stage(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    pace = module.pace
-    callbacks = [Budget(pace, budget), *watch, *_told(context.callbacks(), len(fold.val))]
+    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val))]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -210,7 +209,7 @@ def run_stage(
     }
     if not len(fold.val):
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
-    options["max_steps"] = module.total_steps if pace is None else -1
+    options["max_steps"] = module.total_steps
     options["max_epochs"] = -1
     heeded.count("trainer", "callbacks", "dataset.batch_size")
     processes = Processes.named(make.keywords.get("strategy"))

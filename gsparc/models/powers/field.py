@@ -36,8 +36,6 @@ from gsparc.processes.trend import Trend, Walls, trend_of
 from gsparc.training.time_budget import TimeBudget
 
 QUERIES = 512  # at a time: memory
-CHOOSING = 0.3  # of the seconds, for the settings of the process
-CHOOSING_ALONE = 0.8  # the same where no waves are sought after it
 
 
 class PowerField(ConditionalField):
@@ -208,7 +206,7 @@ def initialise(
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
     waves = walls is None and fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength)
-    pace = haste(budget, CHOOSING if waves else CHOOSING_ALONE, len(rows))
+    pace = haste(budget)
     if walls is not None:
         law, notes = law_of(seen, data.site)
         trend = replace(trend_of_rows(seen, law), walls=walls)
