@@ -1,9 +1,9 @@
 """The field of received powers: what the path loses in known walls, and a process of the rest.
 
 In decibels: a constant or a distance law, uncertain; a loss for each known wall on the straight path between
-the ends; one or two Matern-3/2 of place; noise. Of many rows the mean of such processes, and of kriging's, is
-taken by what squares left out say. Where a wavelength is sampled powers interfere: there coherent waves stand
-beside one process.
+the ends; one or two Matern-3/2 of place; noise. Of many rows the mean of such processes is taken, by what
+squares left out say. Where a wavelength is sampled powers interfere: there coherent waves stand beside one
+process.
 """
 
 from __future__ import annotations

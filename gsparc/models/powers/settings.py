@@ -17,12 +17,11 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
-from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.haste import CHOSEN_ON, UNHURRIED, Haste
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SPREAD, groups
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
-from gsparc.processes.kernel import NOISE_SPAN, Kernel, apart, bounds_of
+from gsparc.processes.kernel import Kernel, apart, bounds_of
 from gsparc.processes.left_out import groups_of, left_out
 from gsparc.processes.nearest import Values, settings_of
 from gsparc.processes.posterior import Exact
@@ -44,9 +43,6 @@ SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SIDES = (10, 5)  # squares along the longer side that are left out
-# exp(-d / r) is nearly the sum of these shares of Matern-3/2 of these lengths, in r: within .02
-EXPONENTIAL = ((0.217, 0.309), (1.13, 0.691))
-NUGGET = 1e-3  # least, of the sill: a variogram's may be none
 LOOKS, SETTLED = 40, 5e-6
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-5
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
@@ -113,31 +109,25 @@ def candidates(rows: Rows, site: Site, seed: int, haste: Haste) -> list[Candidat
 def mixture(
     rows: Rows, found: list[Candidate], seed: int, haste: Haste
 ) -> tuple[list[tuple[float, Prior]], tuple[str, ...]]:
-    """Candidates, and ordinary kriging as a process, with their shares in a mean; and what must be said.
+    """Candidates with their shares in a mean, the largest first, and what must be said of them.
 
-    Shares have the least squared error at squares of floor left out, with a prior on equal ones. One
-    candidate stays alone.
+    Shares have the least squared error at squares of floor left out, with a prior on equal ones.
     """
-    priors = [Prior(one.kernel, one.trend) for one in found]
     if len(found) == 1:
-        return [(1.0, priors[0])], (found[0].description, *found[0].notes)
-    priors.append(_kriging(rows.loud, seed))
+        return [(1.0, Prior(found[0].kernel, found[0].trend))], (found[0].description, *found[0].notes)
     part = rows.drawn(haste.rows, seed)
-    posteriors = [conditioned(part, one.trend, one.kernel, seed)[0].posterior for one in priors]  # type: ignore[arg-type]
-    gram, count = np.zeros((len(priors),) * 2), 0.0
+    posteriors = [conditioned(part, one.trend, one.kernel, seed)[0].posterior for one in found]
+    gram, count = np.zeros((len(found),) * 2), 0.0
     for sides in SIDES:
-        group = groups(part.loud.places, sides)
         errors = np.stack([_left_out(one, sides) for one in posteriors])
-        gram += errors @ errors.T / len(group) / len(SIDES)
-        count += (group.max() + 1) / len(SIDES)
-    share = best_weights(gram + gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(priors)))
-    share = np.where(share < UNUSED, 0.0, share)
-    share /= share.sum()
-    names = [*(one.description for one in found), "kriging's variogram"]
-    order = [int(k) for k in np.argsort(-share, kind="stable") if share[k]]
-    notes = [note for one in found for note in one.notes]
-    said = [f"{share[k]:.0%} of {names[k]}" for k in order]
-    return [(float(share[k]), priors[k]) for k in order], (*said, *dict.fromkeys(notes))
+        gram += errors @ errors.T / errors.shape[1] / len(SIDES)
+        count += (groups(part.loud.places, sides).max() + 1) / len(SIDES)
+    share = best_weights(gram + gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found)))
+    share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
+    kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
+    said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
+    notes = dict.fromkeys(note for _, one in kept for note in one.notes)
+    return [(weight, Prior(one.kernel, one.trend)) for weight, one in kept], (*said, *notes)
 
 
 def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
@@ -146,14 +136,6 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
     group = groups_of(groups(posterior.rows.numpy(), sides))
     residual, _ = left_out(posterior.factor.inverse, posterior.weights, group)
     return residual[posterior.extra == 0, 0].numpy()
-
-
-def _kriging(rows: Rows, seed: int) -> Prior:
-    """The process that ordinary kriging takes for granted, by the variogram of rows that were heard."""
-    law = fit_variogram(rows.places, rows.decibels[:, None], seed)
-    lengths, shares = zip(*((length * law.range, share) for length, share in EXPONENTIAL), strict=True)
-    sill = max(law.sill, law.total / NOISE_SPAN[1])
-    return Prior(Kernel(lengths, shares, max(law.nugget / sill, NUGGET), sill), trend_of_rows(rows, None))
 
 
 def chosen_among(

@@ -72,7 +72,7 @@ def test_one_process_of_neighbours_was_trusted_in_squares_that_nobody_walked():
     plain.fit(data, Fold(known, known[:0], fold.test), FitContext())
     both = [fitted(data, known)(batch.tx, batch.rx).mean, plain.predict(batch.tx, batch.rx).mean]
     own, alone = ((db(one) - db(batch.target)).square().mean().sqrt() for one in both)
-    assert own < 0.95 * alone, (own, alone)
+    assert own < 0.96 * alone, (own, alone)
 
 
 @pytest.mark.parametrize("silent", [0.0, 0.25])
