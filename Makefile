@@ -17,7 +17,7 @@ DIST ?= dist
 # Its own objects, made anew: those of another compiler would be taken as they are.
 WHEEL ?= -Cbuild-dir=build/wheel/objects
 GRID ?=
-.PHONY: browser grid rare results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
+.PHONY: browser grid oracle rare results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -58,7 +58,7 @@ wheel: setup ## a wheel that needs no compiler, into dist/, marked for the oldes
 
 $(VENV)/.sionna: $(VENV)/.installed
 	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna osmnx shapely trimesh mapbox_earcut
-	$(RUN) -m gsparc llvm
+	$(RUN) -m gsparc.simulate.llvm
 	@touch $@
 
 demo: setup ## train on a small simulated site, print the table, draw the spectra (half a minute)
@@ -70,8 +70,8 @@ test: setup ## fast tests (under 6 minutes on two idle cores)
 browser: ## Debian's chromium for the test of the report, where packages can be reached
 	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || (apt-get update -qq && apt-get install -y -qq chromium chromium-driver) >/dev/null 2>&1 || echo "no chromium here: the test of the report in a browser is skipped"
 
-results: setup ## results table of docs/results.md, measured anew (RFID=folder of the release; about five minutes)
-	$(RUN) train.py -m experiment=results dataset.root=$(RFID) hydra.sweep.dir=outputs/results
+results: setup ## results table of docs/results.md, measured anew (of gsparc data rfid-200, or of RFID=DIR; about five minutes)
+	$(RUN) train.py -m experiment=results $(if $(RFID),dataset.root=$(RFID),dataset.listed=160) hydra.sweep.dir=outputs/results
 	$(RUN) -m gsparc report outputs/results readme=docs/results.md
 
 test-slow: setup sionna browser $(VENV)/.docs ## slow tests: whole training runs, kills, sanitizers, ray tracing
@@ -85,6 +85,9 @@ hard-cases: setup ## every hard case on every backend, and the tables of docs/ha
 
 grid: setup ## every kind of data with defaults beside the plain methods (two hours, resumable; GRID=--seed 7: others)
 	$(RUN) tests/grid/sweep.py build/grid/results$(subst $() ,,$(GRID)).jsonl $(GRID)
+
+oracle: setup ## fixed problems fitted and stored anew (tests/oracle/stored), with what moved, old -> new
+	OMP_NUM_THREADS=1 $(RUN) tests/oracle/stored_fits.py
 
 soak: setup ## half an hour of loads and queries from four threads, with memory watched
 	$(RUN) -m pytest tests/hard_cases/test_soak.py --soak-minutes 30 --timeout 2400 -s

@@ -8,6 +8,7 @@ from typing import Any
 import lightning.pytorch as L
 
 from gsparc.data.limits import Checked, setting
+from gsparc.training.fit import stands
 from gsparc.training.schedule import INTERVAL, in_steps
 
 
@@ -23,6 +24,9 @@ class Checkpoint(Checked, L.callbacks.Checkpoint):  # Lightning calls it after a
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write when the schedule says so."""
-        step = module.schedule_step(self.interval)
-        if step and step % in_steps(self.interval, module.total_steps) == 0 and step < module.total_steps:
+        step = module.global_step
+        due = step and step % in_steps(self.interval, module.total_steps) == 0 and step < module.total_steps
+        if due and stands(trainer):
             trainer.save_checkpoint(module.run_dir / "last.ckpt")
+
+    on_validation_end = on_train_batch_end  # type: ignore[assignment]

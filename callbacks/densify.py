@@ -62,7 +62,7 @@ class Densify(Checked, L.Callback):
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
         if module.rendered is None or module.rendered.raster is None:
             return
-        if module.position >= in_steps(self.stop, module.total_steps):
+        if module.global_step >= in_steps(self.stop, module.total_steps):
             return
         raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
@@ -84,12 +84,12 @@ class Densify(Checked, L.Callback):
             radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
             self.statistics["radius"] = largest(torch.maximum(self.statistics["radius"], radius.float()))
 
-    def on_train_batch_start(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any = None, *unused: Any) -> None:
         """Edit the field when the schedule says so, after the validation of the step before."""
-        step, when = module.schedule_step(self.interval), (self.start, self.stop, self.interval)
-        if step is None or not due(step, module.global_step, *when, module.total_steps):
-            return
         if not self.statistics or self._ended:
+            return
+        step = module.global_step
+        if not due(step, self.start, self.stop, self.interval, module.total_steps):
             return
         model: GaussianModel = module.model
         with torch.no_grad():
@@ -97,10 +97,11 @@ class Densify(Checked, L.Callback):
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
             planned = self.plan(model, draws, in_place=module.solved)
             before = len(model.gaussians)
-            solved = solved_again(model, planned, module.batch) if module.solved else None
-            if solved is not None and solved.change > MOST_CHANGE:
+            solved = solved_again(model, planned, batch) if module.solved else None
+            change = 0.0 if solved is None else float(total(solved.change)) ** 0.5
+            if change > MOST_CHANGE:
                 text = "step %d: no Gaussians added from here on: spectra would change by %.1e, more than %g"
-                log.info(text, step, solved.change, MOST_CHANGE)
+                log.info(text, step, change, MOST_CHANGE)
                 self._ended = True
                 return
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])

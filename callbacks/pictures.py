@@ -31,10 +31,9 @@ class Pictures(Checked, L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Draw when it is time."""
         step = trainer.global_step
-        if not trainer.is_global_zero:
+        if not trainer.is_global_zero or module.site.kind != "spectrum":
             return
-        every = in_steps(self.every, module.total_steps)
-        if (step % every and step != trainer.max_steps) or module.site.kind != "spectrum":
+        if step % in_steps(self.every, module.total_steps) and step != trainer.max_steps:
             return
         data = trainer.datamodule  # type: ignore[attr-defined]
         candidates = data.fold.val

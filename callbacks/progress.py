@@ -58,6 +58,5 @@ class StepProgress(L.Callback):
 
 
 def _progress(trainer: L.Trainer, module: Any) -> tuple[int, int]:
-    """Steps done and in all; of the stretched schedule when seconds decide."""
-    pace = module.pace
-    return (trainer.global_step, trainer.max_steps) if pace is None else (pace.step, pace.total)
+    """Steps done and in all."""
+    return trainer.global_step, trainer.max_steps

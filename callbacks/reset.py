@@ -46,11 +46,11 @@ class OpacityReset(Checked, L.Callback):
 
     def on_train_batch_start(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Reset when the schedule says so, after the validation of the step before."""
-        step = module.schedule_step(self.interval)
-        if step is None or module.solved or module.total_steps < self.least_steps:
+        step = module.global_step
+        if module.solved or module.total_steps < self.least_steps:
             return
         interval = in_steps(self.interval, module.total_steps)
-        if not due(step, module.global_step, 1, self.stop, self.interval, module.total_steps):
+        if not due(step, 1, self.stop, self.interval, module.total_steps):
             return
         if step + interval > module.total_steps:
             left = module.total_steps - step

@@ -10,9 +10,10 @@ from typing import Any
 
 from rich.console import Console
 
-from gsparc.data.errors import Caution, DataError
+from gsparc.data.errors import Caution, DataError, gathered
 
 SETTINGS = ("dataset.stations_file=", "dataset.columns.", "dataset.not_heard=", "dataset.absent=")
+SWITCH = re.compile(r"dataset\.(\w+)=(true|false)", re.IGNORECASE)
 
 
 def check(
@@ -31,8 +32,9 @@ def check(
         draw: PNG file for a map; None draws none.
     """
     # Here: they bring torch, which --help does not need.
+    from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
-    from gsparc.data.checks.plausibility import gathered, link_levels, plausibility_warnings, steps_of
+    from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
 
@@ -46,7 +48,7 @@ def check(
     levels = link_levels(reading.data)
     steps = [] if levels is None else steps_of(levels)
     warnings: list[str] = [note for note in reading.notes if isinstance(note, Caution)]
-    warnings += [] if levels is None else plausibility_warnings(levels, steps)
+    warnings += convention_warnings(reading.data) if levels is None else plausibility_warnings(levels, steps)
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
     for topic, sentence in [*topics, *(("warning", warning) for warning in gathered(warnings))]:
@@ -88,6 +90,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_intermixed_args(arguments)
     columns = dict(text.partition("=")[::2] for text in args.column)
     settings: dict[str, Any] = {}
+    for said in filter(None, map(SWITCH.fullmatch, args.path[:])):
+        args.path.remove(said[0])
+        settings[said[1]] = said[2].lower() == "true"
     for text in [text for text in args.path if text.startswith(SETTINGS)]:  # as refusals and notes say them
         name, _, value = text.removeprefix("dataset.").partition("=")
         args.path.remove(text)

@@ -1,4 +1,4 @@
-"""`gsparc export ckpt=FILE to=c`: a trained model for programs without Python and for emulators."""
+"""`gsparc export ckpt=FILE to=c`: a trained model for programs without Python and link simulators."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import POSITIVE, SettingError, choice, or_null, whole
 from gsparc.data.query_places import read_query_places, read_times
-from gsparc.prediction.along import deepmimo, emulators
+from gsparc.prediction.along import deepmimo
 from gsparc.prediction.along.impulses import write_impulses
 from gsparc.prediction.along.taps import Trajectory
 from gsparc.prediction.compiled.blob import write
@@ -26,9 +26,8 @@ from gsparc.prediction.predictor import Predictor
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
 OTHERS = shutil.ignore_patterns("cuda", "projection", "bindings.cpp")
-LIMITS = {name: whole(1) for name in ("symbols", "places", "taps", "antennas")}
-LIMITS |= {name: or_null(POSITIVE) for name in ("rate_hz", "snapshot_s", "spacing_khz")}
-LIMITS |= {"to": choice("c", "cir", "sionna", "deepmimo"), "file": choice("npz", "h5")}
+LIMITS = {name: whole(1) for name in ("places", "taps", "antennas")}
+LIMITS |= {"rate_hz": or_null(POSITIVE), "to": choice("c", "taps", "deepmimo")}
 Facts = tuple[dict[str, Any], list[str]]
 
 
@@ -37,12 +36,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     RunSettings.of(config)
     for name, limit in LIMITS.items():
         limit.check(name, config[name])
-    if config.check is not None:
-        read = emulators.check(Path(config.check), config.symbols)
-        if read.refused:
-            raise SettingError(f"check={config.check}: {read.holds}, but {'; '.join(read.refused)}")
-        lines = [f"{config.check}: {read.holds}; a reader takes all of it"]
-        return finish(run_directory(), {"check/holds": read.holds}, lines=lines, before="summary ")
     path = Path(config.ckpt)
     out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)
     if out.exists():
@@ -80,17 +73,14 @@ def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
     place, time_s = _places(predictor, config), read_times(config.table)
     if time_s is None:
         raise SettingError(f"table={config.table}: no column time_s [s]")
-    facts = write_impulses(predictor, Trajectory(time_s, place), plain(config), folder, config.to == "cir")
-    taps, rate_hz = facts.pop("cir/taps"), facts.pop("cir/rate_hz")
-    lines = [
-        f"{taps} taps at {rate_hz / 1e6:g} MHz leave {facts['cir/residual_db']:.1f} dB of the channels "
-        f"({facts['cir/worst_db']:.1f} at worst) in {out}/cir.{config.file}; first "
-        f"{facts['cir/early_s'] * 1e9:.1f} ns"
-    ]
-    if "cir/symbols" in facts:
-        symbols, left = facts["cir/symbols"], facts["cir/vrtsim_db"]
-        lines.append(f"{symbols} OFDM symbols in sionna-rk; vrtsim with {left:.1f} dB")
-    return facts, lines
+    facts = write_impulses(predictor, Trajectory(time_s, place), plain(config), folder / "taps.npz")
+    taps, rate_hz = facts.pop("taps/count"), facts.pop("taps/rate_hz")
+    line = (
+        f"{taps} taps at {rate_hz / 1e6:g} MHz leave {facts['taps/residual_db']:.1f} dB of the channels "
+        f"({facts['taps/worst_db']:.1f} at worst) in {out}/taps.npz; "
+        f"first {facts['taps/early_s'] * 1e9:.1f} ns"
+    )
+    return facts, [line]
 
 
 def _scenario(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
@@ -100,4 +90,4 @@ def _scenario(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
     return facts, [f"{len(place)} places, at most {paths} paths; beyond these {left:.2g} of the power: {out}"]
 
 
-WRITERS = {"c": _library, "cir": _impulses, "sionna": _impulses, "deepmimo": _scenario}
+WRITERS = {"c": _library, "taps": _impulses, "deepmimo": _scenario}

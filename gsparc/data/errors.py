@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import re
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +23,28 @@ def some(names: Sequence[Any], count: int = 5) -> str:
     """The first of several names, and how many more there are."""
     more = f" and {len(names) - count} more" if len(names) > count else ""
     return ", ".join(map(str, names[:count])) + more
+
+
+MOST_OF_A_KIND = 3
+# What differs between warnings of a kind: quotes, names of stations and rows, paths, numbers.
+NAMES = r"'[^']*'|\b(?:stations?|line|row) [^:, ]+(?:, )?|\S*[/\d]\S*|[^a-z ]"
+
+
+def kind_of(warning: str) -> str:
+    """What warnings of one kind share: their first words, without names and numbers."""
+    return " ".join(re.sub(NAMES, " ", warning).split())[:30]
+
+
+def gathered(warnings: Sequence[str]) -> list[str]:
+    """Warnings of which more than a few of one kind are one, counted."""
+    kinds: dict[str, list[str]] = defaultdict(list)
+    for text in warnings:
+        kinds[kind_of(text)].append(text)
+    gathered: list[str] = []
+    for texts in kinds.values():
+        more = f"{texts[0]} (and {len(texts) - 1} more warnings of this kind)"
+        gathered += texts if len(texts) <= MOST_OF_A_KIND else [more]
+    return gathered
 
 
 def lines_of(rows: Sequence[str], count: int = 5) -> str:

@@ -26,12 +26,14 @@ import torch
 from joblib.externals.loky.process_executor import BrokenProcessPool
 from threadpoolctl import threadpool_limits
 
+from gsparc.data import heeded
 from gsparc.data.errors import reason
 from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, whole
 
 log = logging.getLogger(__name__)
 
-SAY_S = 2.0  # between lines about progress
+SAY_S = 5.0  # between lines about progress, at least
+LINES = 4  # about progress, more or less
 TRIES = 3  # of a piece whose process dies
 _Piece = TypeVar("_Piece")
 _Result = TypeVar("_Result")
@@ -100,18 +102,19 @@ def each(
         here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
         results = _jobs(here, threads, "threading")
     else:
-        blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
+        blob = cloudpickle.dumps((heeded.carried(work), os.getcwd(), torch.get_num_threads()))
         results = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
     with closing(results):  # what has begun is cancelled
         for count, (number, result) in enumerate(results, 1):
             if isinstance(result, Exception):
                 raise result
             ended += cost(pieces[number])
-            if what and count < len(pieces) and time.monotonic() - logged > SAY_S:
-                logged = time.monotonic()
-                left = (logged - began) * (total / max(ended, 1e-9) - 1)
+            now = time.monotonic()
+            whole = (now - began) * total / max(ended, 1e-9)
+            if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
+                logged, left = now, whole - (now - began)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
-            yield number, result
+            yield number, heeded.brought(result) if elsewhere() else result
 
 
 @lru_cache(maxsize=1)

@@ -149,6 +149,8 @@ def _parameters(kind: Any) -> dict[str, inspect.Parameter]:
         if hasattr(kind, "reader"):
             _, *settings = inspect.signature(kind.reader).parameters.values()  # without the file or folder
             more |= {p.name: p for p in settings}
+        for name in getattr(kind, "switches", ()):  # which the reader takes by keyword
+            more[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None)
     return {name: p for name, p in {**more, **known}.items() if not more or p.kind is not p.VAR_KEYWORD}
 
 
@@ -159,6 +161,8 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
         return settings
     accepted, name = {}, settings.get("name")
     for key, value in settings.items():
+        if value == "???" and key in known and known[key].default is not inspect.Parameter.empty:
+            continue
         if key in known or key.startswith("_"):
             accepted[key] = value
         elif value is not None:

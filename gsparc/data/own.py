@@ -17,6 +17,7 @@ import numpy as np
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
 from gsparc.data.checks.outliers import far_ends, peaks, too_strong
+from gsparc.data.conventions import Signals, mended
 from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
@@ -134,7 +135,9 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     given_mask = check.mask(raw.arrays[measured].shape, links.censored)
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
-    grid = check.grid(*values.shape[1:]) if kind == "spectrum" else None
+    named = str(raw.attributes.get("conventions", "")).split()
+    height, width = values.shape[:0:-1] if "transposed" in named else values.shape[-2:]
+    grid = check.grid(height, width) if kind == "spectrum" else None
     array = _array(check, values.shape[1] if kind == "csi" else None)
     noise = _not_negative(check, "noise_variance", rows)
     if noise is not None and measured == "rssi_db":
@@ -155,6 +158,12 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
+    if named and kind == "rssi":
+        check.refuse("conventions", f"{', '.join(named)}: of channels and spectra, not of powers")
+    elif named:
+        signals = Signals(values, mask, tx, rx, rotation, frequency if kind == "csi" else None, array, grid)
+        signals = mended(signals, named)
+        values, mask, array, grid = signals.values, signals.mask, signals.array, signals.grid
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, values, mask, links.censored)
@@ -254,7 +263,11 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
         check.refuse_rows(name, _rows(values, _infinite, mask), unmarked)
         if name == "csi" or values.dtype.kind == "u":
             return
-        wanted, out = "linear power, at least 0 (is it in dB?)", _rows(values, lambda part: part < 0, mask)
+        if "decibels" in str(check.raw.attributes.get("conventions", "")).split():
+            return
+        wanted = "linear power, at least 0 (is it in dB?"
+        wanted += "; then dataset.decibels=true)" if name == "spectrum" else ")"
+        out = _rows(values, lambda part: part < 0, mask)
         if name == "rssi_db":
             wanted, out = "dB between -400 and 400", _rows(values, lambda part: np.abs(part) > 400, mask)
     check.refuse_rows(name, out, f"out of range; expected {wanted}")

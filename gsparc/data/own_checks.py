@@ -156,6 +156,11 @@ class Checker:
         if count is not None and "frequency_hz" not in self.raw.arrays:
             self.refuse("frequency_hz", f"missing; csi needs the {count} frequencies [Hz]")
         carrier = self.real("carrier_hz", ())
+        if frequency is not None and carrier is not None and frequency.size:
+            away = np.abs(frequency)
+            if 2 * away.max() < carrier and away.min() <= np.ptp(frequency):  # values in MHz are far from 0
+                self.notes.append(f"frequency_hz: read as offsets from carrier_hz, {float(carrier):g}")
+                frequency = frequency + carrier
         for name, values in (("frequency_hz", frequency), ("carrier_hz", carrier)):
             if values is None:
                 continue

@@ -185,7 +185,8 @@ def make_split(
     if settings.name in ("stations", "runs"):
         local_folds = _whole(None if station is None else station[rows_left], settings)
     else:
-        named = release_split if settings.name == "random" and not settings.redraw else None
+        its_own = settings.name == "random" and release_split is not None and not settings.redraw
+        named = release_split if its_own else None
         if named is not None:
             train, test = (np.searchsorted(rows_left, np.intersect1d(part, rows_left)) for part in named)
             named = train, test

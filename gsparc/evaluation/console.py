@@ -1,10 +1,13 @@
-"""What commands read and say: plain settings, a console, errors in one line with what to do."""
+"""What commands read and say: plain settings, a console, its log, errors in one line with what to do."""
 
 from __future__ import annotations
 
 import inspect
+import logging
 import os
 import re
+import sys
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,12 +18,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
+from gsparc.data.errors import kind_of
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import SettingError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
 WIDE = 120
+AGAIN = 40  # characters of a warning that tell it from others
+PATH = r"^\S*/\S*: "  # at its head
 
 
 def open_console() -> Console:
@@ -31,6 +37,44 @@ def open_console() -> Console:
     terminal = Console(soft_wrap=True, markup=False)
     known = terminal.is_terminal or "COLUMNS" in os.environ  # a log has no width: 80 cut headings short
     return terminal if known else Console(soft_wrap=True, markup=False, width=WIDE)
+
+
+class Screen(logging.StreamHandler):  # type: ignore[type-arg]
+    """The log as the console shows it: messages alone, and of each kind of warning the first.
+
+    The log's file has every line, with time, level and module.
+
+    Args:
+        quiet: loggers, packages mostly, of which only warnings are shown.
+        stream: where lines go; None: stdout.
+    """
+
+    def __init__(self, quiet: Iterable[str] = (), stream: Any = None) -> None:
+        super().__init__(stream or sys.stdout)
+        self.quiet = tuple(f"{name}." for name in quiet)
+        self.warned: dict[str, tuple[int, str]] = {}  # by kind: how often, and the first
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it is shown; counts warnings."""
+        if record.levelno < logging.WARNING:
+            return not f"{record.name}.".startswith(self.quiet)
+        message = record.getMessage()
+        count, first = self.warned.get(kind_of(message), (0, message))
+        self.warned[kind_of(message)] = count + 1, first
+        return count == 0
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The message; of a warning or an error after its level."""
+        level = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
+        return level + record.getMessage().strip().partition("\n")[0]
+
+
+def warned_again() -> list[str]:
+    """What a command says at its end of warnings that its log's file has more of: one line, or none."""
+    screens = [one for one in logging.getLogger().handlers if isinstance(one, Screen)]
+    more = [(n, first) for one in screens for n, first in one.warned.values() if n > 1]
+    again = [f"{n} like '{re.sub(PATH, '', first)[:AGAIN]} ...'" for n, first in more]
+    return [f"warnings that came again: {', '.join(again)}"] if again else []
 
 
 def plain(node: DictConfig) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,8 @@ from gsparc.models.method import Method
 from gsparc.models.parts import common_label
 from gsparc.prediction import timing
 from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, percentiles, queries
+
+log = logging.getLogger(__name__)
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
@@ -52,6 +55,7 @@ def evaluate(
     cache: Path | None = None,
     clock: ClockSettings | None = None,
     learned: tuple[Measurements, Split] | None = None,
+    shared: str | None = None,
 ) -> Evaluation:
     """Score and time a method beside the baselines.
 
@@ -65,6 +69,7 @@ def evaluate(
         cache: folder where baselines are kept between runs; None keeps nothing.
         clock: how long to measure latencies.
         learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
+        shared: the baseline that the methods are, which is then not fitted again.
 
     Returns:
         `test/*`, `baseline/<name>/*`, `paired/gp/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
@@ -79,7 +84,10 @@ def evaluate(
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     scores = score(methods, data, split, eval_on)
     names = fitting(*(learned or (data, split))) if baselines is None else baselines
-    others = {name: baseline(name, data, split, eval_on, cache, learned) for name in names}
+    if fitted := [name for name in names if name != shared]:
+        log.info("%-10s%s", "baselines", ", ".join(fitted))
+    same = Fitted(methods, scores, tuple(seconds or ()))
+    others = {n: same if n == shared else baseline(n, data, split, eval_on, cache, learned) for n in names}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
     alone = [method.field_alone() for method in methods]

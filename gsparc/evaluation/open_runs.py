@@ -73,8 +73,9 @@ class Opened:
             raise DataError(f"{self.stored[0].path} does not say how it was trained")
         split = config.get("split")
         own = {
-            "seed": int(config.get("seed", 0)), "budget_s": config.get("budget_s"),
-            "budget_clock": config.get("budget_clock", "wall"), "stations": config.get("stations", "auto"),
+            "seed": int(config.get("seed", 0)), "effort": float(config.get("effort", 1.0)),
+            "budget_s": config.get("budget_s"), "budget_clock": config.get("budget_clock", "wall"),
+            "stations": config.get("stations", "auto"),
             "split": None if split is None else split_settings(split),
         }  # fmt: skip
         return partial(build, config["model"], trusted=False), FitContext(**own | others)

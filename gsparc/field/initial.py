@@ -45,7 +45,7 @@ class InitSettings(Checked):
 
     name: InitName = setting("auto", choice(*get_args(InitName)))
     file: str | None = None
-    searches: int = setting(6, whole(1))
+    searches: int = setting(4, whole(1))
     search_rows: int = setting(700, whole(8))
     rows: int = setting(3000, whole(8))
     margin: float = setting(8.0, POSITIVE)
@@ -65,7 +65,6 @@ class InitTask:
         rows: (n,) to learn from.
         receiver: the static one's pose; None where it moves.
         transmitter: (3,) [m], the static one's; None where it moves.
-        snapshot: what every snapshot has of its own.
         seed: of every random choice.
         run_dir: where reports go.
     """
@@ -76,7 +75,6 @@ class InitTask:
     rows: np.ndarray
     receiver: Pose | None
     transmitter: Tensor | None
-    snapshot: Snapshot
     seed: int
     run_dir: Path
 
@@ -99,7 +97,6 @@ class Start:
         solve: sets the parameters of a fresh model; may return what `left_out` holds.
         billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
             the processor [s].
-        time_limited: whether seconds ended that work.
         left_out: training targets that it predicted without their neighbours, for whoever asks; not stored.
     """
 
@@ -107,5 +104,4 @@ class Start:
     solve: Callable[[GaussianModel], Any] = unchanged
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)
-    time_limited: bool = False
     left_out: Any = None

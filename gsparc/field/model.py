@@ -140,10 +140,10 @@ class GaussianModel(nn.Module):
             self.confidence = Confidence(settings.confidence, of_position)
         static = receiver.position if receiver is not None else transmitter
         apart = None if static is None else float((static.float() - box.mean(0)).norm())
-        self.d_ref = settings.attenuation.d_ref or (apart if apart and apart > 0.1 else 1.0)
-        self.log_gain = nn.Parameter(
-            torch.tensor(math.log(settings.attenuation.gain)), requires_grad=settings.attenuation.learn_gain
-        )
+        law = settings.attenuation
+        self.d_ref = law.d_ref or (apart if apart and apart > 0.1 else 1.0)
+        law = law if law.inverse_distance else AttenuationSettings()
+        self.log_gain = nn.Parameter(torch.tensor(math.log(law.gain)), requires_grad=law.learn_gain)
         self.response = self._response(*(shape or (1, 1)), transmitter)
 
     def _response(

@@ -25,12 +25,12 @@ class Solved:
 
     Attributes:
         weight, bias: of the emission's last layer.
-        change: of what is rendered, root mean square over a batch.
+        change: of what is rendered: mean square over a batch (), this process's part of it.
     """
 
     weight: Tensor
     bias: Tensor
-    change: float
+    change: Tensor
 
 
 @torch.no_grad()
@@ -62,7 +62,7 @@ def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solve
     trial.emission.weight2.add_(correction[:-1].transpose(0, 1))
     trial.emission.bias2.add_(correction[-1])
     error = trial(batch.tx, batch.rx).mean - model(batch.tx, batch.rx).mean
-    return Solved(trial.emission.weight2, trial.emission.bias2, float(error.square().mean().sqrt()))
+    return Solved(trial.emission.weight2, trial.emission.bias2, batch.share * error.square().mean())
 
 
 def _lines(model: GaussianModel) -> Tensor:

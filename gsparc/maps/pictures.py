@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, hsv_to_rgb, to_rgba_array
 from matplotlib.transforms import Affine2D
 
 from gsparc.evaluation.drawing import panels, save
@@ -33,7 +33,8 @@ from gsparc.prediction.predictor import Predictor
 GREY = (170, 170, 170)  # of values that are not known
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
-UNSURE = "hatched: less likely than not the strongest and above its floor"
+GOLDEN = 0.61803  # of the circle: no two numbers have one hue
+UNSURE = "hatched: more likely another station, or none that is heard"
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,11 @@ class Layer:
         """Colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
         if not self.words:
             return colormaps[self.legend.colours](np.linspace(0, 1, 256))
-        count = len(self.words)
-        return np.asarray(colormaps["tab10" if count <= 10 else "tab20"](np.arange(count) % 20))
+        number = np.arange(len(self.words))
+        if len(number) <= 10:
+            return np.asarray(colormaps["tab10"](number))
+        shade = np.array([[0.9, 0.55], [0.65, 0.95], [0.45, 0.75]])[number % 3]  # saturation and value
+        return to_rgba_array(hsv_to_rgb(np.column_stack([number * GOLDEN % 1, shade])))
 
 
 def layers(field: FieldMap) -> Iterator[Layer]:

@@ -19,7 +19,6 @@ from gsparc.models.channels import initial as waves
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.directional.method import DirectionalGP
-from gsparc.models.haste import factor_s
 from gsparc.models.image_sources.known.images import counted
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
@@ -33,10 +32,8 @@ from gsparc.models.powers import field as power_field
 from gsparc.models.powers.together import field as joint_field
 from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget, less_repeatable
+from gsparc.training.time_budget import less_repeatable
 
-COMPLETION_SHARE = 0.15  # of the seconds of sources, for that process
-FACTORS = 4.0  # covariances of all rows that it needs at least
 LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
 
 
@@ -44,8 +41,7 @@ def sources(
     data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
     """Image sources of several searches, and a process on what they leave within the same seconds."""
-    budget = context.time_budget()
-    return _completed(ImageSourceGP(**_searched(init, clutter, context)), data, rows, context, budget)
+    return _completed(ImageSourceGP(**_searched(init, clutter, context)), data, rows, context)
 
 
 def scene(
@@ -58,15 +54,17 @@ def scene(
     """
     if data.site.kind == "rssi":
         return powers(data, rows, init, clutter, context)
-    budget = context.time_budget()
     method = KnownWallsGP(read_walls(init.file), **_searched(init, clutter, context))
-    return _completed(method, data, rows, context, budget)
+    return _completed(method, data, rows, context)
 
 
 def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
     """What `ImageSourceGP` takes, of the settings of an initialiser."""
     names = ("searches", "search_rows", "rows", "margin", "max_sources", "order")
     own = {name: getattr(init, name) for name in names}
+    own["searches"] = max(round(context.effort * init.searches), 1)
+    for name in ("search_rows", "rows"):
+        own[name] = max(round(context.effort ** (1 / 3) * getattr(init, name)), 8)
     return {**own, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
 
 
@@ -121,14 +119,15 @@ def bearings(
 ) -> tuple[ConditionalField, FitReport]:
     """Sources where bearings cross, of at most `init.searches` searches.
 
-    With seconds in the context, searches end when the left-out error no longer falls; without, one is made.
-    Of `init`, `searches` and `max_sources` are heeded; `clutter` means nothing to spectra.
+    Searches end when the left-out error no longer falls. Of `init`, `searches` and `max_sources` are heeded;
+    `clutter` means nothing to spectra.
 
     Raises:
         ValueError: not spectra of a moving receiver with a declared array that keeps its orientation.
     """
     search = replace(SearchSettings(), sources=init.max_sources)
-    method = MovingArrayField(search=search, seed=context.seed, most_searches=init.searches)
+    searches = max(round(init.searches * context.effort), 1)
+    method = MovingArrayField(search=search, seed=context.seed, searches=searches)
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
     return BearingField(method, heard(data, rows)), report
 
@@ -143,20 +142,17 @@ def process(
 
 
 def _completed(
-    method: ImageSourceGP, data: Measurements, rows: np.ndarray, context: FitContext, budget: TimeBudget
+    method: ImageSourceGP, data: Measurements, rows: np.ndarray, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
     """The sources, and a process on what they leave where leaving rows out says that it pays."""
-    several = data.target[0].size > 1
-    if context.budget_s is not None and not several:
-        context = replace(context, budget_s=(1 - COMPLETION_SHARE) * context.budget_s)
+    budget = context.time_budget()
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
     field = SourceField(method)
-    if several:
+    if data.target[0].size > 1:
         return field, report
     began = budget.counted.wall
     left = field.left_out()
-    if budget.seconds - budget.spent < FACTORS * factor_s(len(left.rows)):
-        budget.limited = True
+    if budget.over():
         note = "no time for a process on what the sources leave"
         return field, replace(report, notes=(*report.notes, note), limited_by=budget.clock)
     remainder = residuals(left, data)

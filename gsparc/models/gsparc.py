@@ -67,4 +67,6 @@ def plan(
     if parts == ("diffuse",) and not (terms.phase and placed):
         why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
         reasons.append(f"the residual is all there is: {why}")
-    return Plan(not parts, terms.array and not parts, parts, plain and not parts, tuple(reasons))
+    named = init.name in ("auto", "diffuse", *parts)
+    options = (*terms.options, *["init.name"] * named, *["model.field.count"] * (not count))
+    return Plan(not parts, terms.array and not parts, parts, plain and not parts, tuple(reasons), options)

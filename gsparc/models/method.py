@@ -56,6 +56,8 @@ class Method(ABC):
     name: str
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
     linked: ClassVar[Mapping[str, str]] = {"seed": "${seed}"}  # settings that follow those of the run
+    # Attributes that hold settings of other names, by setting; "": it tells `heeded.count` itself.
+    stored_names: ClassVar[Mapping[str, str]] = {}
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
@@ -132,10 +134,6 @@ class Method(ABC):
     ) -> tuple[Literal["each", "together"], str]:
         """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
         return "each", ""
-
-    def usual_s(self, site: Site) -> float | None:
-        """Seconds of all stations together where `FitContext.budget_s` says nothing; None: no end [s]."""
-        return None
 
     def facts(self) -> dict[str, float | int | str | None]:
         """What `summary.json` says of a fitted model, None where it means nothing here."""

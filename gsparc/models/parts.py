@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from gsparc.data import heeded
 from gsparc.data.assemble import content_hash
 from gsparc.data.errors import some
 from gsparc.data.schema import Measurements, Site
@@ -55,6 +56,8 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
         ValueError: the folder holds a part of other data, rows, seed or settings.
     """
     left = context.resume
+    if left is not None:  # what was read then is not known
+        heeded.count("*")
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
             return _restore(method, data, fold, context, left / checkpoint.MODEL)

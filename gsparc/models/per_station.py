@@ -8,7 +8,6 @@ moving, so that its query is (tx, rx), where the method can do that.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import reduce
@@ -20,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data import heeded
 from gsparc.data.executor import each, elsewhere
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -32,12 +32,11 @@ from gsparc.models.target_rows import heard
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import Spent, TimeBudget, less_repeatable
+from gsparc.training.time_budget import Spent, less_repeatable
 
 log = logging.getLogger(__name__)
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
-LEAST_SHARE = 0.5  # of an even part of the seconds, which every station has though earlier ones took more
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
@@ -115,7 +114,7 @@ class PerStation(Method):
         return ", ".join(dict.fromkeys(effects)) if effects else self.wrapped.effects
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit every station that is asked for, or all together; seconds are shared.
+        """Fit every station that is asked for, or all together.
 
         Together, a method that shares stations learns them as they are, any other as if both ends moved.
         What an interrupted run finished is taken from its folder (`FitContext.resume`).
@@ -124,9 +123,8 @@ class PerStation(Method):
             ValueError: a station of the test rows has too few training rows, or all are learned together, and
                 the method cannot take both ends for moving.
         """
-        whole = self.wrapped.usual_s(data.site) if context.budget_s is None else context.budget_s
-        budget = context.time_budget(math.inf if whole is None else whole)
-        numbers = self._numbers(data, fold, replace(context, budget_s=whole))
+        budget = context.time_budget()
+        numbers = self._numbers(data, fold, context)
         self.site, notes = data.site, []
         left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
         resumable = self.wrapped.resumable and context.run_dir != Path()
@@ -136,16 +134,14 @@ class PerStation(Method):
         local = not elsewhere()
 
         def fitted(turn: int) -> tuple[Method, FitReport]:
-            number, share = numbers[turn], None
+            number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
-            if whole is not None:  # what earlier ones left, where these are known
-                even = (whole - budget.spent) / (len(numbers) - turn) if local else whole / len(numbers)
-                share = max(even, LEAST_SHARE * whole / len(numbers))
             resume = None if left is None else left / folder
-            own = context.within(folder, budget_s=share, datamodule=None, resume=resume)
-            if local and self.wrapped.takes_budget and len(numbers) > 1:
-                turns = turn + 1, len(numbers), self._name_of(number), _rest(turn, len(numbers), budget)
-                log.info("station %d of %d: %s%s", *turns)
+            own = context.within(
+                folder, budget_s=budget.left_s if local else context.budget_s, datamodule=None, resume=resume
+            )
+            if len(numbers) > 1:
+                log.info("station %d of %d: %s", turn + 1, len(numbers), self._name_of(number))
             rows, part = self._part(data, number)
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             copy, before = self._make(), budget.counted.wall
@@ -163,7 +159,7 @@ class PerStation(Method):
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
-        fits = dict(each(fitted, range(len(numbers)), "" if local else "stations"))
+        fits = dict(each(fitted, range(len(numbers)), f"stations of {self.name}"))
         reports = [fits[turn][1] for turn in range(len(numbers))]
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
@@ -184,7 +180,8 @@ class PerStation(Method):
         assert stations is not None
         how = context.stations
         if how == "auto":
-            how, why = self.wrapped.best_stations(data, fold, context)
+            with heeded.apart():
+                how, why = self.wrapped.best_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
         together, joint = how == "together", self.wrapped.shares(data.site)
         self._shared = together and joint
@@ -341,14 +338,6 @@ class OfStation(View):
         rows = torch.arange(len(tx))
         station = torch.full_like(rows, self.number)
         return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
-
-
-def _rest(turn: int, count: int, budget: TimeBudget) -> str:
-    """What a log says of the seconds that are left, before the station `turn` of so many."""
-    rest = budget.seconds - budget.spent
-    if math.isinf(rest):
-        rest = budget.spent / turn * (count - turn) if turn else math.inf
-    return "" if math.isinf(rest) else f", about {max(rest, 0.0):.0f} s left for all"
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:

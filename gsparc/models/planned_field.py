@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -29,7 +30,7 @@ from gsparc.models.fields import restored, stored
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.mixture import solutions
-from gsparc.models.mixture.closed_forms import DEFAULT_BUDGET_S, solve, with_cost
+from gsparc.models.mixture.closed_forms import solve, with_cost
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Blended, averaged, contributions, knobs, mean_alone, reduced
@@ -43,11 +44,9 @@ from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.module import GaussianModule
-from gsparc.training.time_budget import TimeBudget, less_repeatable
+from gsparc.training.time_budget import less_repeatable
 
 log = logging.getLogger(__name__)
-
-MEASURED_SHARE = 0.4  # of the seconds, for the fit that positions with errors are refined by
 
 
 class PlannedField(LearnedField):
@@ -113,14 +112,18 @@ class PlannedField(LearnedField):
         """Choose the terms, initialise, weigh; take the steps that pay where Gaussians are rendered."""
         self.site, self.field, self._average, self._average_mean = data.site, None, None, None
         self.runs = RunFactors.none()
-        self.plan = self.planned(data)
+        with heeded.apart():
+            self.plan = self.planned(data)
+        heeded.count(*self.plan.options)
         for reason in self.plan.reasons:
             log.info("%s", reason)
-        if self.init.name == "scene":
+        if "scene" in self.plan.parts:
             read_walls(self.init.file)  # its errors come before anything is computed
-        std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
+        with heeded.apart() as asked:
+            std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
         if std is not None and std[np.concatenate([fold.train, fold.val])].any():
             if not self.plan.rasterized and data.site.kind != "spectrum" and data.site.static_end is not None:
+                heeded.count(*asked)
                 return self._fit_refined(self.plan, data, fold, context, std)
             log.warning("position_std is not used: it is for channels and powers of one end that moves")
         if self.plan.rasterized:
@@ -130,16 +133,15 @@ class PlannedField(LearnedField):
     def _fit_refined(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext, std: np.ndarray
     ) -> FitReport:
-        """First where rows were measured, then, in the rest of the seconds, where they rather were."""
-        seconds = DEFAULT_BUDGET_S if context.budget_s is None else context.budget_s
-        budget = context.time_budget(seconds)
-        first = replace(context, run_dir=Path(), resume=None, budget_s=MEASURED_SHARE * seconds)
+        """First where rows were measured, then where they rather were."""
+        budget = context.time_budget()
+        first = replace(context, run_dir=Path(), resume=None)
         limited = self._fit_conditional(chosen, data, fold, first).limited_by
         assert self.field is not None
         rows, by, note = refined(self.field, self.runs.aligned(data), std)
         log.info("%s", note)
         spent = budget.counted.wall
-        rest = replace(context, budget_s=max(seconds - budget.spent, (1 - MEASURED_SHARE) * seconds / 2))
+        rest = replace(context, budget_s=budget.left_s)
         report = self._fit_conditional(chosen, displaced(data, rows, by), fold, rest)
         limited = less_repeatable(limited, report.limited_by)
         cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
@@ -148,17 +150,21 @@ class PlannedField(LearnedField):
 
     def _fit_rasterized(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         assert self.plan is not None
-        response = replace(self.settings.response, array=self.plan.array)
-        self.settings = replace(self.settings, response=response)
-        if not self.settings.field.count:
-            self.most_steps = 0
-        choices, _ = resolve(self.settings, self.init.name, data.site)
-        log.info(
-            "training %s by rendering: %d Gaussians, terms %s, init=%s; callbacks %s",
-            GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
-            ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
-        )  # fmt: skip
-        report = super().fit(data, fold, context)
+        with heeded.apart():  # what these decide, `Plan.options` says
+            response = replace(self.settings.response, array=self.plan.array)
+            self.settings = replace(self.settings, response=response)
+            if not self.settings.field.count:
+                self.most_steps = 0
+            choices, _ = resolve(self.settings, self.init.name, data.site)
+            log.info(
+                "training %s by rendering: %d Gaussians, terms %s, init=%s; callbacks %s",
+                GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
+                ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
+            )  # fmt: skip
+        with heeded.apart() as read:
+            report = super().fit(data, fold, context)
+        if not self._alone:
+            heeded.count(*read)
         self.started = self.choices.init if self.choices is not None else ""
         spent = dict(self.spent)
         if self._average is not None:
@@ -184,25 +190,16 @@ class PlannedField(LearnedField):
         return not self._alone
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
-        self._reserve_s = 0.0
         if self.plan is not None and self.plan.plain:
-            watch = TimeBudget()
             self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
             self.explained = self.explained if explained is None else explained
-            self._reserve_s = 0.0 if self._average is None else watch.spent  # to fit that process again
-        if self._alone and super().size():
-            log.warning(
-                "the plain process has all the weight: no option of the field changes the result. The row of "
-                "the Gaussians alone shows what they do; model=splat is the field alone, and "
-                "model.effects.residual=false leaves the process out"
-            )
 
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
     ) -> FitReport:
-        if self.most_steps:
-            log.info("model.steps=%d is not used: closed-form weights take no steps", self.most_steps)
-        init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
+        with heeded.apart():  # what these decide, `Plan.options` says
+            known = self.init.name if self.init.name in ("diffuse", *chosen.parts) else "auto"
+            init = replace(self.init, name=known if self.settings.field.count else "diffuse")
         solved = solve(chosen.parts, init, self.switches, data, fold, context)
         self.field, self.started, self.runs = solved.field, solved.started, solved.runs
         self.explained, self.init_s, self.steps = solved.explained, solved.init_s, 0
@@ -215,10 +212,6 @@ class PlannedField(LearnedField):
         if not self.shares(data.site) or self.init.name == "scene":
             return "each", ""
         return stations.best(data, fold, context)
-
-    def usual_s(self, site: Site) -> float | None:
-        """See `Method.usual_s`; steps, not seconds, are counted where Gaussians are rendered."""
-        return None if site.kind == "spectrum" else DEFAULT_BUDGET_S
 
     # -- answering ---------------------------------------------------------------------------------
 

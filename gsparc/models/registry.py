@@ -9,6 +9,7 @@ from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data import heeded
 from gsparc.data.instantiate import find, node_of, plugins, refuse_foreign, suggest, targets
 from gsparc.data.limits import SettingError
 
@@ -105,7 +106,8 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
     kind = find(str(target))
     if isinstance(kind, type):
         _refuse_words("model", node, node_of(kind))
-    method = instantiate(node)
+    with heeded.apart():  # what is handed on is not used yet
+        method = instantiate(node)
     if not isinstance(method, Method):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,9 +23,6 @@ from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
-FOLDS = 3
-TRIED_ON = 2_000  # rows of a fold that are learned from
-SHARE, MOST_S = 0.1, 6.0  # of the seconds, and seconds, after which no further fold is tried
 PLAIN = InitSettings("diffuse")  # no Gaussians: asked is what stations share
 
 
@@ -46,14 +42,13 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
     known = heard(data, np.sort(np.concatenate([fold.train, fold.val])))
     if len(known) > ONE_FACTOR:
         return "each", f"{len(known)} rows are more than one factor holds ({ONE_FACTOR})"
-    limit_s = math.inf if context.budget_s is None else context.budget_s
-    budget = context.time_budget(min(MOST_S, SHARE * limit_s))
-    errors = []
-    for inner in cut_inside(data, fold, context.split, FOLDS, context.seed).folds:
+    budget = context.time_budget()
+    errors, folds, most = [], budget.effort.station_folds, budget.effort.station_rows
+    for inner in cut_inside(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
         learned, queries = (heard(data, part) for part in (np.union1d(inner.train, inner.val), inner.test))
-        if len(learned) > TRIED_ON:
-            learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:TRIED_ON])
-        own = replace(context, run_dir=Path(), resume=None, budget_s=MOST_S)
+        if len(learned) > most:
+            learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:most])
+        own = replace(context, run_dir=Path(), resume=None, budget_s=budget.left_s)
         parts = list(_by_station(data, learned, queries, own))
         if not parts:
             continue

@@ -47,6 +47,7 @@ class Plan:
         parts: initialisers of conditional fields, weighed against each other where there are several.
         plain: of rasterized ones, whether a plain process on the target may stand in, or be averaged in.
         reasons: one line each.
+        options: that decided, by their paths; others may be heeded by what is trained.
     """
 
     rasterized: bool
@@ -54,6 +55,7 @@ class Plan:
     parts: tuple[str, ...] = ()
     plain: bool = False
     reasons: tuple[str, ...] = field(default=())
+    options: tuple[str, ...] = field(default=())
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Terms:
         rendered: whether rendered Gaussians are asked for.
         obstacle: why there is no carrier phase, where there can be none.
         reasons: one line each.
+        options: switches that mean something here.
     """
 
     array: bool
@@ -74,6 +77,7 @@ class Terms:
     rendered: bool
     obstacle: str | None
     reasons: tuple[str, ...]
+    options: tuple[str, ...]
 
 
 def called_for(
@@ -100,7 +104,7 @@ def called_for(
         "phase": _no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
-    on, reasons = {}, []
+    on, reasons, options = {}, [], [] if site.kind == "rssi" else ["model.effects.residual"]
     for name, obstacle in obstacles.items():
         switch = getattr(switches, name)
         if switch is True and obstacle is not None:
@@ -108,11 +112,16 @@ def called_for(
         on[name] = switch is not False and obstacle is None
         if obstacle is None or "=" in obstacle:  # other settings decide, not the data
             why = obstacle if switch == "auto" else "as configured"
+            options.append(f"model.effects.{name}")
             reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}" + (f": {why}" if why else ""))
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True
-    return Terms(**on, rendered=rendered, obstacle=obstacles["phase"], reasons=tuple(reasons))
+    options += ["model.effects.image", "model.loss.snapshot"] if site.kind == "csi" else []
+    obstacle = obstacles["phase"]
+    return Terms(
+        **on, rendered=rendered, obstacle=obstacle, reasons=tuple(reasons), options=tuple(options)
+    )  # fmt: skip
 
 
 def _refuse_scene(

@@ -28,8 +28,8 @@ VALIDATED = SplitSettings().val_fraction
 
 def fit(
     rx: Any = None, tx: Any = None, *, rssi: Any = None, csi: Any = None, spectrum: Any = None,
-    unit: str = "dBm", model: str = "gsparc", budget_s: float | None = None, seed: int = 0,
-    save: str | Path | None = None, settings: dict[str, Any] | None = None, **arrays: Any,
+    unit: str = "dBm", model: str = "gsparc", effort: float = 1.0, budget_s: float | None = None,
+    seed: int = 0, save: str | Path | None = None, settings: dict[str, Any] | None = None, **arrays: Any,
 ) -> Predictor:  # fmt: skip
     """A model of all rows, ready to be asked; checks and messages are those of a file of one's own.
 
@@ -46,7 +46,8 @@ def fit(
         spectrum: (n, elevations, azimuths) directional spectra.
         unit: of `rssi`, and of what is answered: dBm, dBW, dB (of a reference nobody knows), W, mW, ...
         model: a name of `gsparc train --help`.
-        budget_s: seconds of training; None: the model's own.
+        effort: that searches, rows and steps are multiplied by: .3 is quick, 3 thorough.
+        budget_s: seconds after which searches and steps end with what they have; None: no end.
         seed: of whatever is random.
         save: a checkpoint to write, for `gsparc.load` and all commands.
         settings: arguments of the model's class.
@@ -69,7 +70,7 @@ def fit(
         log.warning("%s", note)
     method = for_links(partial(method_class(model), **(settings or {})), data)
     fold = _learned_from(data, VALIDATED if method.takes_budget else 0.0, seed)
-    report = method.fit(data, fold, FitContext(seed=seed, budget_s=budget_s))
+    report = method.fit(data, fold, FitContext(seed=seed, effort=effort, budget_s=budget_s))
     for note in report.notes:
         log.info("%s", note)
     if save is not None:
@@ -80,13 +81,15 @@ def fit(
 def _of_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:
     """Arrays of the schema with powers in a unit: watts, or decibels as they are."""
     unknown = unit in ("dB", LINEAR)  # what they refer to
-    given = PowerUnit.of(unit, "dB" if unknown else "dBW")
+    given = PowerUnit.of(str(unit), "dB" if unknown else "dBW")
     if given.decibels:
         return Raw({**arrays, "rssi_db": powers}, {"level_unit": given.name})
     if "noise_variance" in arrays:
         arrays = {**arrays, "noise_variance": arrays["noise_variance"] / given.scale**2}
+    if powers.dtype.kind in "iuf":  # others are refused by name
+        powers = powers / given.scale
     about = {"unit": given.name, "level_unit": "dB" if unknown else "dBW"}
-    return Raw({**arrays, "rssi": powers / given.scale}, about)
+    return Raw({**arrays, "rssi": powers}, about)
 
 
 def _learned_from(data: Measurements, share: float, seed: int) -> Fold:

@@ -310,8 +310,8 @@ class Predictor:
         """Where snapshots were heard, by this model's likelihood, in world coordinates.
 
         >>> city = gsparc.load("city.ckpt")
-        >>> [one.place.shape for one in city.locate([[-90.0, -75.2]])]  # (n, stations) [dBm]
-        [(3,)]
+        >>> city.locate([[-90.0, -75.2]])[0].place.shape  # (n, stations) [dBm]
+        (3,)
 
         Args:
             values: (n, ...) spectra, channels or powers; where there are stations (n, stations, ...), NaN

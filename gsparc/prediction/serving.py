@@ -233,7 +233,7 @@ def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGI
     @app.post("/std")
     @app.post("/predict")
     async def predict(request: Request) -> Response:
-        body, raw = bytearray(), request.headers.get("content-type", "").startswith(RAW)
+        body, raw = bytearray(), request.headers.get("content-type", "").lower().startswith(RAW)
         try:
             async for part in request.stream():
                 body += part

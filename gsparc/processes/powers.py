@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -76,15 +77,23 @@ def trend_of_rows(rows: Rows, law: Law | None) -> Trend:
 
 @dataclass(frozen=True)
 class PowerProcess:
-    """A process of powers given rows.
+    """A process of powers given rows, or several whose weighed mean is the answer.
 
     Attributes:
         posterior: of decibels (P = 1).
         heard: variance of the rows that were heard, of the amplitude.
+        others: further processes given the same rows, with their shares; the rest is this one's.
     """
 
     posterior: Posterior
     heard: float
+    others: tuple[tuple[float, PowerProcess], ...] = ()
+
+    @property
+    def members(self) -> tuple[tuple[float, PowerProcess], ...]:
+        """Every process alone, with its share, this one first."""
+        own = 1 - sum(share for share, _ in self.others)
+        return (own, replace(self, others=()) if self.others else self), *self.others
 
     @property
     def kernel(self) -> Kernel:
@@ -110,6 +119,10 @@ class PowerProcess:
         Unknown is the variance as a share of that of the known rows. What the mean law explains of them
         counts as known near them only: its slope says nothing of places far from all data.
         """
+        if self.others:
+            parts = [(share, *one.answer(queries)) for share, one in self.members]
+            mean, variance = averaged([part[:3] for part in parts])
+            return mean, variance, sum((part[0] * part[3] for part in parts), torch.zeros_like(mean))
         result = self.posterior.answer(queries)
         own = 1 + self.kernel.noise
         whole = max(self.heard, own)
@@ -124,27 +137,56 @@ class PowerProcess:
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
-        return self.posterior.mean_at(queries)[:, 0]
+        return sum(
+            (share * one.posterior.mean_at(queries)[:, 0] for share, one in self.members),
+            queries.new_zeros(len(queries)),
+        )
+
+    def left_out(self, at: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Mean [dB] of each row that was heard without its own, and variance of a measurement [dB^2].
+
+        Args:
+            at: (n,) places of the rows, where the nearest alone are looked at.
+        """
+        parts = []
+        for share, one in self.members:
+            mean, variance = one.posterior.left_out()
+            exact = one.posterior if isinstance(one.posterior, Exact) else None
+            heard = torch.from_numpy(at) if exact is None else exact.extra == 0
+            parts.append((share, mean[heard, 0], one.kernel.amplitude * variance[heard]))
+        return averaged(parts)
 
     def exact(self) -> PowerProcess:
-        """One that has covariances between places; of many rows, given some that cover the site."""
+        """The first alone, with covariances between places; of many rows, given some that cover the site."""
         nearest = self.posterior
         if not isinstance(nearest, Nearest):
-            return self
+            return replace(self, others=())
         few = covering(self.places, MOST_ROWS, 0)
         places, prior = torch.from_numpy(self.places[few]), nearest.prior
         extra = nearest.noise[few] - prior.kernel.noise
-        return replace(self, posterior=Exact.of(prior, places, nearest.rest[few] + prior.mean(places), extra))
+        values = nearest.rest[few] + prior.mean(places)
+        return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
 
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `read` needs."""
-        return {**self.posterior.state(), "heard": self.heard}
+        others = [{**one.state(), "share": share} for share, one in self.others]
+        return {**self.posterior.state(), "heard": self.heard, **({"others": others} if others else {})}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> PowerProcess:
         """The process whose `state()` this was."""
         kind = Nearest if "level" in state else Exact
-        return cls(kind.read(state), float(state["heard"]))
+        others = tuple((float(one["share"]), cls.read(one)) for one in state.get("others", ()))
+        return cls(kind.read(state), float(state["heard"]), others)
+
+
+def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Mean and variance (n,) of a mixture of (share, mean, variance), with what members disagree about."""
+    if len(parts) == 1:
+        return parts[0][1:]
+    mean = sum((share * one for share, one, _ in parts), torch.zeros_like(parts[0][1]))
+    spread = [share * (variance + (one - mean).square()) for share, one, variance in parts]
+    return mean, torch.stack(spread).sum(0)
 
 
 def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:

@@ -95,8 +95,8 @@ class Trend:
     Attributes:
         level: the mean where there is no law [dB].
         law: the distance law, or None.
-        middle, spread: mean and deviation of the rows' decades of distance: by one deviation its uncertain
-            slope changes powers as much as the process does.
+        middle, spread: mean and deviation of the rows' decades of distance: over one deviation
+            its uncertain slope changes powers as much as the process does.
         walls: that are known; what one takes is uncertain, and what one floor takes.
     """
 

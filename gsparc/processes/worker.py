@@ -1,4 +1,4 @@
-"""Ending work from outside: threads cannot be interrupted, and loops do not know the clock, so they ask."""
+"""Ending work from outside: threads cannot be interrupted, and loops do not know when, so they ask."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def cancelled_by(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
 
 
 def raise_if_cancelled() -> None:
-    """Raise `Cancelled` if this thread's work is unwanted; called every tenth of a second."""
+    """Raise `Cancelled` if this thread's work is unwanted; each factor and block of candidates asks."""
+    _asked.steps = getattr(_asked, "steps", 0) + 1
     unwanted = getattr(_asked, "unwanted", None)
     if unwanted is not None and unwanted():
         raise Cancelled
@@ -39,6 +40,12 @@ def raise_if_cancelled() -> None:
 def late_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
     """Within, `late` says what `over`, or who surrounds it, says, in this thread."""
     return _within("over", over)
+
+
+def after(most: int) -> Callable[[], bool]:
+    """Says whether this thread has made `most` further factors and blocks of candidates."""
+    end = getattr(_asked, "steps", 0) + most
+    return lambda: getattr(_asked, "steps", 0) >= end
 
 
 def late() -> bool:

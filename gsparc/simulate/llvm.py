@@ -3,32 +3,29 @@
 Dr.Jit refuses LLVM 14; with 15 and 16 it imports and then aborts the whole process at the first solve,
 which no `try` catches. So a library is accepted only after a tiny solve in a process of its own.
 
-`gsparc llvm` (or `make sionna`) fetches Debian's package where no library is good.
+`python -m gsparc.simulate.llvm` (or `make sionna`) fetches Debian's package where no library is good.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from contextlib import suppress
 from functools import lru_cache
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from rich.console import Console
-
 from gsparc.data.files import platform_cache, whole_file
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 FETCHED = Path(sys.prefix) / "lib" / "llvm19" / "libLLVM.so.19.1"
 SYSTEM = ("llvm-19/lib", "*-linux-gnu", "llvm-20/lib", "llvm-18/lib")  # below /usr/lib, best first
-REMEDY = f"get one with `gsparc llvm` (Debian's, no root needed) or name a library of LLVM 19 in {VARIABLE}"
+MODULE = "python -m gsparc.simulate.llvm"
+REMEDY = f"get one with `{MODULE}` (Debian's, no root needed) or name a library of LLVM 19 in {VARIABLE}"
 TINY_SOLVE = """
 import sionna.rt as rt
 scene = rt.load_scene(rt.scene.floor_wall)
@@ -131,13 +128,8 @@ def fetch() -> None:
         raise SimulatorMissing(f"libllvm19: {words}; put LLVM 19 on this machine and name it in {VARIABLE}")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`gsparc llvm`: a good library is found or fetched; exit status 0 when a tiny solve works."""
-    argparse.ArgumentParser(prog="gsparc llvm", description=__doc__).parse_args(arguments)
-    console = Console(soft_wrap=True, highlight=False)
+if __name__ == "__main__":
     try:
-        console.print(f"LLVM for Sionna: {prepare(fetch_missing=True)}", markup=False)
+        sys.stdout.write(f"LLVM for Sionna: {prepare(fetch_missing=True)}\n")
     except SimulatorMissing as error:
-        console.print(f"error: {error}", markup=False, style="red")
-        return 1
-    return 0
+        sys.exit(f"error: {error}")

@@ -14,7 +14,7 @@ import numpy as np
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.training import curve
 from gsparc.training.cost import NO_COST, Cost
-from gsparc.training.time_budget import NOTHING, Clock, Spent, TimeBudget
+from gsparc.training.time_budget import NOTHING, Clock, Effort, Spent, TimeBudget
 
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
@@ -48,7 +48,8 @@ class FitContext:
     Attributes:
         run_dir: where the fit may write; empty: nowhere.
         seed: of whatever is random and has no seed of its own.
-        budget_s: seconds of training; None: as the method is configured.
+        effort: that all counts of `Effort` are multiplied by.
+        budget_s: seconds after which searches and steps end with what they have; None: no end.
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
         stations: of several, whether `each` has a model or all are one's `together`; `auto` as the method's
             `best_stations` says.
@@ -66,11 +67,13 @@ class FitContext:
         config_yaml: the whole configuration, stored in every checkpoint.
 
     Raises:
-        ValueError: a budget that is no time, an unknown clock or `stations`, or a batch without rows.
+        ValueError: an effort or a budget that is not positive, an unknown clock or `stations`, or a batch
+            without rows.
     """
 
     run_dir: Path = Path()
     seed: int = 0
+    effort: float = 1.0
     budget_s: float | None = None
     budget_clock: Clock = "wall"
     stations: StationModels = "auto"
@@ -87,6 +90,8 @@ class FitContext:
     config_yaml: str = ""
 
     def __post_init__(self) -> None:
+        if not 0 < self.effort < math.inf:
+            raise ValueError(f"effort={self.effort!r}: a positive number is needed; 1 is usual")
         if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
             raise ValueError(f"budget_s={self.budget_s!r}: a positive number of seconds is needed, or null")
         if self.budget_clock not in get_args(Clock):
@@ -114,7 +119,7 @@ class FitContext:
         curve.write(self.run_dir, [*curve.read(self.run_dir), row])
         curve.log(self.loggers, row)
 
-    def time_budget(self, seconds: float | None = None, before: Spent = NOTHING) -> TimeBudget:
-        """So many seconds of this context's clock (None: `budget_s`, or no end), some spent before."""
-        seconds = self.budget_s if seconds is None else seconds
-        return TimeBudget(math.inf if seconds is None else seconds, self.budget_clock, before)
+    def time_budget(self, before: Spent = NOTHING) -> TimeBudget:
+        """What a fit counts, and the seconds that may end it, some spent before."""
+        seconds = math.inf if self.budget_s is None else self.budget_s
+        return TimeBudget(seconds, self.budget_clock, before, Effort().times(self.effort))

@@ -17,13 +17,10 @@ class Cost:
     Attributes:
         stages: of each [s].
         unused: stages whose result has no weight in what answers, or of which no step was kept.
-        gain: held-out error when half of the seconds had gone over that in the end; None where it is not
-            known.
     """
 
     stages: Mapping[str, float] = field(default_factory=dict)
     unused: Mapping[str, float] = field(default_factory=dict)
-    gain: float | None = None
 
     def __add__(self, other: Cost) -> Cost:
         """Of two fits, such as those of two stations."""
@@ -31,8 +28,7 @@ class Cost:
             {name: a.get(name, 0.0) + b.get(name, 0.0) for name in dict.fromkeys([*a, *b])}
             for a, b in ((self.stages, other.stages), (self.unused, other.unused))
         )
-        gains = [one.gain for one in (self, other) if one.stages]
-        return Cost(stages, unused, gains[0] if len(gains) == 1 else None)
+        return Cost(stages, unused)
 
     @property
     def seconds(self) -> float:
@@ -45,20 +41,14 @@ class Cost:
         return sum(self.unused.values())
 
     def described(self, limited_by: Clock | None) -> str:
-        """One line; what twice the seconds would bring, by what the second half of these brought."""
+        """One line."""
         parts = []
         for name, spent in self.stages.items():
             unused = f" ({self.unused[name]:.1f} without weight)" if name in self.unused else ""
             parts += [f"{name} {spent:.1f} s{unused}"] if spent >= LEAST_S else []
-        if limited_by is None:
-            more = "more seconds would change nothing"
-        elif self.gain is None:
-            more = "seconds ended it; what more would bring is not known"
-        else:
-            half = f"the second half took {1 - 1 / self.gain:.0%} off the held-out error"
-            more = f"seconds ended it, {half}: twice as many may take off as much"
+        ended = "" if limited_by is None else "; seconds ended it"
         share = self.unused_s / max(self.seconds, LEAST_S)
-        return f"{', '.join(parts)}; {share:.0%} of {self.seconds:.1f} s without weight; {more}"
+        return f"{', '.join(parts)}; {share:.0%} of {self.seconds:.1f} s without weight{ended}"
 
 
 NO_COST = Cost()

@@ -19,6 +19,7 @@ import torch
 from lightning.pytorch.plugins.io import CheckpointIO
 from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
 
+from gsparc.data import heeded
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -54,7 +55,7 @@ class Ran:
     Attributes:
         seconds: that it took, validations too [s].
         steps: whose result is kept.
-        position: of that in the schedule [steps]; None where nothing was kept back.
+        position: of that in the schedule [steps]; None where it is the end of it.
         taken: steps in all.
         timed_out: whether `trainer.max_time` ended it.
     """
@@ -82,17 +83,36 @@ def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> i
     for name, value in (("max_steps", steps), ("max_epochs", epochs)):
         if value is not None and (type(value) is not int or value < 0):
             raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
+    if own == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
+        heeded.count("model.steps")
+        return own
+    heeded.count("trainer.max_steps", "trainer.max_epochs")
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
-    given = [*([] if steps is None else [steps]), *([] if epochs is None else [epochs * -(-rows // size)])]
-    return min(given) if given and own != 0 else own  # 0 of either is the start alone
+    of_epochs = None if epochs is None else epochs * -(-rows // size)
+    return min(one for one in (steps, of_epochs) if one is not None)
 
 
 class ReturnMetrics(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """Also after a checkpoint with every step done."""
+        """Also after a checkpoint with every step done; where the schedule was not ended, where it stood."""
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
+        if module.position < module.total_steps:
+            position = torch.tensor(module.position, dtype=torch.float64)
+            trainer.callback_metrics.setdefault(KEPT[1], position)
+
+
+def stands(trainer: L.Trainer) -> bool:
+    """Whether a step is done with, at the end of its batch or of its look at validation rows.
+
+    Lightning leaves out a look that follows, where a run goes on from a state before it.
+    """
+    if trainer.validating:
+        return trainer.state.fn == "fit"
+    every = trainer.val_check_batch
+    due = isinstance(every, int) and (trainer.fit_loop.total_batch_idx + 1) % every == 0
+    return trainer.training and not (due and trainer.enable_validation)
 
 
 class _Stopped(BaseException):
@@ -119,9 +139,11 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write the checkpoint and end training when asked to."""
-        if self.requested:
+        if self.requested and stands(trainer):
             trainer.save_checkpoint(self.file)
             raise _Stopped
+
+    on_validation_end = on_train_batch_end  # type: ignore[assignment]
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         """Leave the state after the last step."""
@@ -171,8 +193,7 @@ def run_stage(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    pace = module.pace
-    callbacks = [Budget(pace, budget), *watch, *context.callbacks()]
+    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val))]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -188,8 +209,9 @@ def run_stage(
     }
     if not len(fold.val):
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
-    options["max_steps"] = module.total_steps if pace is None else -1
+    options["max_steps"] = module.total_steps
     options["max_epochs"] = -1
+    heeded.count("trainer", "callbacks", "dataset.batch_size")
     processes = Processes.named(make.keywords.get("strategy"))
     if processes is not None:
         options["strategy"] = processes
@@ -200,6 +222,8 @@ def run_stage(
         default_root_dir=folder,
         **options,
     )
+    if processes is not None:  # which note nothing here
+        heeded.count("*")
     if trainer.world_size > 1 and processes is None:
         raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
     try:
@@ -223,6 +247,14 @@ def run_stage(
     if timed_out:
         log.warning("trainer.max_time ended training after %d of %d steps", taken, module.total_steps)
     return Ran((budget.counted - before).wall, taken if steps is None else steps, position, taken, timed_out)
+
+
+def _told(callbacks: Sequence[L.Callback], rows: int) -> Sequence[L.Callback]:
+    """Without those that look at figures of validation rows, where there are none."""
+    blind = [] if rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
+    if blind:
+        log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
+    return [one for one in callbacks if one not in blind]
 
 
 def _lost(error: ProcessException, advice: str) -> str:

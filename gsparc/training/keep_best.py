@@ -46,7 +46,7 @@ class KeepBest(L.Callback):
             self.start = module.held_out
         surely = agreed(float(_surely_less(module.held_out, self.start)), trainer)
         if trainer.sanity_checking or (error < self.error and surely):
-            self.error, self.step, self.position = error, trainer.global_step, module.position
+            self.error, self.step, self.position = error, trainer.global_step, trainer.global_step
             self._kept = copy.deepcopy(module.model.state_dict())
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
@@ -97,4 +97,4 @@ class StopAt(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: GaussianModule, *unused: Any) -> None:  # type: ignore[override]
         """After every step."""
-        trainer.should_stop = trainer.should_stop or module.position >= self.position
+        trainer.should_stop = trainer.should_stop or trainer.global_step >= self.position

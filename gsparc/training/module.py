@@ -20,9 +20,7 @@ from gsparc.field.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian
 from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ssim
 from gsparc.training.optimizer import OptimizerSettings, kind_of, optimizer_for, scheduler_for
-from gsparc.training.pace import Pace
 from gsparc.training.processes import count
-from gsparc.training.schedule import in_steps
 
 
 @dataclass(frozen=True)
@@ -53,17 +51,16 @@ class GaussianModule(L.LightningModule):
         optimizer: learning rates.
         total_steps: length of the schedules.
         run_dir: where a poisoned batch is left.
-        pace: says how far the schedules are when seconds decide, not steps.
     """
 
     def __init__(
         self, model: GaussianModel, loss: LossSettings, optimizer: OptimizerSettings,
-        total_steps: int, run_dir: Path, pace: Pace | None = None,
+        total_steps: int, run_dir: Path,
     ) -> None:  # fmt: skip
         super().__init__()
         self.model = model
         self.loss, self.rates = loss, optimizer
-        self.total_steps, self.run_dir, self.pace = total_steps, run_dir, pace
+        self.total_steps, self.run_dir = total_steps, run_dir
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
         self.solved = False  # whether training starts from emissions in closed form
@@ -75,27 +72,14 @@ class GaussianModule(L.LightningModule):
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
 
-    @property
-    def position(self) -> int:
-        """How far the schedule is [steps]."""
-        return self.global_step if self.pace is None else self.pace.step
-
-    def schedule_step(self, interval: int | float) -> int | None:
-        """The schedule's step where a callback acts every `interval` steps, or share of all.
-
-        Where seconds stretch the schedule: the last multiple that the last step passed; None where none was.
-        """
-        return (
-            self.global_step if self.pace is None else self.pace.passed(in_steps(interval, self.total_steps))
-        )
-
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Loss per sample (B,) before confidence; what was not measured counts as met."""
         if self.model.site.kind == "spectrum":
             if batch.mask is not None:
                 prediction = torch.where(batch.mask, prediction, batch.target)
             return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
-        return channel_loss(prediction, batch.target, batch.mask, self.loss.snapshot)
+        snapshot = self.loss.snapshot if self.model.site.kind == "csi" else "none"  # powers have no phase
+        return channel_loss(prediction, batch.target, batch.mask, snapshot)
 
     def _render(self, batch: Batch) -> Rendered:
         try:
@@ -201,7 +185,7 @@ class GaussianModule(L.LightningModule):
     def configure_optimizers(self) -> Any:
         """One Adam group per tensor, rates as pure functions of the step."""
         optimizer = optimizer_for(self.model, self.rates)
-        scheduler = scheduler_for(optimizer, self.rates, self.total_steps, self.pace)
+        scheduler = scheduler_for(optimizer, self.rates, self.total_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:

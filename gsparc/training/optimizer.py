@@ -10,7 +10,6 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
 from gsparc.data.limits import Checked, internal, number, setting, whole
-from gsparc.training.pace import Pace
 
 RATE = number(0)
 WARMUP = 0.1  # of the steps after a start in closed form
@@ -94,12 +93,10 @@ def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -
     return rise * (settings.decay + (1 - settings.decay) * 0.5 * (1 + math.cos(math.pi * progress)))
 
 
-def scheduler_for(
-    optimizer: Adam, settings: OptimizerSettings, total: int, pace: Pace | None = None
-) -> LambdaLR:
-    """The schedule of every group over `total` steps, or as far as `pace` says it is."""
+def scheduler_for(optimizer: Adam, settings: OptimizerSettings, total: int) -> LambdaLR:
+    """The schedule of every group over `total` steps."""
 
     def factor(kind: str):
-        return lambda step: rate_factor(kind, settings, step if pace is None else pace.step, total)
+        return lambda step: rate_factor(kind, settings, step, total)
 
     return LambdaLR(optimizer, [factor(kind_of(group["name"])) for group in optimizer.param_groups])

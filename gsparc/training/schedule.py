@@ -21,21 +21,18 @@ def in_steps(given: int | float, total: int) -> int:
     return given if isinstance(given, int) else max(1, round(given * total))
 
 
-def due(
-    step: int, taken: int, start: int | float, stop: int | float, interval: int | float, total: int
-) -> bool:
+def due(step: int, start: int | float, stop: int | float, interval: int | float, total: int) -> bool:
     """Whether a callback acts at a step: on a multiple of `interval` from `start` to `stop`.
 
     Where the interval is a share, not before `FIRST` steps were taken: a training that short has gradients of
     its initial weights alone, and would not recover.
 
     Args:
-        step: of the schedule.
-        taken: steps of gradient so far; fewer than `step` where seconds stretch the schedule.
+        step: of gradient so far.
         start, stop, interval: steps, or shares.
         total: steps of the schedule.
     """
     first, last, apart = (in_steps(value, total) for value in (start, stop, interval))
-    if isinstance(interval, float) and taken < FIRST:
+    if isinstance(interval, float) and step < FIRST:
         return False
     return first <= step <= last and step % apart == 0

@@ -1,15 +1,54 @@
-"""Seconds that a fit may take, by the clock on the wall or by processor time, and whether they ended it."""
+"""What a fit counts before it ends (`Effort`), and the seconds that may end it before (`TimeBudget`)."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import torch
 
 Clock = Literal["wall", "processor"]
+
+
+LEAST_ROWS = 150  # that settings are chosen on, however little the effort
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much a fit counts before it ends: the same on every machine, however busy it is.
+
+    Attributes:
+        chosen_on: rows that settings are chosen on, of more; each look at them factors a covariance.
+        term_rows: rows that powers of the terms of a channel field are learned on.
+        evaluations: of a search for sources: factors of covariances and blocks of candidates.
+        station_folds: in which stations are learned each and together, to see which is better.
+        station_rows: that are learned from in each of them.
+        fringes: coherent solutions of powers.
+        restarts: of spectra that no neighbour solves, times the starts of each.
+        steps, steps_after_solving: of gradient, where neither model nor Trainer is given a number; after a
+            start in closed form.
+    """
+
+    chosen_on: int = 1_000
+    term_rows: int = 400
+    evaluations: int = 3_000
+    station_folds: int = 3
+    station_rows: int = 1_000
+    fringes: int = 20
+    restarts: int = 100_000
+    steps: int = 400
+    steps_after_solving: int = 60
+
+    def times(self, factor: float) -> Effort:
+        """All of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""
+        counts = {one.name: factor * getattr(self, one.name) for one in fields(self)}
+        rows = {name: max(factor ** (1 / 3) * getattr(self, name), LEAST_ROWS) for name in ROWS}
+        return Effort(**{name: max(round(count), 1) for name, count in {**counts, **rows}.items()})
+
+
+ROWS = ("chosen_on", "term_rows", "station_rows")
 
 
 @dataclass(frozen=True)
@@ -46,19 +85,23 @@ def less_repeatable(*clocks: Clock | None) -> Clock | None:
 class TimeBudget:
     """Counts from where it is made, but for pauses.
 
-    A busy machine does less within seconds of the wall, about the same within seconds of its processor;
-    only fixed numbers of steps or searches repeat a result exactly.
+    Seconds decide nothing but an early end: what a fit does is counted (`Effort`), and repeats exactly.
 
     Args:
         seconds: all of them [s].
         clock: whose seconds they are.
         before: spent by the run that this one goes on from.
+        effort: what is counted within them.
 
     Attributes:
         limited: whether `over` has ended something.
     """
 
-    def __init__(self, seconds: float = math.inf, clock: Clock = "wall", before: Spent = NOTHING) -> None:
+    def __init__(
+        self, seconds: float = math.inf, clock: Clock = "wall", before: Spent = NOTHING,
+        effort: Effort = Effort(),
+    ) -> None:  # fmt: skip
+        self.effort = effort
         self.seconds, self.clock, self.limited = seconds, clock, False
         self._threads = torch.get_num_threads()  # searches change it for a while
         self._before = before
@@ -76,6 +119,11 @@ class TimeBudget:
     def spent(self) -> float:
         """[s]"""
         return self.counted.by(self.clock)
+
+    @property
+    def left_s(self) -> float | None:
+        """What is left of it, more than nothing; None without an end [s]."""
+        return None if math.isinf(self.seconds) else max(self.seconds - self.spent, 1e-3)
 
     @property
     def limited_by(self) -> Clock | None:
@@ -100,8 +148,8 @@ class TimeBudget:
         if self._since is not None:
             self._since = Spent(self._since.wall, 0.0)
 
-    def over(self, share: float = 1.0) -> bool:
-        """Whether that share of it is spent; whoever asks then ends what it does."""
-        result = self.spent > share * self.seconds
+    def over(self) -> bool:
+        """Whether it is spent; whoever asks then ends what it does."""
+        result = self.spent > self.seconds
         self.limited |= result
         return result

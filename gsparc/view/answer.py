@@ -31,7 +31,8 @@ class Answer:
         confidence: in [0, 1]; None where the method has none.
         spectrum: (H, W) in [0, 1]; None of other kinds.
         response: (A, K) complex channel; None of other kinds.
-        strongest: azimuth and elevation in the world of the strongest direction of a spectrum [degrees].
+        strongest: azimuth and elevation of the strongest direction of a spectrum, at the receiver as a
+            picture of it has them, and in the world [degrees].
         paths: None where there are none.
     """
 
@@ -42,7 +43,7 @@ class Answer:
     confidence: float | None = None
     spectrum: np.ndarray | None = None
     response: np.ndarray | None = None
-    strongest: tuple[float, float] | None = None
+    strongest: tuple[float, float, float, float] | None = None
     paths: Rays | None = None
 
 
@@ -93,10 +94,13 @@ def azimuth_elevation(towards: np.ndarray) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
-def _strongest(spectrum: np.ndarray, site: Site) -> tuple[float, float]:
+def _strongest(spectrum: np.ndarray, site: Site) -> tuple[float, float, float, float]:
     assert site.grid is not None
     towards = site.grid.directions().numpy().reshape(-1, 3)[int(spectrum.argmax())]
-    return azimuth_elevation(towards if site.rx_rotation is None else site.rx_rotation @ towards)
+    azimuth, elevation = azimuth_elevation(towards)
+    left = site.grid.edges()[0]
+    world = azimuth_elevation(towards if site.rx_rotation is None else site.rx_rotation @ towards)
+    return left + (azimuth - left) % 360, elevation, *world
 
 
 def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:

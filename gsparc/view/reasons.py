@@ -166,7 +166,8 @@ def headline(answer: Answer, unit: str = "dB") -> str:
         spread = "" if answer.spread_db is None else f" ± {answer.spread_db:.1f}"
         lines.append(f"{answer.level_db:.1f}{spread} {unit}")
     if answer.strongest is not None:
-        lines.append("strongest from azimuth {:.0f}°, elevation {:.0f}° (world)".format(*answer.strongest))
+        where = "azimuth {:.0f}°, elevation {:.0f}° at the receiver ({:.0f}°, {:.0f}° in the world)"
+        lines.append("strongest from " + where.format(*answer.strongest))
     lines.append("no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}")
     return ", ".join(lines)
 

@@ -28,6 +28,8 @@ WIDTH, HEIGHT, DPI = 8.0, 4.4, 150  # readable at 600 pixels
 MOST_DOTS = 3000
 CELLS = 120  # along the longer side of a plane
 LETTERS = 42  # of a line above the panel
+AZIMUTH = -70  # from where it is looked at [degrees]
+ACROSS = np.array([-np.sin(np.radians(AZIMUTH)), np.cos(np.radians(AZIMUTH))])  # to the right, of (x, y)
 FLATTEST = 0.2  # of height to width, that a flat site is drawn with
 
 
@@ -42,8 +44,7 @@ def draw_still(view: SiteView, path: Path) -> None:
     axis: Any = figure.add_subplot(place, projection="3d")
     axis.computed_zorder = False  # parts are sorted as wholes: a plane would hide the walls on it
     low, high = _limits(view, name)
-    if view.grid is not None:
-        _plane(axis, view, name, one.power)
+    plane = [] if view.grid is None else [_plane(axis, view, name, one.power)]
     marks = [part for part in one.scene.parts if isinstance(part, Mark)]
     rays = rays_of(answer, view.extent(name)) or ()
     for part in (*one.scene.parts, *rays):
@@ -55,12 +56,14 @@ def draw_still(view: SiteView, path: Path) -> None:
             corners = np.clip(part.vertices, low, high)[part.triangles]
             colour = np.array(part.colour) / 255
             axis.add_collection3d(Poly3DCollection(corners, facecolor=(*colour, part.opacity), zorder=2))
+    ends = {end: answer.ends[end] for end in viewed.moving}
     for mark in marks:
-        _mark(axis, mark.place, mark.text, "k^", "bottom")
-    for end in viewed.moving:
-        _mark(axis, answer.ends[end], ENDS[end], "o", "top", color=RED)
+        _mark(axis, mark.place, mark.text, "k^", list(ends.values()))
+    for end, place in ends.items():
+        _mark(axis, place, ENDS[end], "o", [mark.place for mark in marks if mark.text], color=RED)
     _look(axis, low, high)
     legends = [legend for key, legend in one.scene.legends.items() if key in (VALUES, GAUSSIANS)]
+    legends += [] if legends else plane
     legends += [PATHS] if rays else []
     for legend in legends:
         scale = ScalarMappable(Normalize(legend.low, legend.high), legend.colours)
@@ -107,19 +110,22 @@ def _rays(axis: Any, part: Lines, low: np.ndarray, high: np.ndarray) -> None:
         axis.plot(*np.stack([start, end]).T, color=colour, lw=1.0, zorder=4)
 
 
-def _mark(axis: Any, place: np.ndarray, text: str, mark: str, side: str, **how: Any) -> None:
+def _mark(axis: Any, place: np.ndarray, text: str, mark: str, others: list[Any], **how: Any) -> None:
+    """A mark with its text on the side away from `others`, where it stands beside all of them."""
     x, y, z = place
     axis.plot([x], [y], [z], mark, ms=7, mec="white", zorder=20, **how)
-    note = axis.text(x, y, z, f"  {text}", fontsize="small", zorder=21, va=side)
+    side = "right" if others and all((place - other)[:2] @ ACROSS < 0 for other in others) else "left"
+    note = axis.text(x, y, z, f"  {text}  ", fontsize="small", zorder=21, va="center", ha=side)
     note.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
-def _plane(axis: Any, view: SiteView, name: str | None, legend: Legend | None) -> None:
+def _plane(axis: Any, view: SiteView, name: str | None, legend: Legend | None) -> Legend:
+    """Draw the power over a plane; returns what its colours mean."""
     grid = view.grid
     assert grid is not None
     coarse = thinned(grid, CELLS)
     level = view.plane(name, coarse).level_db
-    legend = legend or Legend.over("", level)
+    legend = legend or Legend.over(f"received power [{view.unit}]", level)
     clear = np.where(np.isfinite(level), 0.75, 0.0)[..., None]
     colours = np.concatenate([legend.of(level) / 255, clear], axis=-1)
     x, y = np.meshgrid(coarse.x, coarse.y)
@@ -127,6 +133,7 @@ def _plane(axis: Any, view: SiteView, name: str | None, legend: Legend | None) -
     axis.plot_surface(
         x, y, height, facecolors=colours, shade=False, rstride=1, cstride=1, linewidth=0, zorder=1
     )
+    return legend
 
 
 def _look(axis: Any, low: np.ndarray, high: np.ndarray) -> None:
@@ -138,4 +145,4 @@ def _look(axis: Any, low: np.ndarray, high: np.ndarray) -> None:
     for one, count in ((axis.xaxis, 5), (axis.yaxis, 5), (axis.zaxis, 3)):
         one.set_major_locator(MaxNLocator(count))
     axis.set_box_aspect(high - low, zoom=1.15)
-    axis.view_init(elev=30, azim=-70)
+    axis.view_init(elev=30, azim=AZIMUTH)

@@ -29,11 +29,9 @@ def draws() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def at(model: GaussianModel, step: int, taken: int, total: int) -> SimpleNamespace:
+def at(model: GaussianModel, step: int, total: int) -> SimpleNamespace:
     """A module at a step of its schedule."""
-    return SimpleNamespace(
-        model=model, total_steps=total, global_step=taken, schedule_step=lambda interval: step, solved=False
-    )
+    return SimpleNamespace(model=model, total_steps=total, global_step=step, solved=False)
 
 
 def with_gradient(densify: Densify, wanting: list[int], count: int = 10) -> Densify:
@@ -124,7 +122,7 @@ def test_edits_happen_on_the_schedule_only(model):
             Densify(start=20, stop=40, interval=10, grad_threshold=0.5), [0], len(model.gaussians)
         )
         before = int(model.gaussians.version)
-        densify.on_train_batch_start(trainer, at(model, step, 0, 100))
+        densify.on_train_batch_start(trainer, at(model, step, 100))
         edited += [step] if int(model.gaussians.version) > before else []
     assert edited == [20, 30, 40]
 
@@ -155,10 +153,10 @@ def test_an_edit_is_said_and_given_to_the_trackers(model, caplog):
     seen = []
     tracker = SimpleNamespace(log_metrics=lambda figures, step: seen.append((figures, step)))
     optimizer = optimizer_for(model, OptimizerSettings())
-    trainer, module = SimpleNamespace(optimizers=[optimizer], loggers=[tracker]), at(model, 200, 80, 400)
+    trainer, module = SimpleNamespace(optimizers=[optimizer], loggers=[tracker]), at(model, 200, 400)
     densify = with_gradient(Densify(0.25, 0.75, 0.125, grad_threshold=0.5, size_share=1.0), [2, 7])
     densify.on_train_batch_start(trainer, module)
-    assert seen == [({"densify/removed": 0, "densify/added": 2}, 80)]
+    assert seen == [({"densify/removed": 0, "densify/added": 2}, 200)]
     assert "step 200: 0 Gaussians removed or split, 2 added: 10 -> 12" in caplog.text
 
 
@@ -167,5 +165,5 @@ def test_a_short_training_with_a_schedule_of_shares_keeps_its_gaussians(model):
     densify = Densify(0.1, 0.6, 0.05, grad_threshold=0.5, size_share=1.0)
     for step in range(1, 21):
         with_gradient(densify, [2, 7])
-        densify.on_train_batch_start(trainer, at(model, step, step, 20))
+        densify.on_train_batch_start(trainer, at(model, step, 20))
     assert len(model.gaussians) == 10

@@ -17,7 +17,7 @@ def module():
 
 
 def trainer(module, step: int) -> SimpleNamespace:
-    logits, module.schedule_step = module.model.gaussians.opacity_logits, lambda interval: step
+    logits, module.global_step = module.model.gaussians.opacity_logits, step
     optimizer = torch.optim.Adam([logits])
     logits.grad = torch.ones_like(logits)
     kept = logits.detach().clone()

@@ -34,10 +34,10 @@ NEEDED = {
 }
 
 
-def composed(monkeypatch, *overrides: str):
-    """What `train.py` would see, with the run's directory."""
+def composed(monkeypatch, *overrides: str, command: str = "train"):
+    """What a command would see, with the run's directory."""
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        config = hydra.compose("train", overrides=list(overrides), return_hydra_config=True)
+        config = hydra.compose(command, overrides=list(overrides), return_hydra_config=True)
     monkeypatch.setattr(HydraConfig.instance(), "cfg", config)  # what ${hydra:...} asks
     return config
 
@@ -70,7 +70,8 @@ def said_in(file: Path) -> dict:
 def test_what_an_experiment_says_is_what_is_done(file, monkeypatch):
     """`threads: 1` and `baselines: [nearest, gp]` of ablations never acted: train.yaml had the last word."""
     group, choice = file.relative_to(CONF).parts[0], file.relative_to(CONF / file.relative_to(CONF).parts[0])
-    config = composed(monkeypatch, f"{group}={choice.with_suffix('')}")
+    command = "compare" if choice.parts[0] == "results" else "train"
+    config = composed(monkeypatch, f"{group}={choice.with_suffix('')}", command=command)
     with open_dict(config):
         as_said = OmegaConf.merge(config, said_in(file))
     assert OmegaConf.to_container(as_said) == OmegaConf.to_container(config)

@@ -20,6 +20,7 @@ COMPOSED = {  # by `tests/test_docs.py` alone, for another reason each
     "logger=wandb": "tests/commands/test_train.py",
     "model=calibrated_raytracer": "needs the ray tracer (tests/peers)",
     "search=optuna": "a search of many trainings",
+    "experiment=results/wsr": "needs logs of both ends (tests/data/datasets/test_wsr.py)",
 }
 
 

@@ -127,6 +127,10 @@ def test_json_and_raw_bodies_hold_what_the_model_answers(powers, served):
     }  # fmt: skip
 
 
+def test_a_media_type_in_capitals_was_taken_for_json(served):
+    assert served.post(np.ones((1, 3), "<f4").tobytes(), RAW.title())[0] == 200
+
+
 def test_deviations_and_all_stations_in_the_unit_asked_for(powers, served):
     """Of several stations none was served but by name, and no deviation at all."""
     client = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)

@@ -12,7 +12,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,10 +29,11 @@ from gsparc.data.load import datamodule
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
-from gsparc.evaluation.experiment import run
+from gsparc.evaluation.experiment import options, run
 from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
+from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.loading import module_of
 from gsparc.models.parts import Origin
 from gsparc.models.splat.method import LearnedField
@@ -95,15 +95,23 @@ def test_a_run_leaves_every_key_of_the_contract(kind, tmp_path):
 
 
 @pytest.mark.parametrize("model", ["zero", "idw", "gp"])
-def test_a_method_without_a_gradient_is_trained_and_says_that_its_budget_is_not_used(
-    model, spectra_file, tmp_path, caplog
-):
-    """`effects.array=true budget_s=5` took its time without a word."""
+def test_a_method_without_a_gradient_is_trained(model, spectra_file, tmp_path):
     facts, objects = train(plain(spectra_file, model, "baselines=[]", "budget_s=5"), tmp_path)
     assert facts["model/name"] == model and facts["time/train_s"] >= 0
     assert np.isfinite(facts["test/psnr_db"]) and objects.checkpoints[0].exists()
-    assert f"budget_s=5 is not used: the seconds of {model} cannot be chosen" in caplog.text
     assert facts["model/limited_by_clock"] is None
+
+
+@pytest.mark.parametrize("more, times", [([], 1), (["model.components=3"], 2)])
+def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
+    more, times, spectra_file, tmp_path, monkeypatch
+):
+    fits, fit = [], GaussianProcess.fit
+    monkeypatch.setattr(run, "platform_cache", lambda: None)
+    monkeypatch.setattr(GaussianProcess, "fit", lambda *given: fits.append(1) or fit(*given))
+    facts, _ = train(plain(spectra_file, "gp", "baselines=[gp]", *more), tmp_path)
+    assert len(fits) == times
+    assert (facts["test/psnr_db"] == facts["baseline/gp/psnr_db"]) == (times == 1)
 
 
 def test_a_checkpoint_evaluates_to_the_same_figures(field):
@@ -377,16 +385,15 @@ def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monke
     assert one_line(error.value).startswith(message)
 
 
-@pytest.mark.parametrize("given", [["trainer.max_steps=3", "seed=1"], ["seed=1"]])
-def test_options_without_a_gradient_are_said_to_be_unused(given, spectra_file, tmp_path, monkeypatch, caplog):
-    caplog.set_level(logging.DEBUG)
-    hydra = SimpleNamespace(overrides=SimpleNamespace(task=given))
-    monkeypatch.setattr(run, "HydraConfig", SimpleNamespace(initialized=lambda: True, get=lambda: hydra))
-    train(plain(spectra_file, "nearest"), tmp_path)
-    (record,) = [r for r in caplog.records if "does not train by gradient" in r.message]
-    loud = len(given) > 1
-    assert record.levelno == (logging.WARNING if loud else logging.DEBUG)
-    assert ("(trainer.max_steps=3)" in record.message) == loud
+def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monkeypatch, caplog):
+    """`effects.array=true budget_s=5`, or `trainer.max_steps=3` of a plain method, went without a word."""
+    given = {name: f"{name}=3" for name in ("trainer.max_steps", "budget_s", "split.folds", "seed")}
+    monkeypatch.setattr(options, "given", lambda: given)
+    train(plain(spectra_file, "nearest", "+split.folds=3"), tmp_path)
+    stored = json.loads((tmp_path / "summary.json").read_text())
+    assert stored["options/unused"] == "trainer.max_steps=3, budget_s=3, split.folds=3"
+    (record,) = [r for r in caplog.records if "without effect" in r.message]
+    assert record.levelno == logging.WARNING and "(the seconds of nearest cannot be chosen)" in record.message
 
 
 @pytest.mark.parametrize("name", ["model.ckpt", "last.ckpt"])

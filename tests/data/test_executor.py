@@ -59,6 +59,7 @@ def test_threads_of_this_process_do_pieces_side_by_side():
 
 def test_one_line_says_how_many_are_left_and_how_long(caplog, monkeypatch):
     monkeypatch.setattr(executor, "SAY_S", 0.0)
+    monkeypatch.setattr(executor, "LINES", 100)
     caplog.set_level(logging.INFO, "gsparc")
     list(each(lambda piece: time.sleep(piece / 10), [1, 3], "cells", cost=float))
     assert caplog.messages in (["1 of 2 cells, about 0 s left"], ["1 of 2 cells, about 1 s left"])

@@ -1,10 +1,17 @@
-"""Errors in one line."""
+"""Errors in one line, and the log as the console shows it."""
 
 from __future__ import annotations
 
-import pytest
+import io
+import logging
+from logging.config import dictConfig
 
-from gsparc.evaluation.console import one_line
+import pytest
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from gsparc.evaluation.console import Screen, one_line, warned_again
 
 
 @pytest.mark.parametrize(
@@ -19,3 +26,41 @@ from gsparc.evaluation.console import one_line
 )
 def test_an_error_is_one_line(error, line):
     assert one_line(error) == line
+
+
+def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
+    """A default run of a city filled five screens: notes of each station, sixty warnings of a kind."""
+    screen = Screen(["gsparc.models"], io.StringIO())
+    monkeypatch.setattr(logging.getLogger(), "handlers", [screen])
+    caplog.set_level(logging.INFO)
+    for station in range(12):
+        logging.getLogger("gsparc.models.per_station").warning("%g s are too few", 5 - station / 7)
+        logging.getLogger("gsparc.models.per_station").warning("data/a.npz: no level of station s%d", station)
+        logging.getLogger("gsparc.models.per_station").info("station %d of 12", station)
+    logging.getLogger("gsparc.modelling").warning("data/a.npz: 3 places were measured twice")
+    logging.getLogger("gsparc.modelling").info("fitting")
+    assert screen.stream.getvalue().splitlines() == [
+        "warning: 5 s are too few", "warning: data/a.npz: no level of station s0",
+        "warning: data/a.npz: 3 places were measured twice", "fitting",
+    ]  # fmt: skip
+    assert warned_again() == [
+        "warnings that came again: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...'"
+    ]
+
+
+def test_the_file_of_a_log_has_every_line_of_which_the_console_shows_some(tmp_path, capsys):
+    GlobalHydra.instance().clear()
+    given = ["hydra.job.name=train", f"hydra.runtime.output_dir={tmp_path}"]
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        node = compose("report", overrides=given, return_hydra_config=True).hydra
+    before, level = logging.getLogger().handlers, logging.getLogger().level
+    try:
+        dictConfig(OmegaConf.to_container(node.job_logging, resolve=True))
+        logging.getLogger("gsparc.models.splat").info("a note")
+        logging.getLogger("gsparc.evaluation").info("a line")
+    finally:
+        logging.getLogger().handlers = before
+        logging.getLogger().setLevel(level)
+    assert capsys.readouterr().out == "a line\n"
+    text = (tmp_path / "train.log").read_text()
+    assert "[gsparc.models.splat][INFO] - a note" in text and "[gsparc.evaluation][INFO] - a line" in text

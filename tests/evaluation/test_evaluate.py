@@ -72,6 +72,20 @@ def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
         assert facts[f"paired/gp/{key}"] == pytest.approx(facts[f"test/{key}"] - facts[f"baseline/gp/{key}"])
 
 
+def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monkeypatch):
+    """`model=gp` was fitted again as its own baseline, for a second row of equal figures."""
+    data, split = campaign("rssi", 40), folds(40)
+    methods, seconds = fit_all(InverseDistance, data, split)
+    monkeypatch.setattr(InverseDistance, "fit", lambda *unused: pytest.fail("fitted again"))
+    names = ["mean", "idw"]
+    facts = evaluate(methods, seconds, data, split, clock=QUICK, baselines=names, shared="idw").facts
+    assert facts["baseline/idw/rmse_db"] == facts["test/rmse_db"]
+    assert facts["baseline/idw/train_s"] == facts["time/train_s"]
+    assert [row[0] for row in result_rows(facts, "idw")[1]] == ["mean", "idw"]
+    facts["baseline/idw/rmse_db"] += 1  # fitted otherwise, a row of its own
+    assert [row[0] for row in result_rows(facts, "idw")[1]] == ["mean", "idw (baseline)", "idw"]
+
+
 def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
     """`nmse`, `skill` and a warning were of linear powers: the strongest row, measured right, was all."""
     data, split = campaign("rssi", 60), folds(60)

@@ -82,6 +82,7 @@ def test_ctrl_c_ends_every_stage_in_one_line(kind, tiny, tmp_path, monkeypatch):
     assert knock(main, "gsparc", _said(tiny, kind, tmp_path / "whole")).status == 0
     whole, stopped = time.monotonic() - began, 0
     before = signal.signal(signal.SIGALRM, lambda *unused: signal.raise_signal(signal.SIGINT))
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
     try:
         for part in range(1, 7):
             words = _said(tiny, kind, tmp_path / f"run{part}")
@@ -97,4 +98,5 @@ def test_ctrl_c_ends_every_stage_in_one_line(kind, tiny, tmp_path, monkeypatch):
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGINT, ignored)
     assert stopped

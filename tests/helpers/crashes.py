@@ -26,6 +26,7 @@ CONTEXT.set_forkserver_preload(
 STEPS = 42  # a multiple of 7: the last checkpoint of a stage is its end
 DENSIFIED = (
     f"trainer.max_steps={STEPS}",
+    "init=uniform",  # after a closed form few edits are taken
     "callbacks.checkpoint.interval=7",  # in the middle of an interval
     "trainer.val_check_interval=20",
     "callbacks=densify",

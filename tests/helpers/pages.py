@@ -177,13 +177,20 @@ class Tiny:
             words |= {key: here[key] for key in words if key in here}
         if name == "evaluate":
             words.pop("dataset.root", None)
+            words |= {"dataset.file": self.data("city")} if "dataset.file" in words else {}
         if name == "compare":
-            for key in [key for key in words if key.startswith("datasets.")] or ["datasets.rfid.root"]:
+            table = words.get("experiment", "results/rfid").removeprefix("results/")
+            sets = {"ceiling": ("exp005", "exp006"), "halls": ("hall_1", "hall_2")}.get(table, (table,))
+            own = [f"datasets.{one}.{'root' if one == 'rfid' else 'file'}" for one in sets]
+            for key in [key for key in words if re.match(r"datasets\..*(root|file)$", key)] or own:
                 words[key] = self.data(ALIKE.get(key.split(".")[1], key.split(".")[1]))
             methods = ("gp",) if words.get("task") == "locate" else ("mean", "nearest")
             only = [f"{key.split('.')[1]}/*/{method}/*" for key in words if key.startswith("datasets.")
                     for method in methods]  # fmt: skip
             words |= {"only": f"[{','.join(only)}]", "cells": str(run.parent / "cells"), "latency": "false"}
+            if "experiment" in words:  # tiny data have other spectra and stations
+                everything = {"rfid": "listed", "city": "stations"}.get(table)
+                words |= {f"datasets.{table}.{everything}": "null"} if everything else {}
             words |= {"splits.blocks_300m.choose": "['split=blocks','split.side_m=5']"}  # a small city
         words |= TINY.get(name, {})
         gsparc = words.get("model", "gsparc") == "gsparc" and words.get("experiment") != "sionna"

@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.maps.field_map import ARRAYS, REFUSED, FieldMap, best_server, loads, server_chance, sinr
 from gsparc.maps.intervals import Evidence
 from gsparc.maps.making import _usual, answering, levels_at, map_of
-from gsparc.maps.pictures import layers
+from gsparc.maps.pictures import Layer, Legend, layers
 from gsparc.maps.promise import Promise
 from gsparc.maps.refining import refined
 from gsparc.models.registry import method_class
@@ -194,3 +194,11 @@ def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
     assert names == ["west"] and "east was never heard" in notes[0]
     with pytest.raises(DataError, match="never heard"):
         answering(predictor, ["east"], promise)
+
+
+def test_twenty_one_stations_had_twenty_colours():
+    """Those of neighbours were shades of one hue, and the last was the first's."""
+    words = tuple(f"station {number}" for number in range(21))
+    colours = Layer("best_server", np.zeros((1, 1)), Legend("", -0.5, 20.5), words).table()[:, :3]
+    apart = np.linalg.norm(colours[:, None] - colours, axis=-1)
+    assert apart[~np.eye(21, dtype=bool)].min() > 0.1 and np.diag(apart, 1).min() > 0.4

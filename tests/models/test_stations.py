@@ -65,7 +65,7 @@ def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkey
     monkeypatch.setattr(Gsparc, "fit", lambda self, *given: fits.append(given) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         PerStation(Gsparc).fit(data, fold, FitContext(tmp_path))
-    assert len(fits) == 1 and len(fits[0][0]) == len(data) and 50 < fits[0][2].budget_s <= 60
+    assert len(fits) == 1 and len(fits[0][0]) == len(data)
     assert "stations=auto -> together: channels" in caplog.text
     plain = PerStation(method_class("nearest"))
     plain.fit(data, fold, FitContext(tmp_path))
@@ -73,4 +73,4 @@ def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkey
     each = PerStation(Gsparc)
     with pytest.raises(ZeroDivisionError):
         each.fit(data, fold, replace(FitContext(tmp_path), stations="each"))
-    assert len(fits) == 2 and fits[1][2].budget_s == pytest.approx(15, abs=2)
+    assert len(fits) == 2 and fits[1][2].budget_s is None

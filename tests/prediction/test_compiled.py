@@ -149,6 +149,7 @@ MODELS = {
     "powers, all rows": partial(of_powers, 300),
     "powers, variance of the nearest": partial(of_powers, 1500),
     "powers, the nearest": partial(of_powers, 700),
+    "powers, a mean of processes": partial(of_powers, 120, "gsparc"),
     "powers, distilled": partial(of_powers, 80, "idw"),
     "sources": partial(of_sources, 1),
     "sources, many tones": partial(of_sources, 40),

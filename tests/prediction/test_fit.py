@@ -128,6 +128,8 @@ def test_methods_without_deviations_say_so():
 @pytest.mark.parametrize("wrong, said", [
     ({"rx": PLACES, "rssi": POWERS, "unit": "dBi"}, "unit=dBi"),
     ({"rx": PLACES, "rssi": POWERS, "unit": "mW"}, "rssi.*linear power, at least 0"),
+    ({"rx": PLACES, "rssi": POWERS, "unit": None}, "unit=None"),  # were taken for dBW
+    ({"rx": PLACES, "rssi": POWERS.astype(str), "unit": "mW"}, "rssi: expected real numbers"),
     ({"rx": PLACES[:5], "rssi": POWERS}, "^gsparc.fit, rx_position: [^;]*found .5, 3.$"),
     ({"rx": PLACES, "rssi": POWERS, "carier_hz": 1e9}, "carier_hz.*carrier_hz"),
     ({"rx": PLACES}, "one of"),

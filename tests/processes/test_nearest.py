@@ -149,7 +149,7 @@ def test_covariances_are_those_of_rows_that_cover_the_site(many):
     rows = rows_of(data, 300)
     process, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
     few = process.exact()
-    assert len(few.places) == 100 and few.exact() is few and isinstance(few.posterior, Exact)
+    assert len(few.places) == 100 and few.exact() == few and isinstance(few.posterior, Exact)
     queries = torch.from_numpy(data.moving[300:])
     wide, narrow = few.answer(queries)[1], process.answer(queries)[1]
     assert isinstance(process.posterior, Nearest) and (wide >= narrow * 0.99).float().mean() > 0.95

@@ -40,7 +40,7 @@ def test_no_good_library_names_file_fault_and_remedy(monkeypatch):
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
     with pytest.raises(llvm.SimulatorMissing) as raised:
         llvm.prepare()
-    for words in ("/nowhere/libLLVM.so", "no such file", "gsparc llvm"):
+    for words in ("/nowhere/libLLVM.so", "no such file", "python -m gsparc.simulate.llvm"):
         assert words in str(raised.value)
 
 

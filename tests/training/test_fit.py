@@ -1,4 +1,5 @@
 import signal
+from functools import partial
 
 import lightning.pytorch as L
 import pytest
@@ -6,8 +7,9 @@ import torch
 from campaigns import spectra
 from contexts import trained
 
-from gsparc.callbacks import CostLedger
+from gsparc.callbacks import CostLedger, Densify
 from gsparc.models import checkpoint
+from gsparc.training import curve
 
 
 class Interrupt(L.Callback):
@@ -22,9 +24,9 @@ class Interrupt(L.Callback):
                 signal.raise_signal(signal.SIGINT)
 
 
-def run(tmp_path, *callbacks, steps: int = 20, **more):
+def run(tmp_path, *callbacks, steps: int = 20, overrides: tuple[str, ...] = (), **more):
     file, made = spectra(tmp_path / "own.npz"), {"callbacks": lambda: list(callbacks), "every": 5}
-    return trained(file, tmp_path / "run", steps, **made, **more)[0].fitted().state_dict()
+    return trained(file, tmp_path / "run", steps, *overrides, **made, **more)[0].fitted().state_dict()
 
 
 def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(tmp_path):
@@ -37,6 +39,33 @@ def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(tmp_path):
     assert checkpoint.read(last).extra["trainer"]["global_step"] == 8
     resumed = run(tmp_path, resume=last)
     whole = run(tmp_path)
+    assert all(torch.equal(whole[key], resumed[key]) for key in whole)
+
+
+def test_a_run_cut_off_where_a_solved_field_is_edited_could_not_go_on(tmp_path, monkeypatch):
+    """The edit looked for the batch of the step before: so ended every run of rfid that was resumed."""
+    torch.set_num_threads(1)
+    asked = {"overrides": ("init=images",)}
+    monkeypatch.setattr("gsparc.callbacks.densify.MOST_CHANGE", 1.0)  # of so small a field any edit is more
+    edits = partial(Densify, start=5, stop=15, interval=5, grad_threshold=0.0, max_gaussians=44)
+    whole = run(tmp_path, edits(), **asked)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, Interrupt(10, times=2), edits(), **asked)
+    resumed = run(tmp_path, edits(), resume=tmp_path / "run" / "last.ckpt", **asked)
+    assert len(whole["gaussians.ids"]) > 40
+    assert all(torch.equal(whole[key], resumed[key]) for key in whole)
+
+
+def test_a_look_that_was_due_where_a_run_was_cut_off_was_left_out(tmp_path):
+    """Of the learning curve, and of what is kept; a checkpoint of step 10 was written before the look."""
+    torch.set_num_threads(1)
+    whole, folder = run(tmp_path, CostLedger(), validate_every=5), tmp_path / "run"
+    rows = [row | {"seconds": ""} for row in curve.read(folder)]
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, CostLedger(), Interrupt(10, times=2), validate_every=5)
+    assert checkpoint.read(folder / "last.ckpt").extra["trainer"]["global_step"] == 10
+    resumed = run(tmp_path, CostLedger(), resume=folder / "last.ckpt", validate_every=5)
+    assert [row | {"seconds": ""} for row in curve.read(folder)] == rows and len(rows) == 6
     assert all(torch.equal(whole[key], resumed[key]) for key in whole)
 
 

@@ -15,7 +15,7 @@ from gsparc.prediction.operating_point import KEY, Operating
 from gsparc.view.answer import Answer, Rays, ask, rays
 from gsparc.view.building import MIRROR, WALL, rays_of
 from gsparc.view.crossed import Obstacles
-from gsparc.view.reasons import Surroundings, answer_markdown, legend_html, reasons, usual
+from gsparc.view.reasons import Surroundings, answer_markdown, headline, legend_html, reasons, usual
 from gsparc.view.scene import Faces
 from gsparc.view.viewed import open_viewed
 
@@ -89,6 +89,14 @@ def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
     spectrum = ask(spectrum_view.viewed.predictor_of(None), spectrum_view.starts(None))
     assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None and spectrum.query_ms > 0
     assert set(spectrum.ends) == {"tx", "rx"}
+    grid = spectrum_view.viewed.site.grid  # it said -29 degrees of the world over a peak at 58
+    row, column = np.unravel_index(spectrum.spectrum.argmax(), spectrum.spectrum.shape)
+    left, _, low, high = grid.edges()
+    peak = left + (column + 0.5) * np.degrees(grid.azimuth_step), low + (row + 0.5) * (high - low) / 16
+    assert spectrum.strongest[:2] == pytest.approx(peak, abs=0.01)
+    assert "azimuth {:.0f}°, elevation {:.0f}° at the receiver (".format(*spectrum.strongest) in headline(
+        spectrum
+    )
     name = power_view.viewed.stations[1]
     asked, at = power_view.viewed.predictor_of(name), power_view.starts(name)
     power = ask(asked, at)

@@ -14,7 +14,9 @@ from gsparc.commands import view as command
 from gsparc.data.errors import DataError
 from gsparc.maps.making import levels_at
 from gsparc.models import checkpoint
+from gsparc.view import still
 from gsparc.view.building import SPLATS, Building, build
+from gsparc.view.site_view import SiteView, grid_for
 from gsparc.view.viewed import open_viewed
 
 
@@ -65,6 +67,20 @@ def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
     assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
     scene = build(viewed, Building(), "west", viewed.measured("west"))
     assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
+
+
+def test_a_plane_without_measured_points_had_no_colour_bar(tmp_path, monkeypatch):
+    """And the names of a station and of the end beside it were written over each other."""
+    viewed = open_viewed(town_model(), {"file": str(tmp_path / "gone.npz")})
+    kept: list = []
+    monkeypatch.setattr(still, "save", lambda figure, *unused: kept.append(figure))
+    grid = grid_for(viewed, {"area": [0, 0, 80, 60], "step_m": 10.0})
+    still.draw_still(SiteView(viewed, grid=grid), tmp_path / "a.png")
+    labels = [axis.get_xlabel() for axis in kept[0].axes]
+    assert any(label.startswith("received power [") for label in labels)
+    notes = [note for axis in kept[0].axes for note in axis.texts]
+    sides = {note.get_text().strip(): note.get_ha() for note in notes}
+    assert (sides["west"], sides["receiver"], sides["east"]) == ("right", "left", "left")
 
 
 def test_powers_in_dbm_were_shown_in_db_by_default(monkeypatch):

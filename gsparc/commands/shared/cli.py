@@ -171,11 +171,14 @@ def overview(answers: str, config: str) -> str:
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
     @wraps(task)
     def wrapped(config: DictConfig) -> object:
+        logging.captureWarnings(True)  # now that there is a log
         try:
             return task(config)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.RUN:
                 raise _Failed(error) from error
             raise  # in a sweep Hydra names the job that failed
+        finally:
+            logging.captureWarnings(False)
 
     return wrapped

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import subprocess
 import sys
 from typing import Any
 
-STAMP = re.compile(r"^\[\d{4}-[^\]]*\]\[[^\]]*\]\[(\w+)\] - ")
 WIDE = "110"  # columns of a table that fit a notebook
 
 
 def run(line: str, cell: str = "") -> None:
-    """Run `gsparc LINE CELL` with this interpreter and show what it says, without the log's times.
+    """Run `gsparc LINE CELL` with this interpreter and show what it says.
 
     Raises:
         RuntimeError: the command failed; its last line says why.
@@ -30,8 +28,6 @@ def run(line: str, cell: str = "") -> None:
     last = ""
     try:
         for text in command.stdout:
-            stamp = STAMP.match(text)
-            text = STAMP.sub("" if stamp and stamp[1] == "INFO" else r"\1: ", text)
             last = text.strip() or last
             sys.stdout.write(text)
     finally:

@@ -11,7 +11,7 @@ import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from rich.console import RenderableType
 
-from gsparc.evaluation.console import open_console
+from gsparc.evaluation.console import open_console, warned_again
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import machine_facts
@@ -27,7 +27,8 @@ def show(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), befo
     console = open_console()
     for one in tables:
         console.print(one)
-    for line in (*lines, f"{before}written to {run_dir}"):
+    log = "".join(f"; the whole log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
+    for line in (*warned_again(), *lines, f"{before}written to {run_dir}{log}"):
         console.print(line, highlight=False)
 
 

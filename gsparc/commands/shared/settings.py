@@ -29,7 +29,8 @@ class RunSettings(Checked):
         threads: CPU threads of torch; None takes what it finds. NumPy's factorisations use one.
         eval_on: rows that are scored.
         baselines: names of methods; None: all plain ones that serve the data.
-        budget_s: seconds of training, or of timing; None: as the rest is configured.
+        effort: that all counts of a fit are multiplied by.
+        budget_s: seconds that may end training, or of timing; None: as the rest is configured.
         budget_clock: `wall` or `processor`.
         stations: `auto`, `each` or `together`.
     """
@@ -38,6 +39,7 @@ class RunSettings(Checked):
     threads: int | None = setting(None, or_null(whole(1)))
     eval_on: str = setting("test", choice("train", "val", "test"))
     baselines: tuple[str, ...] | None = ()
+    effort: float = setting(1.0, POSITIVE)
     budget_s: float | None = setting(None, or_null(POSITIVE))
     budget_clock: str = setting("wall", choice("wall", "processor"))
     stations: str = setting("auto", choice("auto", "each", "together"))

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.checks import outliers
 from gsparc.data.errors import some
 from gsparc.data.schema import ENDS, Measurements, Site
-from gsparc.data.splits import SplitSettings, make_split, visits
+from gsparc.data.splits import Split, SplitSettings, make_split, visits
 from gsparc.ops import SphereGrid
 
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
@@ -17,11 +17,7 @@ LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """(topic, sentence) pairs about a dataset."""
-    site = data.site
-    carrier = "unknown; give frequency_hz, and effects that need the phase become available"
-    if site.carrier_hz is not None:
-        carrier = f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
-    tones = site.subcarriers_hz
+    site, tones = data.site, data.site.subcarriers_hz
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
@@ -30,7 +26,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("neighbours", neighbours(places_of(data), site.wavelength)),
         *(("units?", hint) for hint in suspicious_values(data)),
         *(("outliers?", warning) for warning in outliers.warnings(data)),
-        ("carrier", carrier),
+        ("carrier", _carrier(site)),
     ]
     if tones is not None and len(tones) > 1:
         lines.append(("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz"))
@@ -56,6 +52,26 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         lines.append(("convergence", f"solver error (NMSE between two seeds) {site.convergence_error:.3g}"))
     lines.append(("sha256", site.sha256))
     return lines
+
+
+def in_short(data: Measurements, split: Split) -> list[tuple[str, str]]:
+    """Five (topic, sentence) pairs about a dataset and how a run divides it."""
+    train, val, test = (sum(len(getattr(f, part)) for f in split.folds) for part in ("train", "val", "test"))
+    folds = f", in {len(split.folds)} folds" if len(split.folds) > 1 else ""
+    rows = f"{train} rows to learn from, {val} to validate, {test} to test{folds}"
+    return [
+        ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
+        ("stays", _static(data.site)),
+        ("moves", _moving(data)),
+        ("carrier", _carrier(data.site)),
+        ("split", f"{split.name}: {rows}"),
+    ]
+
+
+def _carrier(site: Site) -> str:
+    if site.carrier_hz is None:
+        return "unknown; give frequency_hz, and effects that need the phase become available"
+    return f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
 
 
 def places_of(data: Measurements) -> np.ndarray:

@@ -6,7 +6,6 @@ what one station measured at one place, in the order of measuring; levels are in
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -177,22 +176,6 @@ def stuck(levels: LinkLevels) -> list[str]:
                 rows = f"{levels.rows[run[0]]} to {levels.rows[run[-1]]}"
                 found.append(f"{rows}: {what}: a stuck fix? leave these rows out")
     return found
-
-
-MOST_OF_A_KIND = 3
-NAMES = r"'[^']*'|\b(?:stations?|line|row) [^:, ]+(?:, )?|[^a-z ]"  # what differs between warnings of a kind
-
-
-def gathered(warnings: Sequence[str]) -> list[str]:
-    """Warnings of which more than a few of one kind are one, counted."""
-    kinds: dict[str, list[str]] = defaultdict(list)
-    for text in warnings:
-        kinds[" ".join(re.sub(NAMES, " ", text).split())[:30]].append(text)
-    gathered: list[str] = []
-    for texts in kinds.values():
-        more = f"{texts[0]} (and {len(texts) - 1} more warnings of this kind)"
-        gathered += texts if len(texts) <= MOST_OF_A_KIND else [more]
-    return gathered
 
 
 def copies(levels: LinkLevels) -> list[str]:

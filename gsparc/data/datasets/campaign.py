@@ -11,12 +11,14 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from gsparc.data.assemble import FARTHEST, bad_positions
+from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.describe import suspicious_values
-from gsparc.data.checks.plausibility import gathered, link_levels, plausibility_warnings, steps_of
+from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError, Problems
+from gsparc.data.errors import Caution, DataError, Problems
 from gsparc.data.files import read_text
 from gsparc.data.own import interpret
+from gsparc.data.public.fetch import fetched, found
 from gsparc.data.raw import Raw
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements
 from gsparc.data.selection import Selection, select
@@ -28,18 +30,19 @@ class Campaign(DataModule):
     """A published campaign with stations, of which all rows or a part are used.
 
     Args:
-        file: what `raw` reads.
+        file: what `raw` reads; None: what `gsparc data` fetched of it.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
         stations, runs, min_rssi_db, max_rows, level_steps: see `gsparc.data.selection.Selection`.
         **settings: what `reader` takes besides.
     """
 
     choice: ClassVar[str]  # of conf/dataset
+    switches: ClassVar[tuple[str, ...]] = ()  # settings that `reader` takes besides its arguments
     reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
 
     def __init__(
         self,
-        file: str | Path,
+        file: str | Path | None = None,
         name: str | None = None,
         batch_size: int = 16,
         stations: Sequence[str | int] | None = None,
@@ -50,6 +53,7 @@ class Campaign(DataModule):
         **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
+        file = fetched(self.choice) if file in (None, "", "???") else file
         self.file = str(file) if "://" in str(file) else Path(file)  # which would make one of two slashes
         self.settings = settings
         self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
@@ -64,8 +68,10 @@ class Campaign(DataModule):
         selected = select(raw, self.selection, self.file)
         reading = interpret(selected.raw, self.file)
         left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*left_out, *selected.notes, *reading.notes, *gathered(_implausible(reading.data))):
-            log.warning("%s: %s", self.file, note)
+        for note in (*left_out, *selected.notes, *reading.notes):
+            log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
+        for warning in _implausible(reading.data):
+            log.warning("%s: %s", self.file, warning)
         for hint in suspicious_values(reading.data):
             log.warning("%s: units? %s", self.file, hint)
         return reading.data
@@ -81,7 +87,7 @@ def _implausible(data: Measurements) -> list[str]:
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data)
-    return [] if levels is None else plausibility_warnings(levels, steps_of(levels))
+    return convention_warnings(data) if levels is None else plausibility_warnings(levels, steps_of(levels))
 
 
 class StandIn(Protocol):
@@ -96,11 +102,11 @@ class StandIn(Protocol):
 
 
 class Release(DataModule):
-    """A folder of a published release or, where none is named, what stands in for it.
+    """A folder of a published release: one that is named, the fetched one, or what stands in for it.
 
     Args:
-        root: the folder; absent: the stand-in.
-        stand_in: used, loudly, when no root is given.
+        root: the folder; None: what `gsparc data` fetched of it, where it did.
+        stand_in: used, loudly, when there is neither.
         name, batch_size: see `DataModule`.
         **settings: what `reader` takes besides.
     """
@@ -118,7 +124,8 @@ class Release(DataModule):
         **settings: Any,
     ) -> None:
         super().__init__(name or self.called.lower(), batch_size)
-        self.root, self.stand_in, self.settings = None if root is None else Path(root), stand_in, settings
+        self.root = found(self.called.lower()) if root is None else Path(root)
+        self.stand_in, self.settings = stand_in, settings
 
     def missing(self) -> str:
         """Why the release is not used, and how to get it."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ from gsparc.ops import SphereGrid
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
+SPLITS = ("train", "test")
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
@@ -47,6 +49,7 @@ def load_rfid(
     wavelength_m: float = WAVELENGTH,
     array: np.ndarray | Mapping[str, Any] | None = None,
     normalisation: str = "max",
+    listed: str | Path | int | None = None,
 ) -> Measurements:
     """Read a folder in the release's layout; spectra stay uint8 (S, 90, 360).
 
@@ -57,6 +60,8 @@ def load_rfid(
         array: (M, 3) [m] element positions, receiver frame, or arguments of `planar_array`; None for the
             release's 4 x 4 array.
         normalisation: how the published images were scaled.
+        listed: CSV with the columns spectrum and split: only these are used, split like this; 160: those of
+            our tables out of `gsparc data rfid-200`.
 
     Raises:
         DataError: anything is missing or wrong; all problems are listed with file and row.
@@ -70,6 +75,10 @@ def load_rfid(
     count = None if positions is None else len(positions)
     spectra = _read_spectra(root / "spectrum", count, problems)
     release_split = read_split(root, count, problems, first=1)
+    rows = np.arange(count or 0)
+    if listed is not None and count is not None:
+        file = files("gsparc.data.public").joinpath("rfid-160.csv") if listed in (160, "160") else listed
+        rows, release_split = _read_list(Path(str(file)), count, problems)
     problems.raise_if_any()
     assert info is not None and positions is not None and spectra is not None and count is not None
     simulated = info.dataset == STAND_IN
@@ -77,13 +86,34 @@ def load_rfid(
     places = planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
     return assemble(
         name=STAND_IN if simulated else "rfid", stand_in="rfid" if simulated else None,
-        kind="spectrum", static_end="rx", tx=positions, rx=np.repeat(info.position[None], count, axis=0),
-        rx_rotation=np.repeat(info.rotation[None], count, axis=0), target=spectra,
+        kind="spectrum", static_end="rx", tx=positions[rows],
+        rx=np.repeat(info.position[None], len(rows), axis=0),
+        rx_rotation=np.repeat(info.rotation[None], len(rows), axis=0),
+        target=spectra if listed is None else spectra[rows],
         grid=SphereGrid.hemisphere(HEIGHT, WIDTH), normalisation=str(normalisation),
         array=places, carrier_hz=LIGHT / float(wavelength_m), release_split=release_split,
-        row_names=[f"spectrum/{i:05d}.png" for i in range(1, count + 1)],
+        row_names=[f"spectrum/{i + 1:05d}.png" for i in rows],
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
     )  # fmt: skip
+
+
+def _read_list(
+    path: Path, count: int, problems: Problems
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray] | None]:
+    """Rows (n,) that a list names, of `count`, and the (train, test) rows among them."""
+    cells = problems.attempt(
+        lambda: read_csv(path, "missing; expected a CSV with the columns spectrum,split")
+    )
+    wrong = [
+        f"line {i + 2}"
+        for i, row in enumerate(cells[1:] if cells else [])
+        if len(row) != 2 or not row[0].isdecimal() or not 1 <= int(row[0]) <= count or row[1] not in SPLITS
+    ]
+    problems.add_rows(path, wrong, f"expected the number of a spectrum, 1 to {count}, and train or test")
+    if wrong or not cells:
+        return np.zeros(0, np.int64), None
+    train = np.array([row[1] == SPLITS[0] for row in cells[1:]], bool)
+    return np.array([int(row[0]) - 1 for row in cells[1:]]), (np.flatnonzero(train), np.flatnonzero(~train))
 
 
 class _Gateway(NamedTuple):
@@ -153,14 +183,14 @@ def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.nda
     """Images (S, 90, 360) uint8, in the order of their numbers; on disk where they are many."""
     if not folder.is_dir():
         return problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
-    files = {path.name for path in folder.glob("*.png")}
+    there = {path.name for path in folder.glob("*.png")}
     if count is None:
         return None
     expected = [f"{i:05d}.png" for i in range(1, count + 1)]
-    if not files:
+    if not there:
         return problems.add(folder, f"no PNG images in it; tx_pos.csv has {count} rows")
-    missing = [name for name in expected if name not in files]
-    extra = sorted(files - set(expected))
+    missing = [name for name in expected if name not in there]
+    extra = sorted(there - set(expected))
     problems.add_rows(folder, missing, f"missing, but tx_pos.csv has {count} rows")
     problems.add_rows(folder, extra, f"no row for it in tx_pos.csv, which has {count} rows")
     if missing:
@@ -193,7 +223,8 @@ class RFID(Release):
 
     called, reader = "RFID", staticmethod(load_rfid)
     hint = (
-        "Get it from the NeRF2 project (https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, "
+        "Get 200 of its spectra with `gsparc data rfid-200`, or all from "
+        "the NeRF2 project (https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, "
         "tx_pos.csv, spectrum/)"
     )
 

@@ -32,12 +32,13 @@ def context_of(config: DictConfig, **others: Any) -> FitContext:
     """The context of a fit as a composed configuration says, and what is given.
 
     Args:
-        config: its seed, budget, split, `init_from`, batch size, Trainer and callbacks.
+        config: its seed, effort, budget, split, `init_from`, batch size, Trainer and callbacks.
         **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
     """
     init_from, split = config.get("init_from"), config.get("split")
     return FitContext(
         seed=int(config.seed),
+        effort=float(config.get("effort", 1.0)),
         budget_s=config.budget_s,
         budget_clock=config.get("budget_clock", "wall"),
         stations=config.get("stations", "auto"),

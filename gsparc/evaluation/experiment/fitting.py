@@ -127,7 +127,7 @@ def prepare(
     overrides = [*chosen, *contender.overrides(cell.budget_s)]
     config = compose(settings, overrides, problem.draw, cell.seed)
     whole = plain(config)
-    beside = ("trainer", "callbacks", "budget_s", "budget_clock", "init_from", "stations")
+    beside = ("trainer", "callbacks", "effort", "budget_s", "budget_clock", "init_from", "stations")
     trainer = {name: whole[name] for name in beside} | {"batch_size": whole["dataset"].get("batch_size")}
     for file in ((whole["model"].get("init") or {}).get("file"), whole["init_from"]):
         if file and Path(file).is_file():  # walls, and a start, may change under their names

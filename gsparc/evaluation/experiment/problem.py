@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.assemble import identity
 from gsparc.data.load import load, split_for
+from gsparc.data.public.fetch import found
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
@@ -201,8 +202,8 @@ def problems_of(settings: Mapping[str, Any], cells_dir: Path) -> list[Problem]:
     problems: list[Problem] = []
     absent: dict[str, list[str]] = {"here as far as results were kept": [], "left out": []}
     paths = {
-        name: [path for key, path in (of or {}).items() if key in ("root", "file")]
-        for name, of in settings["datasets"].items()
+        name: [path or found(of.get("dataset", name)) for key, path in of.items() if key in ("root", "file")]
+        for name, of in ((name, of or {}) for name, of in settings["datasets"].items())
     }
     here = {name: not of or any(of) for name, of in paths.items()}  # a plugin's dataset may need no path
     for name, own in settings["datasets"].items():
@@ -220,7 +221,9 @@ def problems_of(settings: Mapping[str, Any], cells_dir: Path) -> list[Problem]:
         absent["here as far as results were kept" if stored else "left out"].append(name)
     for how, names in absent.items():
         if names:
-            log.warning("%s %s: say datasets.NAME.root=DIR or .file=FILE", ", ".join(names), how)
+            log.warning(
+                "%s %s: say datasets.NAME.root=DIR or .file=FILE, or gsparc data", ", ".join(names), how
+            )
     order = list(splits)
     problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
     if not problems and not any(here.values()):

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import logging
-import re
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data import heeded
+from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
 from gsparc.data.files import is_address, platform_cache
 from gsparc.data.instantiate import suggest
@@ -21,21 +21,24 @@ from gsparc.data.splits import Split, write_split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.fit import context_of, fit_and_score
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
+from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import new_run_id, provenance, result_rows, write_samples, write_summary
 from gsparc.models import checkpoint, parts
 from gsparc.models.method import Method, TrainsByGradient
-from gsparc.models.registry import build
+from gsparc.models.registry import build, known, method_node
 from gsparc.training import curve, tracking
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
+log_of_models = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
 
 LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 
@@ -72,13 +75,17 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         ValueError: bad data, settings or checkpoint; one line each.
     """
     watch = TimeBudget(clock=config.budget_clock)
-    module = _data(config)
-    data = module.measurements
+    reads = options.noting(config)
+    with heeded.recording(reads):
+        module = _data(config)
+        data = module.measurements
+        split = split_for(plain(config.split), data)
     objective_of(config, data.site.kind)  # refused now, not after the training
     walls = config.get("known_walls") or OmegaConf.select(config, "init.file")
-    known = None if walls is None else read_walls(walls)
-    split = split_for(plain(config.split), data)
+    known_walls = None if walls is None else read_walls(walls)
     split.check()  # none without rows to learn from or to test on
+    for topic, sentence in in_short(data, split):
+        log.info("%-10s%s", topic, sentence)
     run_id = new_run_id()
     write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
     count = len(split.folds)
@@ -89,7 +96,8 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
-        _log_fit(method, report, config.budget_s)
+        for note in report.notes:
+            log_of_models.info("%s", note)
         if not curve.read(folders[number]):  # a method that trains in one piece
             context(number).curve(report.seconds, method.name, report.error)
         marks = parts.marks(report, data, split.folds[number], context(number))
@@ -109,20 +117,25 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
         try:
             make = partial(build, config.model)
-            fitted = fit_and_score(make, data, split, context, eval_on=None, keep=keep)
+            with heeded.recording(reads):
+                fitted = fit_and_score(make, data, split, context, eval_on=None, keep=keep)
+                fitted.methods[0].answer(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
         except KeyboardInterrupt as stopped:
             if count == 1:
                 raise
             cause = str(stopped).partition("; ")[0] or "interrupted"
             raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={run_dir}") from None
         methods = fitted.methods
+        unused = options.unheeded(reads, methods[0], data)
         evaluation = evaluate(
             methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=config.baselines, cache=platform_cache(),
+            shared=_as_baseline(config, methods[0]),
         )  # fmt: skip
         facts: dict[str, Any] = {
             **evaluation.facts, **provenance(), "run_id": run_id,
             "seed": int(config.seed), "model/limited_by_clock": fitted.limited_by,
+            "options/unused": unused,
         }  # fmt: skip
         if fitted.cost.stages:
             facts["time/cost"] = fitted.cost.described(fitted.limited_by)
@@ -141,7 +154,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         tracking.table(loggers, "results", *result_rows(facts, label, config.eval_on))
         objects = methods[0].objects()
         if len(objects):
-            draw_found(data, objects, run_dir / "found.png", known)
+            draw_found(data, objects, run_dir / "found.png", known_walls)
             tracking.picture(loggers, "found", run_dir / "found.png")
     samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
     write_samples(run_dir / "per_sample.csv", samples)
@@ -168,6 +181,13 @@ def _data(config: DictConfig) -> DataModule:
     return module
 
 
+def _as_baseline(config: DictConfig, method: Method) -> str | None:
+    """Its name where a baseline of that name would be fitted in the same way."""
+    plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
+    kind = known().get(method.name)
+    return method.name if plainly and kind and plain(config.model) == method_node(kind) else None
+
+
 def _check_model(config: DictConfig, resumed: bool) -> None:
     """Say what the model guesses; refuse weights to start from, or a resume, where they mean nothing."""
     method = build(config.model)
@@ -176,7 +196,10 @@ def _check_model(config: DictConfig, resumed: bool) -> None:
     if resumed and not method.resumable and not Path(config.ckpt_path).is_dir():  # with parts that finished
         raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
     for guess in method.guesses:
-        log.info("guess: %s", guess)
+        log_of_models.info("guess: %s", guess)
+    guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
+    within = "" if config.budget_s is None else f", within {config.budget_s:g} s"
+    log.info("%-10s%s%s%s", "fitting", method.name, within, guessed)
 
 
 def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
@@ -192,21 +215,6 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
             f"ckpt_path={path}: split={config.split.name} has {folds} folds, give the run's folder"
         )
     return own if own.is_dir() else None
-
-
-def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
-    """What the fit found, and whether a budget or options of the Trainer were asked for and not used."""
-    if budget_s is not None and not method.takes_budget:
-        log.warning("budget_s=%g is not used: the seconds of %s cannot be chosen", budget_s, method.name)
-    if not (isinstance(method, TrainsByGradient) and method.trainer_options()):
-        overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-        unused = [o for o in overrides if re.match(r"[+~]*(trainer[.=]|init_from=)", o)]
-        options = ", ".join(unused) or "accelerator, devices, precision, max_steps, ..."
-        level = logging.WARNING if unused else logging.DEBUG
-        text = "%s does not train by gradient: trainer options (%s) are not used"
-        log.log(level, text, method.name, options)
-    for note in report.notes:
-        log.info("%s", note)
 
 
 def objective_of(config: DictConfig, kind: Kind) -> str:

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.physics.array_response import lags
 from gsparc.processes.factor import Factor
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.time_budget import Effort
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,6 @@ class Recovered:
         residual: (n,) root mean square over pixels of `|A^H h|^2 - image^2`, the part inside the lags.
         floor: (n,) the same for the part that no array vector can explain.
         expected: (n,) the same as quantisation alone would make it.
-        time_limited: (n,) bool: seconds ended the search, so that another machine's result may differ.
     """
 
     vectors: np.ndarray
@@ -49,7 +48,6 @@ class Recovered:
     residual: np.ndarray
     floor: np.ndarray
     expected: np.ndarray
-    time_limited: np.ndarray
 
     @property
     def suspect(self) -> np.ndarray:
@@ -58,7 +56,7 @@ class Recovered:
 
 
 def recover(
-    site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, budget_s: float = 120.0
+    site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, most: int = Effort.restarts
 ) -> Recovered:
     """Array vectors of spectra.
 
@@ -67,11 +65,9 @@ def recover(
         images: (n, H, W) uint8 (255 = 1) or float.
         positions: (n, 3) [m] of the transmitter; neighbours start each other's search.
         seed: of the random starts.
-        budget_s: every row is solved once from its neighbours or from random starts; no row is restarted
-            after this many seconds of the processor, because runs of either clock share the result (spectra
-            of another array never converge) [s].
+        most: every row is solved once from its neighbours or from random starts; of restarts there are at
+            most so many, rows times starts, as spectra of another array never converge.
     """
-    budget, time_limited = TimeBudget(budget_s, "processor"), np.zeros(len(images), dtype=bool)
     problem = _Problem.of(site, images)
     generator = torch.Generator().manual_seed(seed)
     n = len(images)
@@ -88,10 +84,10 @@ def recover(
         unsolved = order[cost[order] > enough[order]]
         if turn == 0:
             unsolved = unsolved[: -(-n // SEEDED)]
+        if turn > 1:
+            unsolved = unsolved[: most // starts]
+            most -= starts * len(unsolved)
         if not len(unsolved):
-            break
-        if turn > 1 and budget.over():
-            time_limited[unsolved.numpy()] = True
             break
         for rows in unsolved.split(max(1, 1536 // starts)):
             keep(rows, _search(problem, rows, problem.random(rows, starts, generator), enough))
@@ -108,7 +104,7 @@ def recover(
         log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
     for rows in every.split(512):
         keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), FINAL_ITERATIONS))
-    return problem.result(state, cost, time_limited)
+    return problem.result(state, cost)
 
 
 def _solved_neighbours(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
@@ -185,12 +181,12 @@ class _Problem:
         error = error - 2 * o * self.z1[rows] - o.square() * self.z0
         return error, torch.cat([2 * half, (-2 * self.z1[rows] - 2 * o * self.z0)[:, :, None]], 2)
 
-    def result(self, state: Tensor, cost: Tensor, time_limited: np.ndarray) -> Recovered:
+    def result(self, state: Tensor, cost: Tensor) -> Recovered:
         m = len(self.forms) // 2
         vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
         offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
         residual, floor, expected = (v.numpy() for v in (cost.sqrt(), self.floor, self.expected))
-        return Recovered(vectors, offset, residual, floor, expected, time_limited)
+        return Recovered(vectors, offset, residual, floor, expected)
 
 
 def _search(

@@ -53,7 +53,6 @@ class Learned:
         error: level and power of the field's `ErrorModel`.
         left_out: training spectra predicted without their neighbours; None for too few.
         elapsed, training: time of phase retrieval in this run, and when it was computed.
-        time_limited: whether seconds ended it.
     """
 
     prior: Prior
@@ -63,7 +62,6 @@ class Learned:
     left_out: LeftOut | None
     elapsed: Spent
     training: Spent
-    time_limited: bool
 
 
 def through_array(task: InitTask) -> Start:
@@ -75,13 +73,13 @@ def through_array(task: InitTask) -> Start:
     assert task.receiver is not None
     if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
         raise ValueError(
-            "init=vectors solves a linear read-out: set model.emission.hidden=0 and "
+            "init=vectors solves a linear read-out: leave init=auto, or set model.emission.hidden=0 and "
             "model.attenuation.inverse_distance=false"
         )
     process = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
     return Start(
         process.prior, partial(start, process=process, receiver=task.receiver), astuple(process.training),
-        astuple(process.elapsed), process.time_limited, process.left_out,
+        astuple(process.elapsed), process.left_out,
     )  # fmt: skip
 
 
@@ -138,7 +136,6 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         tuned.left_out,
         elapsed,
         training,
-        bool(recovery.time_limited.any()),
     )
 
 

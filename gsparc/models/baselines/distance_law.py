@@ -11,7 +11,6 @@ below the level (J. Tobin, "Estimation of relationships for limited dependent va
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +27,7 @@ from gsparc.models.target_rows import entry_variance, to_real
 from gsparc.processes.powers import Rows
 from gsparc.processes.trend import TINY_M, Law, law_of_state
 from gsparc.processes.worker import stop_when_late
+from gsparc.training.time_budget import TimeBudget
 
 EXPONENTS = (0.0, 8.0)  # bounds of n: 2 in free space, 6 through many walls
 USUAL, SPREAD = 3.0, 2.0  # mean and deviation of a prior on n, which only few rows notice
@@ -194,14 +194,14 @@ class DistanceLaw(Differentiable):
         assert self.site is not None
         if self.kind != "rssi":
             raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
-        started = time.perf_counter()
+        started = TimeBudget()
         decibels = to_real(targets, "rssi")[:, 0].astype(np.float64)
         self.law, notes = law_of(Rows(positions, decibels, silent), self.site)
         law = self.law
         summary = (
             f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "
             f"deviation {law_variance(law) ** 0.5:.3g} dB"
-            f" ({time.perf_counter() - started:.2g} s)"
+            f" ({started.spent:.2g} s)"
         )
         return tuple(f"distance_law: {note}" for note in (summary, *notes))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -114,6 +114,7 @@ class GaussianProcess(Differentiable):
 
     name = "gp"
     stored = ("mean", "axes", "lost")
+    stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
     powers: PowerProcess | None = None  # None: not powers
     scores: Posterior | None = None  # of what is not

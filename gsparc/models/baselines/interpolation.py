@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
 from typing import Any, ClassVar
 
@@ -16,6 +15,7 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import from_real, heard, left_out_note, silent, training_targets
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 
 def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
@@ -44,7 +44,7 @@ class Interpolator(Method):
         rows = known if self.uses_censored else heard(data, known)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
-        start = time.perf_counter()
+        start = TimeBudget()
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
         places, targets, unheard = data.moving[rows], training_targets(data, rows), silent(data, rows)
         before = set(vars(self))
@@ -58,7 +58,7 @@ class Interpolator(Method):
                 f"{self.name}: its checkpoint loses {', '.join(lost)}: name it in `stored` (tensor, number, "
                 "string) or make it again in `_relearn(state)`"
             )
-        return FitReport(time.perf_counter() - start, (*notes, *_runs_note(data, known)))
+        return FitReport(start.spent, (*notes, *_runs_note(data, known)))
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""

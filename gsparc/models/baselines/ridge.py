@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +13,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
 from gsparc.models.uplink.interface import UplinkMethod, rms
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
@@ -34,7 +34,7 @@ class Ridge(UplinkMethod):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Solve the normal equations for each penalty and scaling, keep what validates best."""
-        started = time.perf_counter()
+        started = TimeBudget()
         self.site = self._need_uplink(data)
         best: tuple[float, float, bool] | None = None
         for unit in (True, False):
@@ -52,7 +52,7 @@ class Ridge(UplinkMethod):
         self.unit = best[2]
         self.maps = _solve(*self._normal(data, every, self.unit), best[1])
         note = f"ridge: penalty {best[1]:g}, rows {'of unit power' if best[2] else 'as they are'}"
-        return FitReport(time.perf_counter() - started, (note,))
+        return FitReport(started.spent, (note,))
 
     def _normal(self, data: Measurements, rows: np.ndarray, unit: bool) -> tuple[Tensor, Tensor]:
         """Gram matrices (M, F, F) and products with the targets (M, F, O)."""

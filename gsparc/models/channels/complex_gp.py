@@ -10,7 +10,6 @@ predictions at places are those of the largest run, those of measured rows their
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -34,6 +33,7 @@ from gsparc.processes.neighbourhood import Neighbourhood, covering
 from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.prior import Prior
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
@@ -72,7 +72,7 @@ class ComplexGP(Method):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
-        started = time.monotonic()
+        started = TimeBudget()
         if data.site.kind != "csi" or data.site.wavelength is None:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = np.concatenate([fold.train, fold.val])
@@ -83,7 +83,7 @@ class ComplexGP(Method):
         notes = self._fit_many(data, known) if many else self._fit_whole(data, known)
         length, noise = float(self.kernel.length), self.kernel.noise
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
-        return FitReport(time.monotonic() - started, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
+        return FitReport(started.spent, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
 
     def _kernels(self) -> Iterator[WaveKernel]:
         assert self.site is not None and self.site.wavelength is not None

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
 from gsparc.models.channels.columns import Group, ends_of, gather, run_factors_of, thinned
-from gsparc.models.channels.complex_gp import CHOSEN_ON, LENGTHS, NOISES
+from gsparc.models.channels.complex_gp import LENGTHS, NOISES
 from gsparc.models.channels.covariance import BEYOND, Values, disturbance, signals
 from gsparc.models.channels.evidence import (
     Cache,
@@ -37,7 +36,6 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.kernels import cells, directions, plain
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.probe import best_offset
-from gsparc.models.haste import factor_s
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import groups_of
@@ -57,11 +55,6 @@ SHORT = 8  # steps of a fit that compares lengths, or that is followed by anothe
 ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
 DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
-GRID_SHARE = 0.2  # of the seconds, for the grid of envelopes and noises, which has fewer rows if need be
-FEWEST = 150  # of them, that a look is timed with, too
-MIRRORS_SHARE = 0.25  # of the seconds that are left, for mirror planes: directions come after them
-WEIGHTS = 2.0  # factors of all rows that the weights in the end take
-LENGTHS_SHARE = 0.5  # of the seconds, after which no further length is tried
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
 
@@ -76,7 +69,7 @@ class ChannelSettings:
         directions: unequal powers of the diffuse field's directions.
         correlated: noise that is correlated over the order of rows.
         angles: directions of the diffuse field, of a half sphere where all places are in one plane.
-        rows: measurements that powers are learned on at most.
+        rows: measurements that powers are learned on at most; `Effort.term_rows` in `initialise`.
         tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
         narrow: concentration of each of these.
         knots: in that angle.
@@ -134,6 +127,7 @@ def initialise(
     """
     rows, budget = np.asarray(rows), budget or TimeBudget()
     start, factors, notes = _isotropic(data, rows, budget)
+    settings = replace(settings, rows=budget.effort.term_rows)
     search = _Search.of(data, rows, settings, start, factors)
     best, more = search.run(budget)
     channel = (int(data.target.shape[1]), int(data.target.shape[2]))
@@ -145,22 +139,15 @@ def initialise(
 def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[Values, Tensor, list[str]]:
     """Envelope and noise on the grid of `complex_gp`, and the factors of runs, as measured."""
     groups = gather(data, rows, False)
-    looked = thinned(groups, 8, CHOSEN_ON)
+    looked = thinned(groups, 8, budget.effort.chosen_on)
     runs = 1 if data.run is None else len(np.unique(data.run[rows]))
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
-    few, began = thinned(looked, 8, FEWEST), budget.spent
-    _grid_point(few, [plain(g.places, g.places, g.slot.wavenumber, wavelength) for g in few], 1.0, runs)
-    max_s = GRID_SHARE * max(budget.seconds - budget.spent, 0.0) / (len(LENGTHS) * len(NOISES))
-    most = (
-        int(FEWEST * (max_s / max(budget.spent - began, 1e-6)) ** (1 / 3)) if max_s < math.inf else CHOSEN_ON
-    )
-    if most < max(len(group) for group in looked):
-        budget.limited = True
-        looked = thinned(groups, 8, max(most, FEWEST))
-    tried = []
+    tried: list[tuple[float, Tensor, float, float]] = []
     for length in LENGTHS:
         bounded = [plain(g.places, g.places, g.slot.wavenumber, length * wavelength) for g in looked]
         for noise in NOISES:
+            if tried and budget.over():
+                break
             tried.append((*_grid_point(looked, bounded, noise, runs), length * wavelength, noise))
     _, factors, length, noise = min(tried, key=lambda t: t[0])
     everywhere = torch.cat([group.places for group in groups])
@@ -252,17 +239,14 @@ class _Search:
         """The terms that are kept, and notes; what the seconds end is as if it had not been tried."""
         notes: list[str] = []
         steps = [self._measured(self.start, self._compressed(self.start))]
-        longest = max(len(group) for group in self.every)
-        reserve = WEIGHTS * len(self.every) * factor_s(longest)  # for the weights in the end
-        end = max(1 - reserve / max(budget.seconds, 1e-9), 0.0)
         try:
-            with cancelled_by(partial(budget.over, end)):
-                self._grow(steps, notes, budget)
+            with cancelled_by(budget.over):
+                self._grow(steps, notes)
         except Cancelled:
             notes.append("waves: the seconds ended the search for terms")
         return steps[-1], notes
 
-    def _grow(self, steps: list[Candidate], notes: list[str], budget: TimeBudget) -> None:
+    def _grow(self, steps: list[Candidate], notes: list[str]) -> None:
         """Append what each further term makes of the last of `steps`."""
         wanted = self.settings
 
@@ -274,9 +258,9 @@ class _Search:
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
-            step(self._with_fixed(steps[-1], direct, budget), "leakage and direct wave")
+            step(self._with_fixed(steps[-1], direct), "leakage and direct wave")
         if wanted.mirrors and steps[-1].values.direct and ends_of(self.every) > 1:
-            mirrored = self._with_mirrors(steps[-1], budget)
+            mirrored = self._with_mirrors(steps[-1])
             if mirrored is not None:
                 step(mirrored, f"mirror planes of all ends ({len(mirrored.values.planes)})")
         if wanted.directions and one_end:
@@ -327,7 +311,7 @@ class _Search:
         """Whether one end stands."""
         return self.every[0].places.shape[1] == 3
 
-    def _with_fixed(self, before: Candidate, direct: bool, budget: TimeBudget) -> Candidate:
+    def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; lengths by a short fit each, then powers."""
         old = before.values
         values = replace(old, constant=self.settings.constant and self.one_end, direct=direct)
@@ -337,8 +321,6 @@ class _Search:
         tried: list[tuple[Values, float]] = []
         for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if direct else GAINS[:1]:
-                if tried and budget.over(LENGTHS_SHARE):
-                    break
                 envelope, vary = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
                 trial = replace(values, envelope=envelope, gain=vary)
                 tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
@@ -355,17 +337,14 @@ class _Search:
         moved = self._fitted(replace(values, offset=offset))
         return moved if moved.nll < candidate.nll else candidate
 
-    def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
+    def _with_mirrors(self, before: Candidate) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
-        values, late = before.values, budget.over
-        if math.isfinite(budget.seconds):
-            until = budget.spent + MIRRORS_SHARE * max(budget.seconds - budget.spent, 0.0)
-            late = partial(budget.over, until / max(budget.seconds, 1e-9))
+        values = before.values
         rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(values)
         wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
         parts = wide._compressed(values)
         most = self.settings.mirrors
-        planes, sequences = find_mirrors(rough, parts, values, self.wavelength, most, late)
+        planes, sequences = find_mirrors(rough, parts, values, self.wavelength, most)
         if not sequences:
             return None
         power, end = values.power, values.where("noise")[0]

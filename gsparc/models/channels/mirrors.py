@@ -20,6 +20,7 @@ from gsparc.models.channels.covariance import Values, image_waves
 from gsparc.models.channels.evidence import Compressed
 from gsparc.models.channels.probe import Probe, summed_gains
 from gsparc.physics.mirror_planes import Reflections, images
+from gsparc.processes.worker import raise_if_cancelled
 
 LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
 MARGIN = 0.3  # how far beyond places and ends planes may be, of their extent
@@ -116,7 +117,7 @@ class _Searcher:
 
 def find_mirrors(
     coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], values: Values,
-    wavelength: float, most: int, late: Callable[[], bool],
+    wavelength: float, most: int,
 ) -> tuple[Tensor, tuple[Reflections, ...]]:  # fmt: skip
     """Planes (W, 4) float64, local, and images in them; none where all together are not worth it.
 
@@ -126,7 +127,6 @@ def find_mirrors(
         values: the terms beside.
         wavelength: [m].
         most: planes.
-        late: asked again and again; nothing new is tried when it says so.
     """
     rough, probes = (
         tuple(Probe.of(part, part.own(values.power, values.towards)) for part in each)
@@ -136,7 +136,8 @@ def find_mirrors(
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
     grid, turn = candidates(rough, values, wavelength)
-    while len(search.planes) < most and not late():
+    while len(search.planes) < most:
+        raise_if_cancelled()
         scores = search.gains(search.rough, grid, _single(len(grid)), _about).max(1).values
         if not len(search.planes):
             top = scores.topk(min(PROMISING, len(grid))).indices
@@ -147,7 +148,8 @@ def find_mirrors(
             break
         search.keep(torch.cat([search.planes, plane[None]]), (len(search.planes),), level, gain)
     planes, pairs = search.planes, list(permutations(range(len(search.planes)), 2))
-    while not late():
+    while True:
+        raise_if_cancelled()
         pairs = [pair for pair in pairs if search.is_new(planes, [*search.sequences, pair], SAME)]
         if not pairs:
             break

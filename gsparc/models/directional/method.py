@@ -13,7 +13,6 @@ probability.
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -38,6 +37,7 @@ from gsparc.physics.waves import ranges, wave, wave_over_band
 from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out_group
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.
 MIN_SEEN, MAX_SOURCES = 2, 60
@@ -119,7 +119,7 @@ class DirectionalGP(FramedMethod):
         Raises:
             ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
         """
-        started = time.monotonic()
+        started = TimeBudget()
         refuse(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
@@ -152,7 +152,7 @@ class DirectionalGP(FramedMethod):
             f"{math.degrees(clusters.error):.2g} degrees; {changed} visibility entries changed by channels; "
             f"constant share of the gains' variance {self.kernel.constant:.1%}"
         )
-        return FitReport(time.monotonic() - started, (note,))
+        return FitReport(started.spent, (note,))
 
     @property
     def sources(self) -> Tensor:

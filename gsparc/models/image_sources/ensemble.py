@@ -1,13 +1,14 @@
-"""Ensemble of searches within a time budget, in parallel on the available threads."""
+"""Ensemble of searches of a counted effort, in parallel on the available threads."""
 
 from __future__ import annotations
 
 import logging
 import math
 import threading
-from collections.abc import Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from functools import partial
+from itertools import takewhile
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.processes.worker import Cancelled, cancelled_by, late_when
+from gsparc.processes.worker import Cancelled, after, cancelled_by, late_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -27,10 +28,7 @@ log = logging.getLogger(__name__)
 QUADRATURE = 0.4  # initial `Scene.quadrature`
 SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
-# Of the budget: no search starts, none adds sources, none goes on after; the rest is for the final process.
-LAST_START, ROUNDS_END, SEARCH_END = 0.6, 0.8, 0.9
-FINAL_SHARE = 0.1  # least share of the budget for the final process
-PROGRESS_S = 10.0  # [s] between two lines about progress
+ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
 BEATEN = 2.0  # times the error of a rival: sources that missed more had no weight in the end
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
@@ -48,8 +46,8 @@ def search_many(
 ) -> list[Member]:
     """One search per set of rows, best first; at least one, others while the budget lasts.
 
-    Once two have reached the noise floor, or one is `beaten`, no further search starts, and those under way
-    end without a result.
+    The first two that have reached the noise floor, or the first that is `beaten`, are the last: searches
+    of higher numbers do not start, or end without a result, whichever of them is finished first.
 
     Args:
         row_sets: rows of each search, unit mean power, about the middle of the scene.
@@ -57,7 +55,7 @@ def search_many(
         settings: of every search.
         seed: of the first search; the others count on.
         noise_floor: known variance of the noise, in units of the rows' power.
-        budget: of all together; see `LAST_START`, `ROUNDS_END` and `SEARCH_END`.
+        budget: effort of each, and what ends all together.
         clutter: search for occluding boxes and finite mirrors, too.
         cache: of finished searches.
         rival: see `FitContext`.
@@ -65,17 +63,24 @@ def search_many(
     Raises:
         KeyboardInterrupt: by the user, within a step of each search.
     """
-    errors: list[float] = []
+    errors: dict[int, float] = {}
     stopped = threading.Event()
 
-    def unwanted() -> bool:
-        ended = at_noise_floor(errors, noise_floor) or (bool(errors) and beaten(min(errors), rival))
+    def ends(share: float) -> Callable[[], bool]:
+        """Whether so much of a search's effort, from now, or all of the seconds are spent."""
+        counted = after(round(share * budget.effort.evaluations))
+        return lambda: counted() or budget.over()
+
+    def unwanted(number: int) -> bool:
+        """Whether those before it are all that is wanted."""
+        before = list(takewhile(lambda error: error is not None, map(errors.get, range(number))))
+        ended = at_noise_floor(before, noise_floor) or (len(before) > 0 and beaten(before[0], rival))
         return stopped.is_set() or ended
 
     def solve(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
-        rows, last_round = row_sets[number], partial(budget.over, ROUNDS_END)
-        scene = Search(rows, transmitter, settings, seed + number, last_round).run()
+        rows = row_sets[number]
+        scene = Search(rows, transmitter, settings, seed + number, ends(ROUNDS_SHARE)).run()
         scene = with_phases(rows, scene, QUADRATURE, noise_floor)
         scene = refine(rows, learn_visibility(rows, scene, 10, settings.visibility), 20)
         error = left_out_error(rows, scene)
@@ -88,22 +93,21 @@ def search_many(
 
     def search(number: int) -> Member | None:
         if member := cache.find(number, noise_floor):
-            errors.append(member.left_out)
+            errors[number] = member.left_out
             return member
-        if unwanted() or (number > 0 and budget.over(LAST_START)):
+        if unwanted(number) or (number > 0 and budget.over()):
             return None
         try:
-            with cancelled_by(unwanted), late_when(partial(budget.over, SEARCH_END)):
+            with cancelled_by(partial(unwanted, number)), late_when(ends(1.0)):
                 member = solve(number)
         except Cancelled:
             return None
         scene = member.scene
         log.info(
-            "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
+            "search %d of %d: %d sources over %d planes, error %.3f",
             number + 1, len(row_sets), len(scene.sequences), len(scene.planes), member.left_out,
-            budget.spent, budget.seconds,
         )  # fmt: skip
-        errors.append(member.left_out)
+        errors[number] = member.left_out
         cache.put(member, budget.limited_by)
         return member
 
@@ -113,29 +117,13 @@ def search_many(
     pool = ThreadPoolExecutor(max(1, min(threads, len(row_sets))))
     try:
         running = [pool.submit(search, number) for number in range(len(row_sets))]
-        _watch(running, budget)
-        members = [member for each in running if (member := each.result()) is not None]
+        wait(running, return_when=FIRST_EXCEPTION)
+        members = [m for number, one in enumerate(running) if (m := one.result()) and not unwanted(number)]
     finally:
         stopped.set()
         pool.shutdown(cancel_futures=True)  # waits for the step of each search
         torch.set_num_threads(threads)
     return sorted(members, key=lambda member: member.left_out)
-
-
-def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
-    """Wait for the searches; say every `PROGRESS_S` how long they may still take."""
-    waiting = set(running)
-    while waiting:
-        done, waiting = wait(waiting, PROGRESS_S, FIRST_EXCEPTION)
-        if any(each.exception() for each in done):
-            return
-        if waiting:
-            finished = sum(each.done() and each.result() is not None for each in running)
-            left = max(SEARCH_END * budget.seconds - budget.spent, 0.0)
-            log.info(
-                "%d of %d searches finished, %.0f of %.0f s, at most about %.0f s left",
-                finished, len(running), budget.spent, budget.seconds, left,
-            )  # fmt: skip
 
 
 def refined(rows: Rows, member: Member) -> Member:
@@ -163,18 +151,6 @@ def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2
 def beaten(error: float, rival: float) -> bool:
     """Whether a solution of such an error would hardly have weight beside one of error `rival`."""
     return error > BEATEN * rival
-
-
-def affordable_rows(rows: Rows, members: list[Member], budget: TimeBudget) -> int:
-    """Rows of final processes that fit into the rest of the budget; all of one search at least.
-
-    A covariance of n rows takes n^3; that of a search's rows is timed.
-    """
-    started = budget.spent
-    assert Posterior(rows, members[0].scene).conditioned
-    each = max(budget.spent - started, 1e-6)
-    rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
-    return max(int(len(rows) * (rest / (each * len(members))) ** (1 / 3)), len(rows))
 
 
 def ensemble_weights(members: list[Member]) -> Tensor:

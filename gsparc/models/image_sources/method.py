@@ -19,7 +19,6 @@ from gsparc.data.splits import Fold
 from gsparc.models.conditional import LeftOutRows
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
 from gsparc.models.image_sources.ensemble import (
-    affordable_rows,
     at_noise_floor,
     beaten,
     ensemble_weights,
@@ -53,10 +52,7 @@ from gsparc.training.time_budget import TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
 
-SECONDS_PER_ROW = 0.02  # [s], times measurements^1.5: 130 s for 350 in a conference room, 370 s for 700
-MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
-ALIGNMENT_SHARE = 0.25  # of the budget, for each of these searches
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
 
 
@@ -65,7 +61,7 @@ class ImageSourceGP(FramedMethod):
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
-        budget_s: approximate time of all searches [s]; None: 120 to 400 s by the number of measurements.
+        budget_s: as `FitContext.budget_s`, where that says nothing [s].
         search_rows: receivers times tones of a search.
         rows: receivers times tones of the final process.
         margin, max_sources, order: see `SearchSettings`.
@@ -132,7 +128,9 @@ class ImageSourceGP(FramedMethod):
     def _fit(
         self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
     ) -> FitReport:
-        budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
+        if context.budget_s is None:
+            context = replace(context, budget_s=self.budget_s)
+        budget = context.time_budget(cache.spent)
         self.site, self.antennas = data.site, data.target.shape[1]
         self.frame = frame_of(data.site, gather(data, known, self.row_limit, self.seed))
         noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
@@ -157,11 +155,6 @@ class ImageSourceGP(FramedMethod):
                 members = [refined(row_sets[one.number], one) for one in members]
         self.weights = ensemble_weights(members)
         rows = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-        affordable = affordable_rows(row_sets[0], members, budget)
-        if affordable < len(rows):
-            budget.limited = True
-            notes.append(f"{self.name}: {affordable} of {len(rows)} rows in the final process: time is short")
-            rows = rows.take(torch.linspace(0, len(rows) - 1, affordable).long())
         self._conditioned(rows, [member.scene for member in members])
         self.held = self._left_out_rows(data, known, members, len(rows))
         notes += self._described(members, budget)
@@ -178,10 +171,10 @@ class ImageSourceGP(FramedMethod):
         scene, notes = self.members[0].scene, []
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in members], self.noise_floor)
-        ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
+        ended = "noise floor reached" if agree else "all counted"
         if beaten(min(member.left_out for member in members), self._rival):
             ended = "far behind another solution"
-        ended += ", ended by the time budget" if budget.limited else ""
+        ended = "ended by the time budget" if budget.limited else ended
         notes.append(f"{len(members)} of {self.searches} searches ({ended}), {counts} sources")
         inside = int(scatterers(scene.sources, box_of(self.members[0].rows, scene.transmitter)).sum())
         notes.append(f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers")
@@ -210,13 +203,6 @@ class ImageSourceGP(FramedMethod):
         settings = (self.search_rows, self.row_limit, self.offsets, self.clutter, self.settings)
         rows = sha256(b"".join(part.tobytes() for part in (known, *self._groups))).hexdigest()
         return {"data": identity(data), "rows": rows, "seed": str(self.seed), "settings": str(settings)}
-
-    def _budget(self, measurements: int, given_s: float | None) -> float:
-        if given_s is not None:
-            return given_s
-        if self.budget_s is not None:
-            return self.budget_s
-        return min(max(SECONDS_PER_ROW * measurements**1.5, MIN_BUDGET_S), MAX_BUDGET_S)
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
@@ -268,10 +254,8 @@ class ImageSourceGP(FramedMethod):
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
-            now = TimeBudget(ALIGNMENT_SHARE * budget.seconds, budget.clock)
             rows = self._row_sets(aligned, known, 1)
-            scene = self._search(rows, few, now, False, SearchCache())[0].scene
-            budget.limited |= now.limited
+            scene = self._search(rows, few, budget, False, SearchCache())[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)
                 gains = Posterior(rows[0], scene).mean_gains

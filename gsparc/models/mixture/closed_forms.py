@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsparc.data import heeded
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -14,7 +15,6 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import INITIALISERS
-from gsparc.models.haste import factor_s
 from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.mixture import solutions
 from gsparc.models.mixture.weights import comparable, explained
@@ -24,11 +24,6 @@ from gsparc.training.cost import Cost
 from gsparc.training.time_budget import less_repeatable
 
 log = logging.getLogger(__name__)
-
-DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
-LAST_SHARE = 0.1  # of the budget, kept for weighing solutions and for the weights of all rows
-RAYS_FACTORS = 1_500.0  # covariances of all rows, as long as measured rays take
-LEAST_FACTORS, MOST_FACTORED = 2.0, 3_000  # covariances of all rows that any fit makes, and rows of one
 
 
 @dataclass(frozen=True)
@@ -61,23 +56,16 @@ def solve(
     Raises:
         ValueError: the only initialiser, or the one asked for, cannot solve this.
     """
-    if context.budget_s is None:
-        context = replace(context, budget_s=DEFAULT_BUDGET_S)
     budget = context.time_budget()
-    log.info(
-        "training a Gaussian field with closed-form weights: init=%s, within %.3g s",
-        " and ".join(parts), context.budget_s,
-    )  # fmt: skip
+    end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
+    log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
     known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
-    if (least := _least_s(parts, data, len(known))) > budget.seconds:
-        log.warning("%g s are too few: the least fit of these rows takes about %.0f s", budget.seconds, least)
     cut = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
-    until_s = budget.seconds * (1 - LAST_SHARE)
-    share = solutions.CLOSED_SHARE * max(budget.seconds - budget.spent, solutions.LEAST_S)
-    runs = _runs(data, known, init, replace(context, budget_s=share))
+    runs = _runs(data, known, init, context)
     data = runs.aligned(data)
-    fields, reports = solutions.find(parts, init, effects, data, fold, context, budget, until_s, cut)
+    fields, reports, read = solutions.find(parts, init, effects, data, fold, context, budget, cut)
     members = solutions.weighed(fields, data, fold, cut)
+    heeded.count(*(path for name in members for path in read[name]))
     field, started = solutions.joined(members), "+".join(members)
     field.site = data.site
     init_s = budget.counted.wall
@@ -95,7 +83,7 @@ def solve(
     unused = {name: spent for name, spent in stages.items() if name in reports and name not in members}
     notes = [note for name in members for note in reports[name].notes]
     limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-    report = with_cost(FitReport(seconds, tuple(notes), limited), Cost(stages, unused, _late_gain(reports)))
+    report = with_cost(FitReport(seconds, tuple(notes), limited), Cost(stages, unused))
     return Solved(field, started, runs, share_explained, init_s, report)
 
 
@@ -103,14 +91,6 @@ def with_cost(report: FitReport, cost: Cost) -> FitReport:
     """The report of a fit, whose last line is what it cost."""
     log.info("cost: %s", cost.described(report.limited_by))
     return replace(report, cost=cost)
-
-
-def _least_s(parts: tuple[str, ...], data: Measurements, rows: int) -> float:
-    """The least that a fit of so many rows takes [s]."""
-    count = 1 if data.site.stations is None else len(data.site.stations)
-    one_fit = LEAST_FACTORS * count * factor_s(min(rows // count, MOST_FACTORED))
-    least = one_fit if len(parts) == 1 else one_fit * (1 + solutions.GROUPS)
-    return least + ("rays" in parts) * RAYS_FACTORS * factor_s(min(rows, MOST_FACTORED))
 
 
 def _runs(data: Measurements, known: np.ndarray, init: InitSettings, context: FitContext) -> RunFactors:
@@ -134,11 +114,3 @@ def _explained(field: ConditionalField, data: Measurements, fold: Fold, apart: b
     assert result is not None
     own, target = (comparable(one, data.site) for one in (result, batch.target))
     return explained(own, target, data.site.kind != "csi")
-
-
-def _late_gain(reports: dict[str, FitReport]) -> float | None:
-    """Least held-out error of solutions found in the first half of their seconds, over that of all."""
-    ends = np.cumsum([one.seconds for one in reports.values()])
-    early = [one for one, end in zip(reports.values(), ends, strict=True) if end <= ends[-1] / 2]
-    first, last = solutions.least_error(early), solutions.least_error(reports.values())
-    return first / max(last, 1e-12) if np.isfinite(first) else None

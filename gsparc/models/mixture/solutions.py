@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.data import heeded
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -20,7 +21,6 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.conditional import ConditionalField, LeftOutRows
 from gsparc.models.fields import INITIALISERS
-from gsparc.models.haste import factor_s
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
@@ -36,30 +36,27 @@ log = logging.getLogger(__name__)
 MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 GROUPS = 3  # of training rows, that solutions are weighed by
 FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
-CLOSED_SHARE = 0.3  # of the seconds, for what takes no more than it needs beside what does
-FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 HOPELESS = 1.5  # times the error of waves from all around, of few sources: more had no weight then
-SEARCH_LOOKS = 60  # at a search's rows, that the shortest takes
-LEAST_S = 0.2  # of a part, though others left none
-OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
+OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what effort they are given
+CLUTTERED = ("sources", "scene", "joint_powers")  # initialisers to which `clutter` means something
 SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
 
 
 def find(
     parts: tuple[str, ...], init: InitSettings, effects: EffectSettings, data: Measurements, fold: Fold,
-    context: FitContext, budget: TimeBudget, until_s: float, cut: InnerFolds | None,
-) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:  # fmt: skip
-    """What initialisers find, and what each cost.
+    context: FitContext, budget: TimeBudget, cut: InnerFolds | None,
+) -> tuple[dict[str, ConditionalField], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
+    """What initialisers find, what each cost, and which settings each read.
 
     Where they are several, training rows are cut into groups as the test was cut, and each solution
     predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
-    few sources is a solution of its own next to the one that takes what seconds are left: many sources fit
-    rows near others better, few of them what is far.
+    few sources is a solution of its own next to the one that takes all its effort: many sources fit rows near
+    others better, few of them what is far.
 
     Args:
         parts: names of initialisers, which have settings `init`.
         fold: validation rows are solved for, too, where nothing is weighed.
-        until_s: the second of the running `budget` by which all should be found.
+        budget: running; what is left of it ends each.
         cut: how training rows are cut; None of one initialiser.
 
     Raises:
@@ -68,38 +65,36 @@ def find(
     several = cut is not None
     rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
     groups = () if cut is None else _groups(cut, fold.train)
-    first = CLOSED_SHARE if any(part in OPEN_ENDED for part in parts) else 1.0
-    plans = [(part, init, first) for part in parts if part not in OPEN_ENDED]
+    plans = [(part, init) for part in parts if part not in OPEN_ENDED]
     for part in (part for part in parts if part in OPEN_ENDED):
         if several and part in SEARCHES:
-            plans.append((f"few {part}", replace(init, **FEW), FEW_SHARE))
-        plans.append((part, init, 1.0))
+            plans.append((f"few {part}", replace(init, **FEW)))
+        plans.append((part, init))
     fields: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
-    for name, settings, share in plans:
+    read: dict[str, set[str]] = {}
+    for name, settings in plans:
         part = name.split()[-1]
-        least = SEARCH_LOOKS * factor_s(settings.search_rows) if part in SEARCHES else 0.0
-        if fields and context.resume is None and least > until_s - budget.spent:
-            log.info("init=%s is left out: the seconds are too few for a search", name)
-            budget.limited = True
+        if fields and context.resume is None and part in SEARCHES and budget.over():
+            log.info("init=%s is left out: the seconds were over", name)
             continue
         if part in SEARCHES and (why := _hopeless(name, reports)) is not None:
             log.info("init=%s is left out: %s", name, why)
             continue
-        within = replace(context, budget_s=share * max(until_s - budget.spent, LEAST_S))
+        within = replace(context, budget_s=budget.left_s)
         if name.startswith("few "):
             within = replace(within, run_dir=Path(), resume=None)
         try:
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
             within = replace(within, leave_out=leave_out, rival=least_error(reports.values()))
-            clutter = effects.visibility is not False
-            with late_when(budget.over):
+            with heeded.apart() as read[name], late_when(budget.over):
+                clutter = part not in CLUTTERED or effects.visibility is not False
                 field, report = INITIALISERS[part](data, rows, settings, clutter, within)
-            if effects.residual is False and isinstance(field, Mixture):
-                field = next(one for _, one in field.parts())
+                if isinstance(field, Mixture) and effects.residual is False:
+                    field = next(one for _, one in field.parts())
             fields[name] = field
             if part not in OPEN_ENDED:
-                field.held = _held(field, data, rows, groups, until_s, budget, report.seconds)
+                field.held = _held(field, data, rows, groups)
         except KeyboardInterrupt:
             if not name.startswith("few "):
                 raise
@@ -115,7 +110,7 @@ def find(
             miss = solution_weights.error(comparable(field.held.mean, data.site), target)
             report = replace(report, error=miss)
         reports[name] = report
-    return fields, reports
+    return fields, reports, read
 
 
 def least_error(reports: Iterable[FitReport]) -> float:
@@ -191,25 +186,13 @@ def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _held(
-    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...],
-    until_s: float, budget: TimeBudget, fitted_s: float,
-) -> LeftOutRows | None:  # fmt: skip
-    """Rows of every group, predicted from the others with the parameters of all; None where time is short.
-
-    Args:
-        until_s: second of the budget by which that must be done.
-        fitted_s: seconds of the fit, about what the weights may take at most.
-    """
+    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
+) -> LeftOutRows | None:
+    """Rows of every group, predicted from the others with the parameters of all; None without groups."""
     if not groups:
         return None
-    answers, began = [], budget.spent
-    for number, group in enumerate(groups):
-        each = (budget.spent - began) / number if number else fitted_s
-        if budget.spent + each > until_s:
-            budget.limited = True
-            if number:
-                field.condition(data, rows)
-            return None
+    answers = []
+    for group in groups:
         field.condition(data, np.setdiff1d(rows, group))
         batch = data.batch(group)
         answers.append(field(batch.tx, batch.rx))

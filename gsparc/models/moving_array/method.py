@@ -7,8 +7,6 @@ goes to a Gaussian process on images. Images of several searches are averaged.
 from __future__ import annotations
 
 import logging
-import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -47,8 +45,6 @@ log = logging.getLogger(__name__)
 
 UNRESOLVED = 2e-4  # of the images' energy, that the basis of the residual leaves out per mode
 MIN_GAIN = 0.005  # of the leave-one-out error: searches end when the last one gained less
-BUDGET_SHARE = 0.8  # of the budget, by which the last search must end
-SEARCH_SHARE = 0.7  # the same without the kernel of its powers
 
 
 @dataclass(frozen=True)
@@ -78,17 +74,16 @@ class Spectra:
 class MovingArrayField(Differentiable):
     """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
 
-    With `trainer.budget_s` it searches until the budget is spent or the leave-one-out error stops falling.
+    It searches until the leave-one-out error stops falling, the searches are done or the seconds are over.
 
     Args:
         search: how sources are found.
         trend: how smooth their powers are.
-        searches: number, without a budget.
+        searches: number.
         rest_rows: that the residual's kernel is chosen on; seconds grow with their cube.
         components: largest number of principal components of the residual; 0: the trends alone.
         seed: of the first search; the others have the next ones.
         name: as it appears in tables.
-        most_searches: with a budget, at most so many; None: as many as help.
     """
 
     effects = "moving_array"
@@ -103,7 +98,6 @@ class MovingArrayField(Differentiable):
         components: int = 512,
         seed: int = 0,
         name: str = "moving_array",
-        most_searches: int | None = None,
     ) -> None:
         super().__init__()
         if searches < 1 or rest_rows < 3:
@@ -112,7 +106,7 @@ class MovingArrayField(Differentiable):
             )
         self.search, self.trend = search, trend
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
-        self.seed, self.name, self.most_searches = seed, name, most_searches
+        self.seed, self.name = seed, name
         self.trends: list[Trend] = []
         self._budget = TimeBudget()
 
@@ -142,33 +136,25 @@ class MovingArrayField(Differentiable):
     # -- learning ----------------------------------------------------------------------------------
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        begin, budget, longest = time.perf_counter(), self._budget, 0.0
+        budget, watch = self._budget, TimeBudget()
         self.exponent = self._exponent(targets)
         self.basis = separable(self._blocks(targets), UNRESOLVED)
         spectra = self._spectra(positions, targets)
         self.trends, errors = [], []
         modelled = torch.zeros_like(spectra.values)  # sum over searches of left-out images
         while True:
-            start = time.perf_counter()
             sources = self._find(spectra)
             power = self._powers(spectra, sources)
             modelled += self._add(spectra, sources, power, self._choose_kernel(spectra, sources, power))
             rows = _spread(len(positions), self.trend.rows)
             left = spectra.values[rows] - modelled[rows] / len(self.trends)
             errors.append(left_out_error(positions[rows], left)[0] / targets[0].size)
-            now = time.perf_counter()
-            longest = max(longest, now - start)
             log.info(
                 "%s: search %d, %d sources, trend length %.3g m, leave-one-out error %.4g, %.0f s",
-                self.name, len(errors), len(sources), self.trends[-1].kernel.length, errors[-1], now - begin,
+                self.name, len(errors), len(sources), self.trends[-1].kernel.length, errors[-1], watch.spent,
             )  # fmt: skip
-            if budget.seconds == math.inf:
-                done = len(errors) == self.searches
-            else:
-                late = budget.over(BUDGET_SHARE - longest / budget.seconds)
-                done = late or len(errors) == self.most_searches
-                done |= len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2]
-            if done:
+            settled = len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2]
+            if settled or len(errors) == self.searches or budget.over():
                 break
         modelled /= len(self.trends)
         rows = _spread(len(positions), self.rest_rows)
@@ -227,13 +213,8 @@ class MovingArrayField(Differentiable):
         first = None if static is None else torch.from_numpy(np.asarray(static)).float()
         return find_sources(
             some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
-            self.seed + len(self.trends), self._seconds,
+            self.seed + len(self.trends), self._budget.over,
         )  # fmt: skip
-
-    def _seconds(self) -> float:
-        """Left for the search under way [s]; whoever has none of them ends what it does."""
-        self._budget.over(SEARCH_SHARE)
-        return SEARCH_SHARE * self._budget.seconds - self._budget.spent
 
     def _powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:
         """Powers (n, K) float64 that explain each row best."""

@@ -16,7 +16,6 @@ from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 
 SWEEPS = 20  # of coordinate descent: powers are then within 1 % of the optimum
-REFINED = 0.6  # of a search's seconds are for the refinement
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def find_sources(
     grid: SphereGrid,
     settings: SearchSettings,
     seed: int,
-    seconds: Callable[[], float],
+    over: Callable[[], bool],
 ) -> Tensor:
     """Positions (K, 3) float32 [m] of sources.
 
@@ -102,11 +101,8 @@ def find_sources(
         grid: of the spectra; candidates are scored at their nearest pixel.
         settings: how.
         seed: of the candidates.
-        seconds: that are left [s]; sources are added for a part of them, and the schedule of the refinement
-            ends with them.
+        over: asked between steps, which end when it says so.
     """
-    limit_s = seconds()
-    end = REFINED * limit_s if limit_s < math.inf else 0.0
     generator = torch.Generator().manual_seed(seed)
     low, high = receivers.min(0).values, receivers.max(0).values
     far = settings.reach * float((high - low).norm())
@@ -129,18 +125,17 @@ def find_sources(
         positions = torch.cat([positions, new[: settings.sources - len(positions)]])
         residual = residual_of(lags, receivers, positions)
         before, energy = energy, float(residual.square().sum())
-        if energy > (1 - settings.least_gain) * before or seconds() <= end:
+        if energy > (1 - settings.least_gain) * before or over():
             break
     if settings.steps == 0 or len(positions) == len(known):
         return positions
     # Powers are optimal at every step, so that their derivative does not enter the gradient.
     free = positions[len(known) :].clone().requires_grad_(True)
     optimiser = torch.optim.Adam([free], lr=settings.rate)
-    whole = seconds()
     for step in range(settings.steps):
-        progress = max(step / settings.steps, 1 - seconds() / whole if 0 < whole < math.inf else 0.0)
-        if progress >= 1 or whole <= 0:
+        if over():
             break
+        progress = step / settings.steps
         optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         some = torch.randperm(len(receivers), generator=generator)[:64]
         residual = residual_of(lags[some], receivers[some], torch.cat([known, free]))

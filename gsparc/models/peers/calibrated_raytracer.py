@@ -8,7 +8,6 @@ path, it predicts the median of the training rows where it traces none.
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, Literal, get_args
 
@@ -35,6 +34,7 @@ from gsparc.simulate.paths import Paths
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import from_config, known_scene, load_tracer
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 Start = Literal["generic", "scene"]
 
@@ -95,7 +95,7 @@ class CalibratedRayTracer(Method):
         fault = self.problem(data)
         if fault is not None:
             raise ValueError(fault)
-        begin = time.perf_counter()
+        begin = TimeBudget()
         self.site = data.site
         try:
             scene = known_scene(self.scene, data.provenance, float(data.site.carrier_hz or 0.0))
@@ -118,7 +118,7 @@ class CalibratedRayTracer(Method):
         self._silent_db = float(np.median(measured[~reached]) if not reached.all() else measured.min())
         if data.site.kind == "csi":
             self._factor = self._best_factor(data, rows)
-        return FitReport(time.perf_counter() - begin, self._notes(len(rows) - int(reached.sum())))
+        return FitReport(begin.spent, self._notes(len(rows) - int(reached.sum())))
 
     def _notes(self, dark: int) -> tuple[str, ...]:
         assert self.learned is not None

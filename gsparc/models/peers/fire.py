@@ -6,7 +6,6 @@ paths, and the decoder evaluates them in the other band. Sizes and training are 
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +19,7 @@ from gsparc.models.method import Prediction
 from gsparc.models.peers.trained import perceptron
 from gsparc.models.uplink.interface import UplinkMethod, rms
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 
 class Network(nn.Module):
@@ -66,7 +66,7 @@ class Fire(UplinkMethod):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train on all antennas of train and val rows (no choice is made on val)."""
-        started = time.perf_counter()
+        started = TimeBudget()
         self.site = self._need_uplink(data)
         rows = data.batch(np.concatenate([fold.train, fold.val]))
         assert rows.uplink is not None
@@ -93,7 +93,7 @@ class Fire(UplinkMethod):
             optimizer.step()
             schedule.step()
         self.network.eval().requires_grad_(False)
-        return FitReport(time.perf_counter() - started)
+        return FitReport(started.spent)
 
     @torch.no_grad()
     def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:

@@ -1,13 +1,15 @@
 """The field of received powers: what the path loses in known walls, and a process of the rest.
 
 In decibels: a constant or a distance law, uncertain; a loss for each known wall on the straight path between
-the ends; one or two Matern-3/2 of place; noise. Without walls it is `model=gp`. Where a wavelength is sampled
-powers interfere: there coherent waves stand beside the process.
+the ends; one or two Matern-3/2 of place; noise. Of many rows the mean of such processes is taken, by what
+squares left out say. Where a wavelength is sampled powers interfere: there coherent waves stand beside one
+process.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,20 +23,19 @@ from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.models.haste import haste
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
-from gsparc.models.powers.settings import choose_prior, chosen_among
+from gsparc.models.powers.settings import candidates, chosen_among, mixture
 from gsparc.models.target_rows import entry_variance, from_real, rows_of
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
+from gsparc.processes.powers import PowerProcess, Rows, conditioned, trend_of_rows
+from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend, Walls, trend_of
 from gsparc.training.time_budget import TimeBudget
 
 QUERIES = 512  # at a time: memory
-CHOOSING = 0.3  # of the seconds, for the settings of the process
-CHOOSING_ALONE = 0.8  # the same where no waves are sought after it
 
 
 class PowerField(ConditionalField):
@@ -46,6 +47,7 @@ class PowerField(ConditionalField):
         kernel: of the process.
         seed: of rows drawn where there are too many.
         fringes: of coherent waves, beside the process.
+        others: further priors with their shares in the mean; the rest is that of trend and kernel.
     """
 
     kind = "powers"
@@ -57,8 +59,9 @@ class PowerField(ConditionalField):
         kernel: Kernel,
         seed: int = 0,
         fringes: Fringes | None = None,
+        others: Sequence[tuple[float, Prior]] = (),
     ) -> None:
-        self.fringes = fringes
+        self.fringes, self.others = fringes, tuple(others)
         self.site, self.trend, self.kernel, self.seed = site, trend, kernel, seed
         self.process: PowerProcess | None = None
         self._tree: cKDTree | None = None  # of its places, made when it is asked
@@ -85,7 +88,10 @@ class PowerField(ConditionalField):
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`; what rows say where nothing was heard is that powers are below a level."""
         seen = rows_of(data, rows)
-        self.process, _ = conditioned(seen, self.trend, self.kernel, self.seed)
+        first = Prior(self.kernel, self.trend)
+        own, *others = (_given(seen, prior, self.seed) for prior in (first, *(one for _, one in self.others)))
+        shares = (share for share, _ in self.others)
+        self.process = replace(own, others=tuple(zip(shares, others, strict=True)))
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
@@ -117,12 +123,11 @@ class PowerField(ConditionalField):
             ValueError: before `condition`.
         """
         process = self._conditioned()
-        posterior = process.posterior
-        mean, variance = posterior.left_out()
-        loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
-        decibels, spread = mean[loud, 0], process.kernel.amplitude * variance[loud]
-        places = process.places[loud]
+        decibels, spread = process.left_out(self.at)
         if self.fringes is not None:
+            posterior = process.posterior
+            loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
+            places = process.places[loud]
             decibels, factor = self.fringes.blended_unseen(
                 decibels, torch.from_numpy(places), torch.from_numpy(nearest(places)), self.known
             )
@@ -144,6 +149,7 @@ class PowerField(ConditionalField):
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
+            "others": [{**prior.state(), "share": share} for share, prior in self.others],
             **({} if self.fringes is None else {"fringes": self.fringes.state()}),
             **({} if self.process is None else {"process": self.process.state()}),
         }
@@ -200,23 +206,31 @@ def initialise(
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
     waves = walls is None and fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength)
-    pace = haste(budget, CHOOSING if waves else CHOOSING_ALONE, len(rows))
+    pace = haste(budget)
     if walls is not None:
         law, notes = law_of(seen, data.site)
         trend = replace(trend_of_rows(seen, law), walls=walls)
-        _, kernel, more = chosen_among(seen, [(trend, 0.0, ())], seed, pace)
+        best = chosen_among(seen, [(trend, 0.0, ())], seed, pace)
         note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
-        return PowerField(data.site, trend, kernel, seed), (note, *notes, *more)
-    trend, kernel, notes = choose_prior(seen, data.site, "auto", seed, pace)
-    field = PowerField(data.site, trend, kernel, seed)
+        return PowerField(data.site, trend, best.kernel, seed), (note, *notes, *best.notes)
+    found, said = candidates(seen, data.site, seed, pace), list[str]()
     if waves:
         order = np.argsort(rows)
+        plain = found[0].trend, found[0].kernel
         assert data.site.wavelength is not None
-        field.fringes, note = find_fringes(
-            seen.at(order), rows[order], (trend, kernel), data.site.wavelength, seed, budget
-        )
-        notes = (*notes, note)
-    return field, notes
+        waved, note = find_fringes(seen.at(order), rows[order], plain, data.site.wavelength, seed, budget)
+        said.append(note)
+        if waved is not None:  # their share was learned beside this process
+            notes = (found[0].description, *found[0].notes, note)
+            return PowerField(data.site, *plain, seed, waved), notes
+    ((_, first), *others), notes = mixture(seen, found, seed, pace)
+    assert isinstance(first.kernel, Kernel) and first.trend is not None
+    return PowerField(data.site, first.trend, first.kernel, seed, None, others), (*notes, *said)
+
+
+def _given(rows: Rows, prior: Prior, seed: int) -> PowerProcess:
+    assert isinstance(prior.kernel, Kernel) and prior.trend is not None
+    return conditioned(rows, prior.trend, prior.kernel, seed)[0]
 
 
 def restored(site: Site, state: dict[str, Any]) -> PowerField:
@@ -225,7 +239,8 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
     settings = torch.cat([state["log_lengths"], *logit, state["log_noise"][None]]).double()
     kernel = Kernel.of(settings.numpy(), math.exp(state["log_amplitude"]))
     fringes = fringes_of(state["fringes"]) if "fringes" in state else None
-    field = PowerField(site, trend_of(state), kernel, int(state["seed"]), fringes)
+    others = [(float(one["share"]), Prior.read(one)) for one in state.get("others", ())]
+    field = PowerField(site, trend_of(state), kernel, int(state["seed"]), fringes, others)
     field.known, field.decibels = state["known"].numpy(), state["decibels"].numpy()
     field.at = state["at"].numpy()
     if "process" in state:

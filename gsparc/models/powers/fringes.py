@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.models.powers.groups import Gain, compared, folds, groups
+from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
 from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out, left_out_group
@@ -27,14 +27,13 @@ from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
 from gsparc.processes.trend import Trend
 from gsparc.training.time_budget import TimeBudget
 
-SOLUTIONS, FOLDS = 20, 5
+FOLDS = 5
 SIDES = 8  # squares along the longer side
-BEFORE, SPREAD = 0.5, 0.25  # mean and deviation of a prior on the share of the solutions
+BEFORE = 0.5  # mean of a prior on the share of the solutions
 TRIED = 10  # solutions after which it must pay
 PROBES = 10  # one row of so many is kept from all solutions
 MOST_ROWS = 3_000
 ROWS_PER_WAVE = 6  # two real unknowns each
-SECONDS = 30.0
 BEYOND = (1.0, 2.0)  # wavelengths from all rows between which solutions lose their share
 
 
@@ -176,9 +175,9 @@ def find_fringes(
         plain: the process's mean law and kernel.
         wavelength: [m].
         seed: of starts, folds and rows that are drawn.
-        budget: none is sought beyond it, nor beyond `SECONDS`.
+        budget: how many are sought, and when none is any longer.
     """
-    own = TimeBudget(SECONDS, "processor")
+    budget = budget or TimeBudget()
     chosen = draw(rows.silent, MOST_ROWS, seed)
     tail = f" (of {len(chosen)} of {len(rows.places)} rows)" if len(chosen) < len(rows.places) else ""
     rows, numbers = rows.at(chosen), numbers[chosen]
@@ -196,7 +195,7 @@ def find_fringes(
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None
-    while len(weights) < SOLUTIONS and not own.over() and not (budget and budget.over()):
+    while len(weights) < budget.effort.fringes and not budget.over():
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
             weights.append(fit_waves(columns[seen], rows.decibels[seen] - level, rng))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 SIDES = 10  # squares along the longer side of the places' box
+SPREAD = 0.25  # deviation of a prior on what share of a mean a prediction has
 
 
 @dataclass(frozen=True)

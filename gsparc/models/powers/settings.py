@@ -1,4 +1,9 @@
-"""Settings of a process of powers: its mean law, lengths and noise, from rows heard and silent."""
+"""Settings of a process of powers: its mean law, lengths and noise, from rows heard and silent.
+
+Left-out likelihood is of rows with neighbours. What a setting is worth in a gap it does not tell: there a
+mixture of processes, by the errors at squares of floor left out, is safer than the likeliest of them
+(stacking: D. H. Wolpert, Neural Networks 5 (1992)).
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,15 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.haste import CHOSEN_ON, UNHURRIED, Haste
+from gsparc.models.mixture.weights import UNUSED, best_weights
+from gsparc.models.powers.groups import SPREAD, groups
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart, bounds_of
+from gsparc.processes.left_out import groups_of, left_out
 from gsparc.processes.nearest import Values, settings_of
-from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw, trend_of_rows
-from gsparc.processes.prior import Prior
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw, trend_of_rows
+from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.trend import Trend
 from gsparc.processes.worker import late, late_when
 
@@ -29,9 +38,11 @@ WEIGHED_ON = 600  # the same where some rows were silent: each look factors seve
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
 LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
-TWO_LENGTHS_NEED = 100
+TWO_LENGTHS_NEED = 100  # rows that were heard; for a mixture too: of fewer no squares tell
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
+WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
+SIDES = (10, 5)  # squares along the longer side that are left out
 LOOKS, SETTLED = 40, 5e-6
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-5
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
@@ -60,27 +71,12 @@ def choose_prior(
     rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
 ) -> tuple[Trend, Kernel, tuple[str, ...]]:
     """The settings of `fit_powers` alone, and what must be said of them."""
-    trend, kernel, notes = chosen_among(rows, _trends(rows, site, mean), seed, haste)
-    return trend, kernel, (_description(trend, kernel), *notes)
-
-
-def chosen_among(
-    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
-) -> tuple[Trend, Kernel, tuple[str, ...]]:
-    """The best of mean laws (each with its cost and notes), its kernel, and what must be said of it."""
-    many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
-    with late_when(haste.late):
-        pace = replace(haste, rows=min(haste.rows, COMPARED_ON)) if many else haste
-        trend, kernel, notes = _settings(rows, trends, seed, pace)
-    if many:  # given their nearest, all tell of settings
-        values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
-        kernel, how = settings_of(Prior(kernel, trend), values, seed)
-        notes = (*notes, f"then {how}")
-    return trend, kernel, notes
+    best = chosen_among(rows, _trends(rows, site, mean), seed, haste)
+    return best.trend, best.kernel, (best.description, *best.notes)
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class Candidate:
     """A prior, its log likelihood less `cost` for fitted parameters, and what must be said of it."""
 
     score: float
@@ -89,11 +85,78 @@ class _Candidate:
     cost: float
     notes: tuple[str, ...] = ()
 
+    @property
+    def description(self) -> str:
+        """One line of the settings."""
+        parts = [f"{length:.4g} m" for length in self.kernel.lengths]
+        if len(parts) == 2:
+            parts = [f"{part} ({share:.0%})" for part, share in zip(parts, self.kernel.shares, strict=True)]
+        law, noise = self.trend.law, f"noise {self.kernel.noise:.3g} of the signal's variance"
+        mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
+        word = "length" if len(parts) == 1 else "lengths"
+        return f"{word} {' and '.join(parts)}, {noise}, about {mean}"
+
+
+def candidates(rows: Rows, site: Site, seed: int, haste: Haste) -> list[Candidate]:
+    """Of each mean law the settings of `choose_prior`, the best first; of few or very many rows the best."""
+    trends = _trends(rows, site, "auto")
+    if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
+        return [chosen_among(rows, trends, seed, haste)]
+    found = [chosen_among(rows, [one], seed, haste) for one in trends]
+    return sorted(found, key=lambda one: -one.score)
+
+
+def mixture(
+    rows: Rows, found: list[Candidate], seed: int, haste: Haste
+) -> tuple[list[tuple[float, Prior]], tuple[str, ...]]:
+    """Candidates with their shares in a mean, the largest first, and what must be said of them.
+
+    Shares have the least squared error at squares of floor left out, with a prior on equal ones.
+    """
+    if len(found) == 1:
+        return [(1.0, Prior(found[0].kernel, found[0].trend))], (found[0].description, *found[0].notes)
+    part = rows.drawn(haste.rows, seed)
+    posteriors = [conditioned(part, one.trend, one.kernel, seed)[0].posterior for one in found]
+    gram, count = np.zeros((len(found),) * 2), 0.0
+    for sides in SIDES:
+        errors = np.stack([_left_out(one, sides) for one in posteriors])
+        gram += errors @ errors.T / errors.shape[1] / len(SIDES)
+        count += (groups(part.loud.places, sides).max() + 1) / len(SIDES)
+    share = best_weights(gram + gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found)))
+    share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
+    kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
+    said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
+    notes = dict.fromkeys(note for _, one in kept for note in one.notes)
+    return [(weight, Prior(one.kernel, one.trend)) for weight, one in kept], (*said, *notes)
+
+
+def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
+    """Errors (n,) [dB] of rows that were heard, each predicted without those of its square of floor."""
+    assert isinstance(posterior, Exact)
+    group = groups_of(groups(posterior.rows.numpy(), sides))
+    residual, _ = left_out(posterior.factor.inverse, posterior.weights, group)
+    return residual[posterior.extra == 0, 0].numpy()
+
+
+def chosen_among(
+    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
+) -> Candidate:
+    """The best of mean laws (each with its cost and notes), with its kernel."""
+    many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
+    with late_when(haste.late):
+        pace = replace(haste, rows=min(haste.rows, COMPARED_ON)) if many else haste
+        best = _settings(rows, trends, seed, pace)
+    if not many:
+        return best
+    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])  # given their nearest, all tell
+    kernel, how = settings_of(Prior(best.kernel, best.trend), values, seed)
+    return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
+
 
 def _settings(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
-) -> tuple[Trend, Kernel, tuple[str, ...]]:
-    """Mean, lengths and noise, chosen on a part of many rows, and what must be said of the choice."""
+) -> Candidate:
+    """Mean, lengths and noise, chosen on a part of many rows."""
     loud = rows if rows.silent.all() else rows.loud
     loud = loud.at(draw(np.zeros(len(loud.places), bool), haste.rows, seed))
     compared_on = min(COMPARED_ON, max(haste.rows // 2, LEAST_COMPARED_ON))
@@ -105,15 +168,15 @@ def _settings(
         candidates = [_weighed(weighed, one) for one in candidates]
     best = max(candidates, key=lambda one: one.score)
     if len(loud.places) > len(few.places) and not both and not late():
-        best = _refined(loud, best)
+        best = _searched(loud, best, [best.kernel])
     if len(loud.places) >= TWO_LENGTHS_NEED and not late():
-        two = _two_lengths(loud, best)
+        two = _searched(loud, best, _pairs(loud, best.kernel), 2.0)
         best = max((best, _weighed(weighed, two) if both else two), key=lambda one: one.score)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):
         note = f"settings chosen on {count} of {len(rows.places)} rows, drawn evenly"
-        return best.trend, best.kernel, (*best.notes, note)
-    return best.trend, best.kernel, best.notes
+        return replace(best, notes=(*best.notes, note))
+    return best
 
 
 def _trends(rows: Rows, site: Site, mean: MeanName) -> list[tuple[Trend, float, tuple[str, ...]]]:
@@ -146,32 +209,31 @@ def _by_left_out(
     return by_left_out(starts, distance, terms, values, bounds, LOOKS, SETTLED)
 
 
-def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> _Candidate:
+def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
     distance, terms, values = _views(rows, trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
-        return _Candidate(0.0, trend, Kernel.of_one(scale, 1e-2, amplitude), cost, notes)
+        return Candidate(0.0, trend, Kernel.of_one(scale, 1e-2, amplitude), cost, notes)
     starts = [Kernel.of_one(scale * share, 0.1) for share in SHARES]
     value, kernel = _by_left_out(starts, distance, terms, values)
-    return _Candidate(-value - cost, trend, kernel, cost, notes)
+    return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
-def _refined(rows: Rows, one: _Candidate) -> _Candidate:
-    """The same with settings of more rows."""
-    value, kernel = _by_left_out([one.kernel], *_views(rows, one.trend))
-    return replace(one, score=-value - one.cost, kernel=kernel)
-
-
-def _two_lengths(rows: Rows, one: _Candidate) -> _Candidate:
-    """The same mean with two lengths, for two more parameters."""
-    length, noise = one.kernel.lengths[0], one.kernel.noise
-    starts = [Kernel((length * a, length * b), (0.5, 0.5), noise) for a, b in SPLITS]
+def _searched(rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0) -> Candidate:
+    """The same mean with settings of more rows, or with two lengths, for more parameters."""
     value, kernel = _by_left_out(starts, *_views(rows, one.trend))
-    return replace(one, score=-value - one.cost - 2, kernel=kernel, cost=one.cost + 2)
+    return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
-def _weighed(rows: Rows, one: _Candidate) -> _Candidate:
+def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
+    """Two lengths to start from, about the one that fits best and apart from it."""
+    scale = float(np.median(apart(*(torch.from_numpy(rows.places),) * 2).numpy()))
+    near = [Kernel((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
+    return near + [Kernel((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
+
+
+def _weighed(rows: Rows, one: Candidate) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest."""
     distance, terms, values = _views(rows, one.trend)
     silent = torch.from_numpy(rows.silent)
@@ -187,14 +249,3 @@ def _weighed(rows: Rows, one: _Candidate) -> _Candidate:
     best, value = walked(objective, [start], bounds, EVIDENCE_LOOKS, EVIDENCE_SETTLED)
     kernel = Kernel.of(best[:-1], math.exp(best[-1]))
     return replace(one, score=-value * len(values) - one.cost, kernel=kernel)
-
-
-def _description(trend: Trend, kernel: Kernel) -> str:
-    """One line of the settings."""
-    parts = [f"{length:.4g} m" for length in kernel.lengths]
-    if len(parts) == 2:
-        parts = [f"{part} ({share:.0%})" for part, share in zip(parts, kernel.shares, strict=True)]
-    law = trend.law
-    mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
-    word = "length" if len(parts) == 1 else "lengths"
-    return f"{word} {' and '.join(parts)}, noise {kernel.noise:.3g} of the signal's variance, about {mean}"

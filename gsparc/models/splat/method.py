@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import lightning.pytorch as L
 import numpy as np
@@ -44,13 +44,11 @@ from gsparc.training.fit import run_stage, steps_asked_for
 from gsparc.training.keep_best import KeepBest, StopAt
 from gsparc.training.module import GaussianModule, LossSettings, squared_error
 from gsparc.training.optimizer import OptimizerSettings
-from gsparc.training.pace import Pace
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
 
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
-STEPS, AFTER_CLOSED_FORM = 400, 60  # of gradient, where neither model nor Trainer is given a number
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
@@ -74,6 +72,7 @@ class LearnedField(Method):
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = True
+    stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
@@ -112,8 +111,6 @@ class LearnedField(Method):
         self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._billed = Spent()  # for reusable work, by the stages so far
         self.frozen: FrozenView | FrozenArray | None = None
-        self._stretched = True  # whether a budget stretches the schedule; else it only ends it
-        self._reserve_s = 0.0  # of the budget, for what follows the last stage [s]
         self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
         self._left_out: LeftOut | None = None  # of the initialiser; not stored
         self._apart: float | None = None  # validation rows from the nearest training row, median [m]
@@ -141,23 +138,22 @@ class LearnedField(Method):
         marks = {} if resumed is None else resumed.extra
         stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
         budget = context.time_budget(before=Spent(*marks.get("spent", ())))
-        now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self.steps_taken = int(marks.get("taken", 0))
         self.spent, self._apart = {}, _apart(data, fold)
         self._left_out = LeftOut.of(
             marks.get("left_out")
         )  # the initialiser of an interrupted run is not repeated
-        self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
+        self._billed, self._limited_by = Spent(), marks.get("limited_by")
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
         asked = steps_asked_for(context, len(watched.train), self.most_steps)
-        steps = (AFTER_CLOSED_FORM if solved else STEPS) if asked is None else asked
+        usual = budget.effort.steps_after_solving if solved else budget.effort.steps
+        steps = usual if asked is None else asked
         log.info(
             "steps=%s%d: a start %s", "auto -> " if asked is None else "", steps,
             "in closed form" if solved else f"from init={self.choices.init}",
         )  # fmt: skip
-        self._stretched = asked is not None or not solved
         watching = not self.keep_best or len(watched.val) > 0 or not solved
         if stage == "train":
             if steps and watching:
@@ -172,12 +168,14 @@ class LearnedField(Method):
             self._weigh_process(data, watched)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
-        if self.refit and len(watched.val) and self._pays():
+        if self.refit and len(watched.val) and self._pays() and not budget.over():
             every = Fold(np.sort(np.concatenate([watched.train, watched.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
             again = context.within("refit", resume=resume)
-            known = self.fitted().confidence, self.fitted().error
+            known, kept = (self.fitted().confidence, self.fitted().error), (self.model, self.steps)
             self._stage("refit", origin, data, every, again, budget, seconds, steps, *known)
+            if budget.limited and stage == "train":  # its schedule is cut: the first stage ended its own
+                self.model, self.steps = kept
         return self._ended(context, budget)
 
     def _end_with_start(
@@ -229,7 +227,7 @@ class LearnedField(Method):
             start = prepare(
                 InitTask(
                     settled(self.settings, self.choices), self.choices.closed_form, data,
-                    fold.train, self._receiver(), self._ends.get("tx_position"), self.loss.snapshot,
+                    fold.train, self._receiver(), self._ends.get("tx_position"),
                     context.seed, folder,
                 )
             )  # fmt: skip
@@ -240,7 +238,6 @@ class LearnedField(Method):
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
             budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
             self._billed = Spent(*start.billed_s)
-            self._limited_by = less_repeatable(self._limited_by, "processor" if start.time_limited else None)
         else:
             self.restore(data.site, checkpoint.read(resume).state)
         if confidence is not None:
@@ -253,27 +250,14 @@ class LearnedField(Method):
         self.spent["initialiser" + again] = prepared
         if not steps:
             return prepared
-        pace = None
-        if context.budget_s is not None and not self._stretched:
-            if budget.over():
-                log.info("budget_s=%.3g: none is left for gradient steps", context.budget_s)
-                self._paying = 0 if stage == "train" else self._paying
-        elif context.budget_s is not None:
-            first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
-            end = context.budget_s * 0.5 if first else context.budget_s - self._reserve_s
-            pace = Pace(steps, end - budget.spent)
-            if pace.budget_s <= 0 and self._paying != 0:
-                blind = stage == "train" and self.keep_best and self.choices.closed_form
-                self._paying = 0 if blind else self._paying  # nothing shows that steps would gain
-                log.warning(
-                    "budget_s=%.3g: %.1f of %.3g s went before the first step of stage %s (preparation, "
-                    "earlier stages), which has %s; give more",
-                    context.budget_s, budget.spent, end, stage, "none" if blind else "one step",
-                )  # fmt: skip
+        if budget.over():
+            log.warning("budget_s=%.3g: none is left for gradient steps", context.budget_s)
+            blind = stage == "train" and self.choices.closed_form  # nothing shows that steps would gain
+            self._paying = 0 if blind else self._paying
         if self._paying == 0:
             self.steps = 0
             return prepared
-        module = self.module(steps, folder, pace)
+        module = self.module(steps, folder)
         module.prepared_seconds, module.solved = earlier_s + prepared, self.choices.closed_form
         module.start = f"init={self.choices.init}" + (", closed form" if module.solved else "")
         marks = {
@@ -300,11 +284,11 @@ class LearnedField(Method):
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         """A hook between the stages: what a process averaged with the field would gain."""
 
-    def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
+    def module(self, steps: int = 1, run_dir: Path = Path()) -> GaussianModule:
         """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
         solved = self.choices is not None and self.choices.closed_form
         rates = self.rates.after_closed_form(steps) if solved else self.rates
-        return GaussianModule(self.fitted(), self.loss, rates, steps, run_dir, pace)
+        return GaussianModule(self.fitted(), self.loss, rates, steps, run_dir)
 
     def _start_from(self, site: Site, path: Path) -> None:
         """Take the weights of another model of this site; what is learned anew are these rows.

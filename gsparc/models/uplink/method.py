@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
@@ -26,6 +25,7 @@ from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 CHUNK = 32  # snapshots searched together
 LEAKAGES = (1e-4, 3e-4, 1e-3)
@@ -63,7 +63,7 @@ class UplinkField(UplinkMethod):
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the leakage on validation rows, fit the error model on training rows."""
-        started = time.perf_counter()
+        started = TimeBudget()
         self.site = self._need_uplink(data)
         self.error_model = None
         rng = np.random.default_rng(self.seed)
@@ -78,7 +78,7 @@ class UplinkField(UplinkMethod):
         rows = rng.permutation(fold.train)[: self.teachers]
         self.error_model = fit_error_model(*self._training_errors(data, rows, rng, PIECES))
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
-        return FitReport(time.perf_counter() - started, (note,))
+        return FitReport(started.spent, (note,))
 
     @torch.no_grad()
     def _training_errors(

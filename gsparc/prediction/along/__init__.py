@@ -1,1 +1,1 @@
-"""Channels along a trajectory, as channel emulators and link simulators take them."""
+"""Channels along a trajectory, as link simulators take them."""

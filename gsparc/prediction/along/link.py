@@ -13,7 +13,7 @@ from gsparc.data.raw import read_raw
 
 
 class TrajectoryChannel(ChannelModel):
-    """Tapped delay lines of `gsparc export to=sionna`: a batch is stretches of the way, at random times.
+    """Tapped delay lines of `gsparc export to=taps`: a batch is stretches of the way, at random times.
 
     >>> channel = OFDMChannel(TrajectoryChannel("model-sionna/cir.npz"), resource_grid)
 

@@ -124,7 +124,7 @@ def fitted(
     """
     site = predictor.site
     if site.kind != "csi" or site.static_end is None:
-        raise ValueError("to=cir: channels with one end that stands still are needed")
+        raise ValueError("to=taps: channels with one end that stands still are needed")
     tones = site.tones()
     if rate_hz is None and len(tones) == 1:
         raise ValueError(f"rate_hz= is needed: {site.name} was measured at one frequency")

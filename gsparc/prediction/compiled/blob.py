@@ -23,7 +23,7 @@ class Form:
     """One of the forms that are compiled.
 
     Attributes:
-        kind: 1 an array's spectrum, 2 a frozen image, 3 sources, 4 a process of powers.
+        kind: 1 an array's spectrum, 2 a frozen image, 3 sources, 4 a process of powers, 5 a mean of such.
         numbers: sizes and parameters, in the order in which the form's constructor reads them.
         arrays: by name, contiguous, of a type in `TYPES`.
         predictor: answers as the form does, for its error; None: the model itself does.

@@ -94,7 +94,8 @@ def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarra
     return np.stack([squared, power if model.site.kind == "csi" else np.ones(len(places))])
 
 
-_NAMES = {1: "an array's spectrum", 2: "a frozen image", 3: "a sum of sources", 4: "a process of powers"}
+_ARRAY, _IMAGE, _SUM = "an array's spectrum", "a frozen image", "a sum of sources"
+_NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of processes of powers"}
 
 
 def exact_form(method: Method, site: Site) -> Form | None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gsparc.prediction.compiled.blob import Form
+from gsparc.prediction.compiled.blob import Form, packed
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import JITTER, Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
@@ -26,6 +26,11 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
         process: given its rows.
         scale: watts, or what was measured, of a stored unit of power.
     """
+    if process.others:
+        weights, alone = zip(*process.members, strict=True)
+        files = [packed(form, np.zeros(3)) for one in alone if (form := powers_form(one, scale))]
+        named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
+        return Form(5, [len(weights), *weights], named) if len(files) == len(weights) else None
     posterior, kernel, trend = process.posterior, process.kernel, process.trend
     if type(kernel) is not Kernel or trend.walls is not None:
         return None

@@ -1,6 +1,6 @@
 // The forms of a field, compiled once per instruction set.
 #include "image.h"
-#include "powers.h"
+#include "mixture.h"
 #include "sources.h"
 
 namespace gsparc {
@@ -8,7 +8,7 @@ namespace GSPARC_ISA {
 
 extern Form* form_of(const Blob& blob) {
     Numbers in(blob);
-    const int kind = in.size(4);
+    const int kind = in.size(5);
     double error, worst, origin[3];
     in.values(error, worst, origin[0], origin[1], origin[2]);
     Form* found = nullptr;
@@ -16,6 +16,7 @@ extern Form* form_of(const Blob& blob) {
     if (kind == 2) found = new ImageForm(blob, in);
     if (kind == 3) found = new SourcesForm(blob, in);
     if (kind == 4) found = new PowersForm(blob, in);
+    if (kind == 5) found = new MixtureForm(blob, in);
     if (!found) refuse("form %d is none of this library's", kind);
     found->facts.error = error, found->facts.worst = worst;
     for (int axis = 0; axis < 3; ++axis) found->facts.origin[axis] = origin[axis];

@@ -1,4 +1,4 @@
-"""`%gsparc` in a notebook: what a command says, without times, and an error where it fails."""
+"""`%gsparc` in a notebook: what a command says, and an error where it fails."""
 
 from __future__ import annotations
 
@@ -16,21 +16,6 @@ def test_a_command_says_what_it_says_in_a_shell(capsys):
 def test_settings_may_stand_on_lines_and_a_failure_is_raised(capsys):
     with pytest.raises(RuntimeError, match="no command is called 'trian'; did you mean 'train'"):
         notebook.run("trian", "model=gp  # a comment\ndataset=own")
-
-
-@pytest.mark.parametrize(
-    ("line", "shown"),
-    [
-        ("[2026-11-21 22:39:04,835][gsparc.x][INFO] - said", "said"),
-        ("[2026-11-21 22:39:04,835][gsparc.x][WARNING] - said", "WARNING: said"),
-    ],
-)
-def test_times_are_left_out(line, shown, monkeypatch, capsys):
-    monkeypatch.setattr(notebook.sys, "executable", "/bin/echo")  # says its arguments
-    notebook.run(f"'{line}'")
-    text = capsys.readouterr().out.removeprefix("-m gsparc ")
-    found = notebook.STAMP.match(text)
-    assert found and notebook.STAMP.sub("" if found[1] == "INFO" else r"\1: ", text).strip() == shown
 
 
 def test_the_extension_is_found_by_its_package():

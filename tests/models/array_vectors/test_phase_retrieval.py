@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -12,13 +11,10 @@ from known_arrays import array_site, measure, room_vectors, spectra, walk
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
-from gsparc.data.splits import Fold
-from gsparc.models.array_vectors import splat_init, vector_cache
+from gsparc.models.array_vectors import phase_retrieval, vector_cache
 from gsparc.models.array_vectors.phase_retrieval import recover
 from gsparc.models.array_vectors.vector_gp import mirror_elements, twin
-from gsparc.models.splat.array import ArrayField
 from gsparc.ops import SphereGrid
-from gsparc.training.context import FitContext
 
 
 def _agreement(found, truth, partner):
@@ -58,18 +54,20 @@ def test_a_subtracted_minimum_is_found():
     assert np.median(np.abs(found.offset - low / (high - low))) < 2e-3
 
 
-def test_rows_that_seconds_gave_up_are_known_also_from_the_cache(known_campaign, tmp_path, monkeypatch):
-    """Seconds of the wall gave up rows, the cache kept them, and no report told."""
-    data, _ = known_campaign
-    spoilt = _spoilt(data, 5)
-    monkeypatch.setattr(vector_cache, "recover", partial(recover, budget_s=0.0))
-    for cache in (tmp_path, tmp_path):
-        found, _ = vector_cache.recovered(spoilt, np.arange(8), cache)
-        assert np.flatnonzero(found.time_limited).tolist() == [5]
-    monkeypatch.setattr(splat_init, "platform_cache", lambda: None)
-    fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
-    for measured, clock in ((spoilt, "processor"), (data, None)):
-        assert ArrayField().fit(measured, fold, FitContext(tmp_path)).limited_by == clock
+def test_restarts_are_counted_and_no_clock_ends_them(known_campaign, monkeypatch):
+    """Seconds of the processor gave up rows that another machine would have solved."""
+    starts, search = [], phase_retrieval._search
+
+    def counted(problem, rows, start, *rest):
+        starts.append(len(start))
+        return search(problem, rows, start, *rest)
+
+    monkeypatch.setattr(phase_retrieval, "_search", counted)
+    broken, rows = _spoilt(known_campaign[0], 2), np.arange(4)
+    for most in (0, 96):
+        starts.clear()
+        recover(broken.site, broken.target[rows], broken.tx[rows], most=most)
+        assert (96 in starts) == (most >= 96) and 384 not in starts
 
 
 @pytest.mark.parametrize("rows", [2, 3, 5])
@@ -128,7 +126,7 @@ def test_a_damaged_cache_is_computed_anew(known_campaign, tmp_path, caplog):
 def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
     data, _ = known_campaign
     broken, rows = _spoilt(data, 2), np.arange(4)
-    found = recover(data.site, broken.target[rows], data.tx[rows], budget_s=0.0)
+    found = recover(data.site, broken.target[rows], data.tx[rows], most=0)
     assert np.flatnonzero(found.suspect).tolist() == [2]
     vector_cache.report(found, broken, rows, tmp_path / "array_recovery.csv")
     lines = (tmp_path / "array_recovery.csv").read_text().splitlines()

@@ -84,7 +84,7 @@ def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
     data = _data(*_site([WALL], ends=4, count=50, side=0.7, turned=2.0))
     groups, values = _bare(data)
     parts = compressed(groups, values)
-    planes, _ = find_mirrors(parts, parts, values, WAVELENGTH, 1, lambda: False)
+    planes, _ = find_mirrors(parts, parts, values, WAVELENGTH, 1)
     plane = planes[0].numpy() * np.sign(planes[0, 0].item())
     assert np.arccos(plane[:3] @ WALL[:3]) < 0.05
     assert plane[3] + plane[:3] @ data.site.origin == pytest.approx(WALL[3], abs=0.05)

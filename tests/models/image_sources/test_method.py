@@ -116,7 +116,7 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
     finally:
         torch.set_num_threads(threads)
     assert len(method.members) == 1
-    assert "1 of 3 searches (within 0 s, ended by the time budget)" in report.notes[0]
+    assert "1 of 3 searches (ended by the time budget)" in report.notes[0]
 
 
 def test_a_search_far_behind_another_solution_is_the_last(tmp_path):
@@ -124,7 +124,7 @@ def test_a_search_far_behind_another_solution_is_the_last(tmp_path):
     method = ImageSourceGP(searches=4, search_rows=60, margin=1.0, max_sources=2, clutter=False)
     report = method.fit(data, fold, FitContext(tmp_path, rival=1e-9))
     assert "searches (far behind another solution)" in report.notes[0]
-    assert len(method.members) <= torch.get_num_threads()
+    assert len(method.members) == 1  # however many threads search
 
 
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):

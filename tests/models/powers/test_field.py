@@ -63,10 +63,10 @@ def small_field(data: Measurements, two: bool = True) -> PowerField:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
-def test_without_gaussians_it_is_the_plain_process(share):
+def test_of_few_rows_it_is_the_plain_process(share):
     data = town(160)
     data = weak(data, share) if share else data
-    rows = np.arange(120)
+    rows = np.arange(90)
     field, notes = initialise(data, rows)
     field.condition(data, rows)
     plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
@@ -161,11 +161,11 @@ def powers_of(data: Measurements, rows: np.ndarray, init: InitSettings) -> Power
     return field
 
 
-def test_settings_of_little_time_are_chosen_on_fewer_rows():
-    budgets = [FitContext(budget_s=seconds).time_budget() for seconds in (1e-3, 1e6)]
-    few, every = (haste(budget, 0.5, 9999) for budget in budgets)
-    assert few.rows == 150 and few.late() and every.rows == 1000 and not every.late()
-    assert [budget.limited for budget in budgets] == [True, False] and haste(None, 0.5, 9).rows == 1000
+def test_settings_are_chosen_on_rows_that_no_clock_counts():
+    """A busy machine chose on fewer rows: 5.573 dB beside two loops, 5.580 alone."""
+    chosen = [haste(FitContext(effort=effort, budget_s=1e-9).time_budget()) for effort in (1e-3, 1.0, 8.0)]
+    assert [each.rows for each in chosen] == [150, 1000, 2000] and all(each.late() for each in chosen)
+    assert haste(None).rows == 1000 and not haste(None).late()
 
 
 @pytest.mark.parametrize("rows", [20, 60])

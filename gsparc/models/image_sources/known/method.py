@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
-from gsparc.models.image_sources.ensemble import SEARCH_END, compact, left_out_error
+from gsparc.models.image_sources.ensemble import compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import with_phases
 from gsparc.models.image_sources.known.images import (
     MOST_PATCHES,
@@ -78,7 +77,7 @@ class KnownWallsGP(ImageSourceGP):
         def both(values: list[Tensor]) -> Tensor:
             return near(values) + prior.cost(values[4], start.sequences)
 
-        with late_when(partial(budget.over, SEARCH_END)):
+        with late_when(budget.over):
             scene = with_phases(rows, refine(rows, start, STEPS[0], near), QUADRATURE, self.noise_floor)
             scene = learn_visibility(rows, scene, STEPS[1], settings.visibility)
             prior = ReflectionPhasePrior.of(scene)

@@ -114,15 +114,15 @@ def _trend(prior: Prior) -> Trend:
 def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tuple[Own, list[str]]:
     """The law and settings of own processes, and what must be said of them.
 
-    Searches end with what they have when the budget is over; single stations have no settings of their own
-    when half of it is.
+    Searches end with what they have when the budget is over; single stations then have no settings of
+    their own.
     """
     trend, notes = _site_law(rows, seed)
     heard = rows if rows.silent.all() else rows.loud
     numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else late_when(budget.over):
         kernel, priors = _common_settings(heard, trend, seed)
-        if budget is not None and budget.over(0.5):
+        if budget is not None and budget.over():
             numbers = []
         for number in numbers:
             distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)

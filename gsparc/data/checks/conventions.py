@@ -1,0 +1,287 @@
+"""Whether channels and spectra follow the schema's conventions, told by the direct path between known ends.
+
+Each rival of `CONVENTIONS`, and each two of them, is scored as the declared one is. Of channels the share of
+a row's power along the direct path counts, with a free factor for each row, free phases of the antennas and a
+free delay common to all rows, and whether the factors of rows agree; of spectra how much of the sphere is
+stronger than the direction of the other end. A row counts once, however many entries it has, since
+reflections are common to them, and rows within half a wavelength count as one. Places must agree, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from gsparc.data.conventions import CONVENTIONS, Signals, mended
+from gsparc.data.errors import some
+from gsparc.data.schema import LIGHT, Measurements
+
+RATIO = math.log(1000)  # of likelihoods
+ROWS = 400
+ENTRIES = {"csi": 2**15, "spectrum": 2**22}  # of the rows drawn, at most, where that leaves LEAST rows
+LEAST = 64
+FEWEST = {"csi": 32, "spectrum": 50}  # rows that tell
+COHERENT = 8  # antennas, tones or both with one factor: fewer fit anything
+ANY = {"csi": 0.01, "spectrum": 0.003}  # share that no path explains
+FIT = {"csi": 0.12, "spectrum": 0.8}  # of the median row, at least of a rival; a worse one says nothing
+ONE_DELAY, CLEAR = 0.7, 0.15  # the same of one delay for all rows, and its gain: reflections fit one, too
+GOOD = {"csi": 0.5, "spectrum": 0.95}  # of what is declared: with it no two conventions are tried together
+HALVINGS = 3  # of the places, into groups
+DROPPED = 2  # groups that speak most for a rival: the others must do so, too
+SHARED = 8  # rows with one phase, at least
+DELAYS = 4  # tried for each tone
+LEAST_DB = 6.0  # of the largest value: less is no spectrum in decibels
+EDGE = 0.5  # of the strongest lobe's peak; further down lie other paths and the floor
+LOBE = 0.5  # logarithm of the ratio for the median spectrum, at least: lobes of arrays are no exact beams
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well rows follow a convention.
+
+    Attributes:
+        rows: (S,) logarithms of likelihoods.
+        phases: the same of the factors that rows have in common.
+        fit: share of the median row that it explains.
+    """
+
+    rows: np.ndarray
+    phases: float
+    fit: float
+
+    @property
+    def total(self) -> float:
+        """Of all rows; phases of neighbouring rows are not independent, and count half."""
+        return float(self.rows.sum()) + self.phases / 2
+
+
+def convention_warnings(data: Measurements) -> list[str]:
+    """The convention that rows seem to follow instead of the declared one, and the setting that mends it."""
+    kind = data.site.kind
+    if kind == "rssi":
+        return []
+    of_file = Signals.of(data)
+    signals, labels = _arrayed(data, of_file)
+    rows = _drawn(signals)
+    few, signals, labels = of_file.rows(rows[:1]), signals.rows(rows), labels[rows]
+    zeros = _zeros(signals) if kind == "csi" else []
+    entries = signals.values.shape[2] * (1 if signals.array is None else signals.values.shape[1])
+    if len(rows) < FEWEST[kind]:
+        return zeros
+    if kind == "csi":
+        signals = CONVENTIONS["zeros_unmeasured"].change(signals)
+        return [*zeros, *_rivals(signals, few, labels)] if entries >= COHERENT else zeros
+    return _rivals(signals, few, labels) + _decibels(signals, data.site.target_scale)
+
+
+def _arrayed(data: Measurements, signals: Signals) -> tuple[Signals, np.ndarray]:
+    """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
+    stations, place = data.site.stations, data.place
+    run = np.zeros(len(data), np.int64) if data.run is None else data.run
+    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    single = signals.tones is not None and signals.values.shape[1] == 1
+    if stations is None or place is None or len(stations) < COHERENT or not single:
+        return signals, run * (int(station.max()) + 1) + station
+    _, first, of_place = np.unique(place, return_index=True, return_inverse=True)
+    shape = (len(first), len(stations), signals.values.shape[2])
+    values, mask = np.zeros(shape, signals.values.dtype), np.zeros(shape, bool)
+    values[of_place, station] = signals.values[:, 0]
+    mask[of_place, station] = True if signals.mask is None else signals.mask[:, 0]
+    middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(first), 1, 1))
+    ends = data.moving[first], np.tile(middle, (len(first), 1))
+    return Signals(values, mask, *ends, turned, signals.tones, stations.position - middle), run[first]
+
+
+def _drawn(signals: Signals) -> np.ndarray:
+    """Rows (n,) at places of their own, drawn at random; channels half a wavelength apart."""
+    place = np.hstack([signals.tx, signals.rx])
+    known = np.flatnonzero(np.isfinite(place).all(axis=1))
+    kind = "spectrum" if signals.tones is None else "csi"
+    order = np.random.default_rng(0).permutation(known)[: 20 * ROWS]
+    if not len(order):
+        return order
+    side = float(np.ptp(place[order], axis=0).max()) / ROWS + 1e-9
+    side = side if signals.tones is None else max(side, signals.wavelength / 2)
+    cells = np.floor((place[order] - place[order].min(axis=0)) / side)
+    first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+    return order[first[: min(ROWS, max(LEAST, ENTRIES[kind] // signals.values[0].size))]]
+
+
+def _zeros(signals: Signals) -> list[str]:
+    measured = signals.values != 0 if signals.mask is None else (signals.values != 0) | ~signals.mask
+    zero = np.flatnonzero(~measured.any(axis=(0, 1)))
+    if not len(zero):
+        return []
+    which = f"tones {some(zero.tolist())} (of {measured.shape[2]}, from 0) are 0 in all rows"
+    return [f"{which}: guards, or the direct current? dataset.zeros_unmeasured=true: they were not measured"]
+
+
+def _rivals(signals: Signals, few: Signals, labels: np.ndarray) -> list[str]:
+    """A warning where a rival fits far better than what is declared, with those that fit as well."""
+    kind, place = "csi" if signals.grid is None else "spectrum", np.hstack([signals.tx, signals.rx])
+    names = [n for n, one in CONVENTIONS.items() if one.tried and one.applies(few)]
+    groups, declared = _groups(place), _score(signals, labels)
+    rivals = {}
+    pairs = combinations(names, 2) if declared.fit < GOOD[kind] else ()
+    for chosen in [*((name,) for name in names), *pairs]:
+        with suppress(ValueError):  # a grid turned beyond a pole
+            rivals[chosen] = _score(mended(signals, chosen), labels)
+
+    def may_be(chosen: tuple[str, ...], rival: Score) -> bool:
+        gain = float((rival.rows - declared.rows).mean())
+        clear = "delays_removed" not in chosen or (rival.fit > ONE_DELAY and gain > CLEAR)
+        return clear and rival.fit > FIT[kind]
+
+    def wins(rival: Score, over: Score) -> bool:
+        gain = rival.rows - over.rows
+        of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
+        return float(of_group[:-DROPPED].sum()) + (rival.phases - over.phases) / 2 > RATIO
+
+    rivals = {chosen: one for chosen, one in rivals.items() if may_be(chosen, one)}
+    best: tuple[str, ...] = ()
+    for count in (1, 2):
+        fit = {chosen: one.total for chosen, one in rivals.items() if len(chosen) == count}
+        first = max(fit, key=lambda chosen: fit[chosen], default=())
+        if first and wins(rivals[first], rivals[best] if best else declared):
+            best = first
+    if not best:
+        return []
+    least = rivals[best].total - RATIO
+    best, *alike = [c for c, one in rivals.items() if len(c) == len(best) and one.total > least]
+    said = " and ".join(CONVENTIONS[name].words for name in best)
+    others = "".join(f" or {_setting(chosen)}" for chosen in alike)
+    others += ", which these rows do not tell apart" if others else ""
+    how = f"{len(signals.values)} rows drawn fit the direct path more than 1,000 times better with {said}"
+    return [f"{how}: is it that? {_setting(best)}{others} mends it"]
+
+
+def _setting(chosen: Iterable[str]) -> str:
+    return " ".join(f"dataset.{name}=true" for name in chosen)
+
+
+def _groups(place: np.ndarray) -> np.ndarray:
+    """Numbers (S,) of parts of the site, halved again and again along their longest side."""
+    part = np.zeros(len(place), np.int64)
+    for _ in range(HALVINGS):
+        for number in np.unique(part):
+            inside = np.flatnonzero(part == number)
+            along = place[inside, np.ptp(place[inside], axis=0).argmax()]
+            part[inside] = 2 * number + (along > np.median(along))
+    return part
+
+
+def _score(signals: Signals, labels: np.ndarray) -> Score:
+    return _spectra(signals) if signals.tones is None else _channels(signals, signals.tones, labels)
+
+
+def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
+    """By the share of power along the direct path, with factors of rows and antennas and a common delay."""
+    measured = np.ones(signals.values.shape, bool) if signals.mask is None else signals.mask
+    values = np.where(measured, signals.values, 0).astype(np.complex128)
+    away = (signals.tx - signals.rx)[:, None]
+    if signals.array is not None:
+        away = away - np.einsum("sij,aj->sai", signals.rotation, signals.array)
+    distance = np.linalg.norm(away, axis=2)
+    direct = values * np.exp(2j * np.pi * distance[..., None] * tones / LIGHT)
+    spacing = float(np.median(np.diff(np.sort(tones)))) if len(tones) > 1 else 1.0
+    count = min(DELAYS * len(tones), 256) if len(tones) > 1 else 1
+    delays = (np.arange(count) - count // 2) / count / spacing
+    antennas = direct @ np.exp(2j * np.pi * np.outer(tones - tones.mean(), delays))
+    used = measured.sum(axis=(1, 2)) / (
+        1 if signals.array is not None else measured.any(axis=2).sum(axis=1).clip(1)
+    )
+    power = (used * (np.abs(values) ** 2).sum(axis=(1, 2))).clip(1e-300)
+
+    def best(share: np.ndarray) -> tuple[np.ndarray, int]:  # likelihoods (S,) at the delay that fits best
+        rows = -np.log1p(-(1 - ANY["csi"]) * (share / power[:, None]).clip(0, 1))
+        delay = int(rows.sum(axis=0).argmax())
+        return rows[:, delay], delay
+
+    if signals.array is None:
+        rows, delay = best((np.abs(antennas) ** 2).sum(axis=1))
+        factor = antennas[:, 0, delay]
+    else:
+        rows, delay = best(np.abs(antennas.sum(axis=1)) ** 2)
+        factor = antennas[:, :, delay].sum(axis=1)
+        other = antennas[
+            :, :, best((np.abs(antennas) ** 2).sum(axis=1))[1]
+        ]  # of antennas whose phases are free
+        if len(values) > 2 * other.shape[1]:
+            level = np.sqrt((np.abs(other) ** 2).mean(axis=1, keepdims=True)).clip(1e-150)
+            phases = np.angle(np.linalg.svd(other / level, full_matrices=False)[2][0])
+            turned = other @ np.exp(-1j * phases)
+            free, _ = best(np.abs(turned[:, None]) ** 2)
+            if free.sum() > rows.sum():
+                rows, factor = free, turned
+    return Score(rows, _common(factor, labels), float(np.median(1 - np.exp(-rows))))
+
+
+def _common(factor: np.ndarray, labels: np.ndarray) -> float:
+    """Logarithm of the likelihood that factors (S,) of the same label have one phase."""
+    unit, total = factor / np.abs(factor).clip(1e-150), 0.0
+    for label in np.unique(labels):
+        same = unit[labels == label]
+        if len(same) >= SHARED:
+            total -= len(same) * math.log1p(-(1 - ANY["csi"]) * abs(same.mean()) ** 2)
+    return total
+
+
+def _spectra(signals: Signals) -> Score:
+    """By the share of the sphere that is stronger than the direction of the other end; half of it outside."""
+    grid = signals.grid
+    assert grid is not None
+    x, y, z = np.einsum("sji,sj->is", signals.rotation, signals.tx - signals.rx)
+    row = np.rint((np.arctan2(z, np.hypot(x, y)) - grid.first_elevation) / grid.elevation_step).astype(int)
+    column = np.rint((np.arctan2(y, x) - grid.first_azimuth) / grid.azimuth_step % grid.turn).astype(int)
+    column = column % grid.width if grid.periodic else column
+    inside = (row >= 0) & (row < grid.height) & (column < grid.width)
+    angle = grid.solid_angles().numpy() / float(grid.solid_angles().sum())
+    values = signals.values.reshape(len(row), grid.height, grid.width)
+    at = values[np.arange(len(row)), row.clip(0, grid.height - 1), column.clip(0, grid.width - 1)]
+    at = at[:, None, None]
+    stronger = (((values > at) + 0.5 * (values == at)) * angle).sum(axis=(1, 2))
+    stronger = np.where(inside, stronger, 0.5)
+    return Score(-np.log(stronger + ANY["spectrum"]), 0.0, 1 - 2 * float(np.median(stronger)))
+
+
+def _decibels(signals: Signals, scale: float) -> list[str]:
+    """A warning where the strongest lobes of spectra fall as parabolas to their edges, not as beams do."""
+    grid, values = signals.grid, signals.values.astype(np.float64) * scale
+    assert grid is not None
+    if signals.values.dtype.kind != "f" or values.max() < LEAST_DB:
+        return []
+    gains = np.array([_lobe(one.ravel(), grid.directions().numpy().reshape(-1, 3)) for one in values])
+    groups, gains = _groups(np.hstack([signals.tx, signals.rx])), np.nan_to_num(gains)
+    of_group = np.sort([gains[groups == group].sum() for group in np.unique(groups)])
+    if of_group[:-DROPPED].sum() < RATIO or np.median(gains) < LOBE:
+        return []
+    how = (
+        f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g}, fit a beam more than"
+    )
+    return [f"{how} 1,000 times better as decibels: dataset.decibels=true makes them linear"]
+
+
+def _lobe(values: np.ndarray, directions: np.ndarray) -> float:
+    """Logarithm of the likelihood that a Gaussian beam (P,) is in decibels over that it is linear.
+
+    Fitted about its peak, to where it has fallen to `EDGE`.
+    """
+    peak = int(values.argmax())
+    angle = np.arccos((directions @ directions[peak]).clip(-1, 1))
+    outside = angle[values < EDGE * values[peak]].min(initial=np.pi)
+    inside = (angle <= 1.5 * outside) & (values >= EDGE * values[peak])
+    level = values[inside] / values[peak]
+    across = np.linalg.svd(directions[peak][None])[2][1:]
+    x, y = (directions[inside] @ across.T).T
+    terms = np.column_stack([np.ones(len(x)), x, y, x * x, y * y, x * y])
+    if len(level) <= terms.shape[1] + 2:
+        return 0.0
+    parabola = level - terms @ np.linalg.lstsq(terms, level, rcond=None)[0]
+    log = np.linalg.lstsq(terms * level[:, None], np.log(level) * level, rcond=None)[0]
+    beam = level - np.exp(terms @ log)
+    return 0.5 * math.log((beam @ beam + 1e-9) / (parabola @ parabola + 1e-9))

@@ -1,0 +1,77 @@
+"""Received power on a plane under Techtile's ceiling (KU Leuven, geometry-based wireless power transfer).
+
+The release is a folder of a run, with TIME_positions.npy and TIME_values.npy: arrays of Python objects,
+positions with x, y, z [m], values with pwr_pw [pW]. The 42 antennas transmit one tone, with unknown weights.
+
+The same as an npz: rx_position (S, 3) [m], rssi_db (S,) [dBm], frequency_hz () [Hz].
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.errors import DataError
+from gsparc.data.pickles import unpickled
+from gsparc.data.raw import Raw, read_raw
+
+CARRIER_HZ = 920e6
+PICOWATT_DB = -90.0  # relative to a milliwatt
+POSITIONS, VALUES = {"Positioner.PositionerValue"}, {"lib.ep.ep_data"}  # classes of the makers' recorder
+LAYOUT = {
+    "rx_position": Expected(("S", 3), place=True),
+    "rssi_db": Expected(("S",)),
+    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
+}
+
+
+def raw_of_techtile_power(path: str | Path) -> Raw:
+    """Read a folder of a run of the release, or an npz.
+
+    Returns:
+        `rx_position` (S, 3) [m], `rssi_db` (S,) [dBm], `carrier_hz` () [Hz].
+
+    Raises:
+        DataError: no such file, objects of other classes, or arrays missing or wrong.
+    """
+    raw = _of_release(Path(path)) if Path(path).is_dir() else read_raw(path)
+    return Raw(check_layout(raw, path, LAYOUT), {"name": "techtile_power", **raw.attributes})
+
+
+def _of_release(folder: Path) -> Raw:
+    places = sorted(folder.glob("*_positions.npy"))
+    if len(places) != 1:
+        raise DataError(f"{folder}: expected one *_positions.npy with its *_values.npy, found {len(places)}")
+    file = places[0].with_name(places[0].name.replace("_positions", "_values"))
+    where = _attributes(places[0], POSITIONS, ("x", "y", "z"))
+    power = _attributes(file, VALUES, ("pwr_pw",))[:, 0]
+    if len(where) != len(power):
+        raise DataError(f"{folder}: {len(where)} positions, but {len(power)} values")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = 10 * np.log10(power) + PICOWATT_DB
+    heard = np.isfinite(where).all(axis=1) & np.isfinite(level)
+    arrays = {
+        "rx_position": where[heard].astype(np.float32),
+        "rssi_db": level[heard].astype(np.float32),
+        "frequency_hz": np.array(CARRIER_HZ),
+    }
+    lost = f"{(~heard).sum()} of {len(heard)} rows left out: no position, or no power"
+    return Raw(arrays, {} if heard.all() else {"left_out": lost})
+
+
+def _attributes(path: Path, classes: set[str], names: tuple[str, ...]) -> np.ndarray:
+    """Attributes (rows, names) of the objects in an array; DataError where one has none of them."""
+    held: Any = unpickled(path, classes, npy=True)
+    try:
+        return np.array([[float(one.state[name]) for name in names] for one in held])
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise DataError(f"{path}: expected an array of objects with {', '.join(names)}") from None
+
+
+class TechtilePower(Campaign):
+    """Received powers on a plane; settings of `Campaign`."""
+
+    choice, reader = "techtile_power", staticmethod(raw_of_techtile_power)

@@ -1,0 +1,152 @@
+"""Options that a run was given and did not heed, named in one warning with what to set instead."""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.heeded import Option, Reads
+from gsparc.data.instantiate import find
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import FileSettings, SplitSettings
+from gsparc.evaluation.console import config_folder
+from gsparc.models.method import Method, TrainsByGradient
+from gsparc.models.parts import leaves
+from gsparc.models.registry import build
+
+log = logging.getLogger(__name__)
+
+# Counted where they are heeded; of other settings only those are judged whose reads are noted.
+COUNTED = ("trainer", "callbacks", "dataset.batch_size", "budget_s", "stations")
+RENDERED = (  # settings of the model that only rasterized Gaussians have
+    "field", "emission", "attenuation", "raster", "response", "confidence", "loss", "optimizer", "refit",
+    "keep_best", "steps",
+)  # fmt: skip
+ALONE = "a plain process has all the weight: model=splat is the field alone, and "
+ALONE += "model.effects.residual=false leaves the process out"
+REDRAW = "the dataset names its test rows: say split.redraw=true"
+STEPS = "no gradient steps are asked for: say model.steps=auto"
+NAMES = ("_target_", "name", "guesses")  # settings that say nothing of what is done
+
+
+def given() -> dict[str, str]:
+    """What the command line and its experiment file say: words by dotted names of settings."""
+    if not HydraConfig.initialized():
+        return {}
+    hydra = HydraConfig.get()
+    experiment = _of_experiment(hydra.runtime, hydra.runtime.choices.get("experiment"))
+    said = {path: f"{path}={value}" for path, value in experiment}
+    for one in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+        path, value = one.key_or_group, one.value()
+        inner = leaves(value, f"{path}.") if isinstance(value, dict) else [(path, value)]
+        said |= {name: one.input_line or name for name, _ in inner}
+    # A file of the group `init` is as good as its name.
+    return {"init.name" if path == "init" else path: text.lstrip("+") for path, text in said.items()}
+
+
+def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]]:
+    """What an experiment file says itself, after those of its folder that it builds on."""
+    for source in runtime.config_sources if choice else ():
+        folder = Path(source.path) if source.schema == "file" else config_folder()
+        file = folder / "experiment" / f"{choice}.yaml"
+        if file.exists():
+            text = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+            for one in text.get("defaults", ()):
+                if isinstance(one, str) and one != "_self_":
+                    yield from _of_experiment(runtime, one)
+            yield from leaves({key: value for key, value in text.items() if key not in ("defaults", "hydra")})
+            return
+
+
+def noting(config: DictConfig) -> Reads:
+    """What is to be noted of the options that were `given`."""
+    method, options = build(config.model), []
+    for path in given():
+        group, _, name = path.rpartition(".")
+        node = OmegaConf.select(config, group) if group else None
+        if isinstance(node, DictConfig) and (name not in NAMES or path == "init.name"):
+            value = OmegaConf.select(config, path)
+            options += [Option(path, value, *holder) for holder in _holders(path, node, method)]
+    return Reads(options)
+
+
+def _holders(path: str, node: DictConfig, method: Method) -> Iterator[tuple[type, str]]:
+    """Classes and attributes that hold a setting, none where this is not known."""
+    group, _, name = path.rpartition(".")
+    stored = method.stored_names.get(path.removeprefix("model."))
+    kind: Any = find(str(node.get("_target_")))
+    if group == "split":
+        kind = FileSettings if node.name == "file" else SplitSettings
+    as_named = group == "model" and stored is None and vars(method).get(name, ...) == node[name]
+    if as_named or name in getattr(kind, "__dataclass_fields__", ()):
+        yield kind, name
+    if stored:
+        owner, _, attribute = stored.rpartition(".")
+        yield type(getattr(method, owner) if owner else method), attribute
+
+
+def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
+    """Name the options without effect, in one warning too; None where there are none.
+
+    Args:
+        reads: of a fit and a prediction.
+        method: fitted.
+        data: that it learned from.
+    """
+    stations = data.site.stations is not None and len(data.site.stations) > 1
+    counted = {"budget_s": method.takes_budget, "stations": stations}
+    reads.noted |= {name for name, heeded in counted.items() if heeded}
+    known = {option.path for option in reads.options}
+    known |= {f"model.{name}" for name, stored in method.stored_names.items() if not stored}
+    why: dict[str, list[str]] = defaultdict(list)
+    for path, text in given().items():
+        judged = path in known or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
+        if judged and not reads.heeds(path):
+            why[_instead(path, method, reads, data)].append(text)
+    words = "; ".join(f"{', '.join(one)} ({text})" for text, one in why.items())
+    if why or _alone(method):
+        log.warning("%s", f"options without effect here: {words}" if why else ALONE)
+    return ", ".join(text for one in why.values() for text in one) or None
+
+
+def _alone(method: Method) -> bool:
+    return method.field_alone() is not None and not method.size()
+
+
+def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str:
+    """Why an option has no effect, and what to set instead where that is known."""
+    (group, _, name), noted = path.partition("."), reads.noted
+    training = group in ("trainer", "callbacks", "dataset") or path == "model.steps"
+    rendered = group == "model" and name.partition(".")[0] in RENDERED
+    started = method.facts()["model/init"] if group == "init" else None
+    reasons = (
+        (path == "budget_s", f"the seconds of {method.name} cannot be chosen"),
+        (path == "stations", "there is one station"),
+        (
+            group == "split" and data.release_split is not None,
+            REDRAW,
+        ),
+        (group == "split", "this split does not use it"),
+        (
+            method.field_alone() is not None and not method.size(),
+            ALONE,
+        ),
+        (path == "model.steps" and "trainer.max_steps" in noted, "steps of the Trainer win"),
+        (training and "trainer" in noted, "this training does not call for it"),
+        (
+            training and {"model.steps", "trainer.max_steps"} & noted,
+            STEPS,
+        ),
+        (training, f"{method.name} takes no gradient steps here: model=splat does"),
+        (rendered and isinstance(method, TrainsByGradient), "of rendered Gaussians alone: say model=splat"),
+        (started is not None, f"here it is init={started}"),
+    )
+    return next((text for holds, text in reasons if holds), f"{method.name} does not use it here")

@@ -1,0 +1,31 @@
+"""A comparison of what was fetched: it needs no path."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from campaigns import compose
+from hydra import initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from releases import real
+
+from gsparc.commands.shared.settings import plain
+from gsparc.evaluation.experiment.problem import problems_of
+
+ROOM = "dataset_conference_ch1_rt_image_fc.pkl"
+
+
+def test_a_fetched_set_needs_no_path(monkeypatch, tmp_path, caplog):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    settings = plain(compose("experiment=results/newrf", config="compare"))
+    with pytest.raises(ValueError, match="no dataset has a path"):
+        problems_of(settings, tmp_path / "cells")
+    (tmp_path / "gsparc/data/newrf").mkdir(parents=True)
+    shutil.copy(real(f"releases/newrf/{ROOM}"), tmp_path / "gsparc/data/newrf")
+    GlobalHydra.instance().clear()
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        problems = problems_of(settings, tmp_path / "cells")
+    assert [one.split for one in problems] == ["redrawn"] * 5
+    assert {one.draw for one in problems} == set(range(5)) and len(problems[0].data) == 433
+    assert "or gsparc data" in caplog.text  # of the other sets

@@ -1,0 +1,301 @@
+"""Every option is heeded or named: tiny fits of each method on each kind of data, and options perturbed."""
+
+from functools import cache, partial
+from pathlib import Path
+from tempfile import mkdtemp
+
+import hydra
+import numpy as np
+import pytest
+import torch
+from hydra import initialize_config_module
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+from worlds import World, arrays
+
+from gsparc.data import executor, heeded
+from gsparc.data.executor import Engine
+from gsparc.data.load import datamodule, split_for
+from gsparc.evaluation.console import plain
+from gsparc.evaluation.experiment import options
+from gsparc.evaluation.experiment.fit import context_of, fit_and_score
+from gsparc.models.registry import build
+
+WORLDS = {
+    "array": World("array", 1, 1, "tx", "metres", "none", "random", 30),
+    "moving": World("moving_array", 1, 1, "rx", "metres", "none", "random", 30),
+    "image": World("image", 1, 1, "rx", "metres", "none", "random", 30),
+    "tone": World("tone", 1, 1, "rx", "metres", "none", "random", 30),
+    "antennas": World("antennas", 1, 1, "rx", "metres", "none", "random", 30),
+    "power": World("power", 1, 1, "rx", "metres", "none", "random", 30),
+    "stations": World("power", 1, 4, "rx", "metres", "none", "random", 30),
+}
+
+
+@cache
+def file_of(world: str) -> Path:
+    path = Path(mkdtemp()) / f"{world}.npz"
+    np.savez(path, **arrays(WORLDS[world], 0))
+    return path
+
+
+def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
+    """Names of options without effect, and answers at the test rows, after what `run` does until then."""
+    given = ["dataset=own", f"dataset.file='{file_of(world)}'", "logger=none", *overrides]
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        whole = hydra.compose("train", overrides=given, return_hydra_config=True)
+    config = OmegaConf.masked_copy(whole, [key for key in whole if key != "hydra"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HydraConfig.instance(), "cfg", whole)
+        reads = options.noting(config)
+        with heeded.recording(reads):
+            data = datamodule(config.dataset).measurements
+            split = split_for(plain(config.split), data)
+            folder = Path(mkdtemp())
+            fits = fit_and_score(
+                partial(build, config.model),
+                data,
+                split,
+                lambda n: context_of(config, run_dir=folder),
+                eval_on=None,
+            )
+            method, rows = fits.methods[0], split.folds[0].test
+            method.answer(data.batch(rows[:1]))
+        unused = options.unheeded(reads, method, data) or ""
+        return {one.partition("=")[0] for one in unused.split(", ") if one}, method.answer(
+            data.batch(rows)
+        ).mean
+
+
+# Options of which a plain method heeds those of the split alone.
+TRAINING = {
+    "trainer.val_check_interval": 2,
+    "callbacks.densify.min_gaussians": 5,
+    "callbacks.reset.ceiling": 0.02,
+    "dataset.batch_size": 7,
+}
+OF_RUN = {"budget_s": 4, "stations": "each", "split.redraw": "true", **TRAINING}
+SPLIT = {"split.test_fraction": 0.25, "split.thin": 0.9}
+FIELD = {
+    "trainer.max_steps": 4,
+    "model.field.count": 40,
+    "model.field.near": 1.5,
+    "model.field.margin": 1.0,
+    "model.emission.encoding.anchors": 20,
+    "model.emission.init_scale": 0.2,
+    "model.attenuation.gain": 3.0,
+    "model.raster.low_pass": 0.2,
+    "model.loss.ssim_weight": 0.3,
+    "model.optimizer.emission": 0.01,
+    "model.confidence.alpha": 0.2,
+    "model.refit": "false",
+}
+INIT = {"init.searches": 2, "init.rows": 500}
+ALL_FIELD = set(FIELD) | set(TRAINING)  # what a process that has all the weight, or a closed form, leaves
+NEVER = {"callbacks.densify.min_gaussians", "callbacks.reset.ceiling"}  # of trainings of four steps
+SPHERE = {"model.field.margin", "model.attenuation.gain"}
+BOX = {"model.field.near", "model.attenuation.gain"}
+SSIM = {"model.loss.ssim_weight"}
+PLAIN = {
+    "nearest": {},
+    "kriging": {},
+    "idw": {"model.neighbours": 4, "model.power": 1.0},
+    "gp": {"model.components": 3, "model.mean": "constant"},
+}
+PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
+OTHER = {  # values to perturb options by
+    "trainer.val_check_interval": 3, "callbacks.densify.min_gaussians": 8, "callbacks.reset.ceiling": 0.04,
+    "dataset.batch_size": 5, "budget_s": 5, "stations": "auto", "split.redraw": "false", "split.thin": 0.7,
+    "trainer.max_steps": 3, "model.field.count": 30, "model.field.near": 1.2, "model.field.margin": 2.5,
+    "model.emission.encoding.anchors": 10, "model.emission.init_scale": 0.3, "model.attenuation.gain": 2.5,
+    "model.raster.low_pass": 0.5, "model.loss.ssim_weight": 0.1, "model.optimizer.emission": 0.02,
+    "model.confidence.alpha": 0.4, "model.refit": "true", "model.components": 5, "model.mean": "distance",
+    "init.searches": 3, "init.rows": 400, "model.power": 3.0,
+}  # fmt: skip
+
+Case = tuple[str, str, dict, set]
+
+
+def plain_case(world: str, model: str) -> Case:
+    powers = world in ("power", "stations")
+    own = PLAIN.get(model, {})
+    unused = set(OF_RUN) - ({"stations"} if world == "stations" else set())
+    unused |= {"model.components" if powers else "model.mean"} if model == "gp" else set()
+    return world, model, OF_RUN | SPLIT | own, unused
+
+
+FAST: list[Case] = [
+    plain_case("power", "gp"),
+    ("tone", "splat", TRAINING | FIELD, NEVER | BOX | SSIM),
+    ("power", "gsparc", TRAINING | FIELD | INIT, ALL_FIELD | set(INIT)),
+]
+CASES: list[Case] = [
+    *(plain_case(world, model) for world in WORLDS for model in PLAIN),
+    *(plain_case(world, "complex_gp") for world in ("tone", "antennas")),
+    *(plain_case(world, "distance_law") for world in ("power", "stations")),
+    *(plain_case(world, model) for world in WORLDS for model in ("zero", "mean")),
+    ("array", "splat", TRAINING | FIELD, NEVER | SPHERE | {"model.confidence.alpha"}),
+    *((world, "splat", TRAINING | FIELD, NEVER | BOX) for world in ("moving", "image")),
+    *((w, "splat", TRAINING | FIELD, NEVER | BOX | SSIM) for w in ("antennas", "power")),
+    ("array", "gsparc", TRAINING | FIELD | INIT, NEVER | SPHERE | set(INIT) | {"model.confidence.alpha"}),
+    ("image", "gsparc", TRAINING | FIELD | INIT, ALL_FIELD | set(INIT)),
+    ("stations", "gsparc", TRAINING | FIELD | INIT, ALL_FIELD | set(INIT)),
+    ("array", "array", TRAINING | {"model.field.margin": 1.0}, {*TRAINING, "model.field.margin"}),
+    *((w, m, TRAINING | {"model.max_steps": 2}, set(TRAINING)) for w in ("array", "image") for m in PEERS),
+    ("array", "ngrf", TRAINING | {"model.max_steps": 2}, set(TRAINING)),
+]  # fmt: skip
+
+
+def name_of(one: Case | str) -> str:
+    return one if isinstance(one, str) else f"{one[1]}-{one[0]}"
+
+
+def words(options: dict) -> list[str]:
+    return [f"{name}={value}" for name, value in options.items()]
+
+
+def check(case: Case) -> None:
+    world, model, given, unused = case
+    assert fitted(world, f"model={model}", *words(given))[0] == unused
+
+
+@pytest.mark.parametrize("case", FAST, ids=name_of)
+def test_what_a_method_does_not_heed_is_named(case):
+    check(case)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES, ids=name_of)
+def test_what_every_method_does_not_heed_of_every_kind(case):
+    check(case)
+
+
+def perturbed(case: Case, option: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Answers with the value of a case, and with another."""
+    world, model, given, _ = case
+    both = given, given | {option: OTHER[option]}
+    first, second = (fitted(world, f"model={model}", *words(one))[1] for one in both)
+    return first, second
+
+
+NOTED = [(case, option) for case in CASES for option in sorted(case[3])]
+DRAWN = np.random.default_rng(57).permutation(len(NOTED))[:10]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "case, option",
+    [NOTED[i] for i in DRAWN],
+    ids=name_of,
+)
+def test_what_is_named_changes_no_bit_of_the_answers(case, option):
+    assert torch.equal(*perturbed(case, option))
+
+
+@pytest.mark.parametrize(
+    "case, option",
+    [
+        (plain_case("array", "idw"), "model.power"),
+        (plain_case("power", "nearest"), "split.thin"),
+        (plain_case("image", "gp"), "model.components"),
+        (FAST[1], "model.optimizer.emission"),
+        (FAST[1], "model.field.count"),
+    ],
+    ids=name_of,
+)
+def test_what_is_heeded_changes_the_answers(case, option):
+    assert option not in case[3]
+    first, second = perturbed(case, option)
+    assert first.shape != second.shape or not torch.equal(first, second)
+
+
+def warned(caplog) -> list[str]:
+    return [one.message for one in caplog.records if "without effect" in one.message]
+
+
+def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
+    """`model.attenuation.inverse_distance=true` on powers was ignored without a word."""
+    falls = "model.attenuation.inverse_distance=true"
+    unused, answers = fitted("power", "model=gsparc", falls)
+    assert unused == {"model.attenuation.inverse_distance"}
+    said = f"options without effect here: {falls} (of rendered Gaussians alone: say model=splat)"
+    assert warned(caplog) == [said]
+    assert torch.equal(answers, fitted("power", "model=gsparc")[1])
+
+
+def test_steps_mean_nothing_to_a_plain_method(caplog):
+    """`trainer.max_steps=1200` of a plain method; what nobody gave is not named."""
+    assert fitted("image", "model=nearest", "trainer.max_steps=1200")[0] == {"trainer.max_steps"}
+    assert warned(caplog)[0].endswith("(nearest takes no gradient steps here: model=splat does)")
+    caplog.clear()
+    assert not fitted("image", "model=nearest", "seed=1")[0] and not warned(caplog)
+
+
+def test_hidden_units_beside_a_process_with_all_the_weight(caplog):
+    """`model.emission.hidden=16` was exactly the Gaussian process, printed as hidden=16."""
+    given = "model=gsparc", "trainer.max_steps=2", "model.field.count=20"
+    unused, answers = fitted("image", *given, "model.emission.hidden=16")
+    assert unused >= {"model.emission.hidden", "trainer.max_steps"}
+    assert torch.equal(answers, fitted("image", *given)[1])
+    assert "a plain process has all the weight: model=splat is the field alone" in warned(caplog)[0]
+
+
+@pytest.mark.parametrize("none", ["model.steps=0", "trainer.max_steps=0"])
+def test_callbacks_of_a_training_without_steps(none, caplog):
+    """The log listed callbacks for "at most 0 steps"; which of the two numbers asked for that is heeded."""
+    given = "callbacks.densify.start=0.2", "callbacks=early_stopping", "trainer.max_time=00:00:01:00"
+    unused, _ = fitted("array", "model=gsparc", none, *given)
+    assert unused == {"callbacks.densify.start", "callbacks", "trainer.max_time"}
+    assert warned(caplog)[0].endswith("(no gradient steps are asked for: say model.steps=auto)")
+
+
+def test_steps_that_closed_forms_do_not_take(caplog):
+    assert fitted("power", "model=gsparc", "model.steps=7")[0] == {"model.steps"}
+    assert warned(caplog)[0].endswith("model.steps=7 (gsparc takes no gradient steps here: model=splat does)")
+
+
+def test_an_initialiser_that_these_data_do_not_have(caplog):
+    """`init=vectors` of powers was ignored without a word."""
+    assert fitted("power", "model=gsparc", "init=vectors")[0] == {"init"}
+    assert warned(caplog)[0].endswith("init=vectors (here it is init=powers)")
+    for init in ("vectors", "auto"):
+        assert not fitted("array", "model=gsparc", f"init={init}", "model.steps=0")[0]
+
+
+def test_switches_of_effects_count_where_they_decide():
+    assert fitted("power", "model=gsparc", "model.effects.phase=false")[0] == {"model.effects.phase"}
+    assert not fitted("array", "model=gsparc", "model.effects.array=true", "model.steps=0")[0]
+    assert not fitted("image", "model=gsparc", "model.effects.residual=false", "trainer.max_steps=1")[0]
+
+
+def test_steps_of_the_model_give_way_to_those_of_the_trainer():
+    given = "model=splat", "model.field.count=20", "model.steps=3"
+    assert not fitted("tone", *given)[0]
+    assert fitted("tone", *given, "trainer.max_steps=2")[0] == {"model.steps"}
+
+
+def test_phases_of_snapshots_mean_nothing_to_powers():
+    """`model.loss.snapshot=phase` of powers ended in an IndexError."""
+    given = "model=splat", "model.field.count=20", "trainer.max_steps=1", "model.loss.snapshot=phase"
+    assert fitted("power", *given)[0] == {"model.loss.snapshot"}
+    assert not fitted("tone", *given)[0]
+
+
+@pytest.mark.slow
+def test_what_other_processes_read_counts():
+    """Stations fitted by joblib: everything would be named, as nothing was read here."""
+    given = "model=idw", "stations=each", "model.neighbours=4", "model.power=1.0", "trainer.max_steps=3"
+    executor.use(Engine("joblib", 2))
+    try:
+        assert fitted("stations", *given)[0] == {"trainer.max_steps"}
+    finally:
+        executor.use(Engine())
+
+
+def test_what_an_experiment_file_says_is_given_too(monkeypatch):
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        whole = hydra.compose("train", overrides=["experiment=ablation_field"], return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", whole)
+    own = options.given()
+    assert own["trainer.max_steps"] == "trainer.max_steps=400"
+    assert {"threads", "baselines"} < own.keys()  # of the file that it builds on
