@@ -136,11 +136,15 @@ class PlannedField(LearnedField):
         """First where rows were measured, then where they rather were."""
         budget = context.time_budget()
         first = replace(context, run_dir=Path(), resume=None)
-        limited = self._fit_conditional(chosen, data, fold, first).limited_by
+        report = self._fit_conditional(chosen, data, fold, first)
         assert self.field is not None
         rows, by, note = refined(self.field, self.runs.aligned(data), std)
+        if by.any() and budget.over():
+            note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
-        spent = budget.counted.wall
+        if not by.any() or budget.limited:
+            return replace(report, notes=(note, *report.notes))
+        limited, spent = report.limited_by, budget.counted.wall
         rest = replace(context, budget_s=budget.left_s)
         report = self._fit_conditional(chosen, displaced(data, rows, by), fold, rest)
         limited = less_repeatable(limited, report.limited_by)

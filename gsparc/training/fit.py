@@ -98,9 +98,8 @@ class ReturnMetrics(L.Callback):
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Also after a checkpoint with every step done; where the schedule was not ended, where it stood."""
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
-        if module.position < module.total_steps:
-            position = torch.tensor(module.position, dtype=torch.float64)
-            trainer.callback_metrics.setdefault(KEPT[1], position)
+        if trainer.global_step < module.total_steps:
+            trainer.callback_metrics.setdefault(KEPT[1], trainer.callback_metrics[TAKEN])
 
 
 def stands(trainer: L.Trainer) -> bool:

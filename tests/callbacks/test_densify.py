@@ -83,7 +83,7 @@ def test_never_more_than_allowed_and_the_neediest_first(model, share):
 
 def rendering(model, rendered, share=1.0):
     batch = SimpleNamespace(share=share, rx=SimpleNamespace(batched=True))
-    return SimpleNamespace(model=model, total_steps=100, rendered=rendered, batch=batch, position=0)
+    return SimpleNamespace(model=model, total_steps=100, rendered=rendered, batch=batch, global_step=0)
 
 
 def statistics(model, gradient, visible=True, shares=(1.0,)) -> dict[str, torch.Tensor]:

@@ -21,7 +21,7 @@ from gsparc.models.per_station import for_links
 from gsparc.models.refined_places import Linearised, displaced, displacements, refined
 from gsparc.training.context import FitContext
 
-BRIEF = FitContext(budget_s=1.0, budget_clock="processor")
+BRIEF = FitContext(effort=0.1)
 CARRIER = 2.4e9
 
 

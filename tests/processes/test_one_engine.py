@@ -20,6 +20,7 @@ EXCEPTIONS = {  # who solves a system for itself, and why
     "gsparc/evaluation/link/pusch.py": "the receiver's filter of a link, no covariance of places",
     "gsparc/data/datasets/powder.py": "a map from degrees to metres by least squares",
     "gsparc/data/checks/level_steps.py": "a mean law by least squares",
+    "gsparc/data/checks/conventions.py": "the lobe about a strongest direction by least squares",
     "gsparc/physics/lags.py": "a basis of an array's lags",
     "gsparc/models/refined_places.py": "three coordinates of a place's error",
     "gsparc/models/directional/position_refine.py": "three coordinates of a source",

@@ -129,7 +129,7 @@ def warm_start(
         ValueError: the emission has hidden units.
     """
     if model.settings.emission.hidden:
-        raise ValueError("init=images solves a linear read-out: leave init=auto or set emission.hidden=0")
+        raise ValueError("init=images solves a linear read-out: leave init=auto, or model.emission.hidden=0")
     version = int(model.gaussians.version)
     weights = model.freeze(receiver).render(torch.eye(len(model.gaussians)), version).flatten(1).mT
     parts = [_seen(model, data, part, weights) for part in np.array_split(rows, -(-len(rows) // CHUNK))]

@@ -248,11 +248,11 @@ def test_an_interrupt_ends_all_searches_and_names_the_checkpoint(tmp_path, monke
     data, fold = _uplink(100)
     begun = time.monotonic()
 
-    def interrupt(*unused):
+    def interrupt(*unused, **named):
         time.sleep(0.5)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gsparc.models.image_sources.ensemble._watch", interrupt)
+    monkeypatch.setattr("gsparc.models.image_sources.ensemble.wait", interrupt)
     with pytest.raises(KeyboardInterrupt, match=r"0 finished; go on with ckpt_path=.*last\.ckpt"):
         ImageSourceGP(searches=2, margin=8.0).fit(data, fold, FitContext(tmp_path))
     assert time.monotonic() - begun < 0.5 + 2.0 + 1.0

@@ -71,7 +71,7 @@ def test_more_gaussians_explain_more(smooth):
 
 
 def test_a_network_with_hidden_units_has_no_closed_form(smooth):
-    with pytest.raises(ValueError, match=r"set model\.emission\.hidden=0"):
+    with pytest.raises(ValueError, match=r"or model\.emission\.hidden=0"):
         started(smooth, emission=dataclasses.replace(KERNEL, hidden=4))
 
 
