@@ -72,7 +72,7 @@ def noting(config: DictConfig) -> Reads:
     for path in given():
         group, _, name = path.rpartition(".")
         node = OmegaConf.select(config, group) if group else None
-        if isinstance(node, DictConfig) and (name not in NAMES or path == "init.name"):
+        if isinstance(node, DictConfig) and name in node and (name not in NAMES or path == "init.name"):
             value = OmegaConf.select(config, path)
             options += [Option(path, value, *holder) for holder in _holders(path, node, method)]
     return Reads(options)

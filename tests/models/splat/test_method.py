@@ -47,6 +47,7 @@ def test_images_smaller_than_the_window_of_ssim_train(tmp_path, caplog, height, 
     with np.load(spectra(tmp_path / "own.npz")) as stored:
         arrays = {**stored, "spectrum": stored["spectrum"][:, :height, :width]}
     np.savez(tmp_path / "own.npz", **arrays)
+    caplog.set_level("INFO")
     method, data, fold = fitted(tmp_path / "own.npz", tmp_path, *more)
     assert "smaller than SSIM's window" in caplog.text
     batch = data.batch(fold.test)
