@@ -73,7 +73,7 @@ def search_many(
 
     def unwanted(number: int) -> bool:
         """Whether those before it are all that is wanted."""
-        before = list(takewhile(lambda error: error is not None, map(errors.get, range(number))))
+        before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
         ended = at_noise_floor(before, noise_floor) or (len(before) > 0 and beaten(before[0], rival))
         return stopped.is_set() or ended
 
