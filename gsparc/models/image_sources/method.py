@@ -54,6 +54,7 @@ log = logging.getLogger(__name__)
 
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
+ALONE = 3.0  # times the effort of a search beside others: here nothing else answers where it ends early
 
 
 class ImageSourceGP(FramedMethod):
@@ -130,6 +131,8 @@ class ImageSourceGP(FramedMethod):
     ) -> FitReport:
         if context.budget_s is None:
             context = replace(context, budget_s=self.budget_s)
+        if not context.leave_out:
+            context = replace(context, effort=ALONE * context.effort)
         budget = context.time_budget(cache.spent)
         self.site, self.antennas = data.site, data.target.shape[1]
         self.frame = frame_of(data.site, gather(data, known, self.row_limit, self.seed))
