@@ -9,6 +9,7 @@ from clocks import wound
 from contexts import loaded, short
 
 from gsparc.commands.train import train
+from gsparc.models import checkpoint, loading
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
 from gsparc.training.context import FitContext
@@ -59,7 +60,9 @@ def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
     data, fold = loaded(file)
     method = build(compose(*brief(file)).model)
     callbacks = context.pop("callbacks", lambda: [Ticking()])
-    return method.fit(data, fold, short(tmp_path, 30, callbacks=callbacks, every=2, **context))
+    report = method.fit(data, fold, short(tmp_path, 30, callbacks=callbacks, every=2, **context))
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    return report
 
 
 def test_what_others_take_of_the_processor_ends_no_stage(tmp_path, monkeypatch):
@@ -75,6 +78,13 @@ def test_a_second_stage_that_seconds_cut_is_not_the_result(tmp_path, monkeypatch
         for budget in (1e3, 40.0)
     )
     assert whole.limited_by is None and cut.limited_by == "processor"
+
+
+def test_a_field_whose_second_stage_was_cut_could_not_be_read_back(tmp_path, monkeypatch):
+    """The anchors of its encoding were those of the second stage, which learned from more rows."""
+    fitted(tmp_path, monkeypatch, 0.0, 0.0, budget_s=40.0, budget_clock="processor")
+    method, _ = loading.load(tmp_path / "model.ckpt")
+    assert len(method.fitted().gaussians) == 40
 
 
 def test_a_run_that_seconds_ended_goes_on_without_them_to_its_end(tmp_path, monkeypatch):

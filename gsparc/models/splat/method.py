@@ -172,10 +172,11 @@ class LearnedField(Method):
             every = Fold(np.sort(np.concatenate([watched.train, watched.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
             again = context.within("refit", resume=resume)
-            known, kept = (self.fitted().confidence, self.fitted().error), (self.model, self.steps)
+            known = self.fitted().confidence, self.fitted().error
+            kept = self.model, self.steps, self._prior
             self._stage("refit", origin, data, every, again, budget, seconds, steps, *known)
             if budget.limited and stage == "train":  # its schedule is cut: the first stage ended its own
-                self.model, self.steps = kept
+                self.model, self.steps, self._prior = kept
         return self._ended(context, budget)
 
     def _end_with_start(
