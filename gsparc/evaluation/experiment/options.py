@@ -118,6 +118,7 @@ def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
 
 
 def _alone(method: Method) -> bool:
+    """Whether the process beside the field has all the weight."""
     return method.field_alone() is not None and not method.size()
 
 
@@ -130,21 +131,12 @@ def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str
     reasons = (
         (path == "budget_s", f"the seconds of {method.name} cannot be chosen"),
         (path == "stations", "there is one station"),
-        (
-            group == "split" and data.release_split is not None,
-            REDRAW,
-        ),
+        (group == "split" and data.release_split is not None, REDRAW),
         (group == "split", "this split does not use it"),
-        (
-            method.field_alone() is not None and not method.size(),
-            ALONE,
-        ),
+        (_alone(method), ALONE),
         (path == "model.steps" and "trainer.max_steps" in noted, "steps of the Trainer win"),
         (training and "trainer" in noted, "this training does not call for it"),
-        (
-            training and {"model.steps", "trainer.max_steps"} & noted,
-            STEPS,
-        ),
+        (training and {"model.steps", "trainer.max_steps"} & noted, STEPS),
         (training, f"{method.name} takes no gradient steps here: model=splat does"),
         (rendered and isinstance(method, TrainsByGradient), "of rendered Gaussians alone: say model=splat"),
         (started is not None, f"here it is init={started}"),

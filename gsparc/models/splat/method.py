@@ -141,9 +141,7 @@ class LearnedField(Method):
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self.steps_taken = int(marks.get("taken", 0))
         self.spent, self._apart = {}, _apart(data, fold)
-        self._left_out = LeftOut.of(
-            marks.get("left_out")
-        )  # the initialiser of an interrupted run is not repeated
+        self._left_out = LeftOut.of(marks.get("left_out"))  # an interrupted run's start is not repeated
         self._billed, self._limited_by = Spent(), marks.get("limited_by")
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
@@ -180,14 +178,9 @@ class LearnedField(Method):
         return self._ended(context, budget)
 
     def _end_with_start(
-        self,
-        origin: Origin,
-        data: Measurements,
-        fold: Fold,
-        context: FitContext,
-        budget: TimeBudget,
-        seconds: float,
-    ) -> FitReport:
+        self, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
+        budget: TimeBudget, seconds: float,
+    ) -> FitReport:  # fmt: skip
         """Solve the start again on all rows: no step was surely better, or none was asked for."""
         every = np.sort(np.concatenate([fold.train, fold.val]))
         fold = Fold(every, fold.val[:0], fold.test) if self.refit else fold
