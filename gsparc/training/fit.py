@@ -32,7 +32,7 @@ from gsparc.training.time_budget import Spent, TimeBudget
 log = logging.getLogger(__name__)
 
 TAKEN = "steps/taken"
-KEPT = ("steps/kept", "steps/kept_position")
+KEPT = "steps/kept"
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 LOOKS = 10  # validations of a training, where the Trainer is given no interval
 
@@ -54,16 +54,14 @@ class Ran:
 
     Attributes:
         seconds: that it took, validations too [s].
-        steps: whose result is kept.
-        position: of that in the schedule [steps]; None where it is the end of it.
+        kept: steps whose result is kept; None where the schedule was gone through to its end.
         taken: steps in all.
         timed_out: whether `trainer.max_time` ended it.
     """
 
     seconds: float
-    steps: int
-    position: int | None
-    taken: int = 0
+    kept: int | None
+    taken: int
     timed_out: bool = False
 
 
@@ -96,10 +94,10 @@ class ReturnMetrics(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """Also after a checkpoint with every step done; where the schedule was not ended, where it stood."""
+        """Also after a checkpoint with every step done; of an unfinished schedule, what was taken is kept."""
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
         if trainer.global_step < module.total_steps:
-            trainer.callback_metrics.setdefault(KEPT[1], trainer.callback_metrics[TAKEN])
+            trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
 
 
 def stands(trainer: L.Trainer) -> bool:
@@ -239,13 +237,13 @@ def run_stage(
     metrics = trainer.callback_metrics
     more = Spent(*metrics[SPENT].tolist()) - budget.counted  # of other processes, and of an earlier run
     budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
-    steps, position = (int(metrics[name]) if name in metrics else None for name in KEPT)
+    kept = int(metrics[KEPT]) if KEPT in metrics else None
     taken = int(metrics[TAKEN])
     timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[union-attr]
     timed_out = any((timer.time_remaining() or 0) <= 0 for timer in timers)
     if timed_out:
         log.warning("trainer.max_time ended training after %d of %d steps", taken, module.total_steps)
-    return Ran((budget.counted - before).wall, taken if steps is None else steps, position, taken, timed_out)
+    return Ran((budget.counted - before).wall, kept, taken, timed_out)
 
 
 def _told(callbacks: Sequence[L.Callback], rows: int) -> Sequence[L.Callback]:

@@ -27,13 +27,12 @@ class KeepBest(L.Callback):
     standard errors, and below that of all looks before it.
 
     Attributes:
-        position: of the kept parameters in the schedule [steps]; 0: as they were before the first.
-        step: the number of steps taken until then.
+        step: of the kept parameters; 0: as they were before the first.
     """
 
     def __init__(self) -> None:
         self.error = float("inf")
-        self.step = self.position = 0
+        self.step = 0
         self.start = torch.zeros(0)  # errors of the rows before the first step (n,)
         self._kept: dict[str, Any] | None = None
 
@@ -46,15 +45,16 @@ class KeepBest(L.Callback):
             self.start = module.held_out
         surely = agreed(float(_surely_less(module.held_out, self.start)), trainer)
         if trainer.sanity_checking or (error < self.error and surely):
-            self.error, self.step, self.position = error, trainer.global_step, trainer.global_step
+            self.error, self.step = error, trainer.global_step
             self._kept = copy.deepcopy(module.model.state_dict())
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Back to the best; also after a checkpoint with every step done."""
         if self._kept is None:
             return
-        for name, value in zip(KEPT, (self.step, self.position), strict=True):  # also from another process
-            trainer.callback_metrics[name] = torch.tensor(value, dtype=torch.float64)
+        trainer.callback_metrics[KEPT] = torch.tensor(
+            self.step, dtype=torch.float64
+        )  # of another process, too
         taken = trainer.global_step
         if self.step == taken:
             return
@@ -68,12 +68,11 @@ class KeepBest(L.Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """What is kept, so that a resumed run ends with it, too."""
-        names = ("error", "step", "position", "start")
-        return {**{name: getattr(self, name) for name in names}, "kept": self._kept}
+        return {"error": self.error, "step": self.step, "start": self.start, "kept": self._kept}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on."""
-        self.error, self.step, self.position = state["error"], state["step"], state["position"]
+        self.error, self.step = state["error"], state["step"]
         self.start, self._kept = state["start"], state["kept"]
 
 
@@ -89,12 +88,12 @@ class StopAt(L.Callback):
     """Ends training where an earlier stage found that further steps do not pay.
 
     Args:
-        position: in the schedule [steps].
+        step: the last one.
     """
 
-    def __init__(self, position: int) -> None:
-        self.position = position
+    def __init__(self, step: int) -> None:
+        self.step = step
 
     def on_train_batch_end(self, trainer: L.Trainer, module: GaussianModule, *unused: Any) -> None:  # type: ignore[override]
         """After every step."""
-        trainer.should_stop = trainer.should_stop or trainer.global_step >= self.position
+        trainer.should_stop = trainer.should_stop or trainer.global_step >= self.step

@@ -267,12 +267,12 @@ class LearnedField(Method):
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
         ran = run_stage(module, data, fold, context, files, budget, watch)
-        self.steps = ran.steps
+        self.steps = ran.taken if ran.kept is None else ran.kept
         self.spent["gradient steps" + again] = ran.seconds
         if ran.timed_out or budget.limited:
             self._limited_by = less_repeatable(self._limited_by, "wall" if ran.timed_out else budget.clock)
         if stage == "train":
-            self._paying, self.steps_taken = ran.position, ran.taken
+            self._paying, self.steps_taken = ran.kept, ran.taken
         return prepared + ran.seconds
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
