@@ -52,9 +52,7 @@ class KeepBest(L.Callback):
         """Back to the best; also after a checkpoint with every step done."""
         if self._kept is None:
             return
-        trainer.callback_metrics[KEPT] = torch.tensor(
-            self.step, dtype=torch.float64
-        )  # of another process, too
+        trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process
         taken = trainer.global_step
         if self.step == taken:
             return
