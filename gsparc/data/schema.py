@@ -13,6 +13,7 @@ from torch import Tensor
 from gsparc.data.blocks import take
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
+from gsparc.physics.row_factors import Freedom
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
@@ -110,6 +111,9 @@ class Site:
             of both as in `Measurements.moving`.
         level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
         unit: that powers were given in, and are answered in; None: `level_unit`.
+        freedom: what of each row's factor nobody knows, see `gsparc.physics.row_factors`.
+        gauge: of rows that were turned to each other: `carrier`, their phases over places are those of
+            waves; `free`, neighbours were made alike. None where rows are as measured.
     """
 
     name: str
@@ -136,6 +140,8 @@ class Site:
     georeference: Georeference | None = None
     level_unit: str = "dB"
     unit: str | None = None
+    freedom: Freedom = "none"
+    gauge: Literal["carrier", "free"] | None = None
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:

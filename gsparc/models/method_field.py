@@ -10,6 +10,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.models.method import Method
 from gsparc.ops import Pose
@@ -68,5 +69,14 @@ class ProcessField(MethodField):
 
     kind = "process"
     makes = GaussianProcess
+    count = 0  # type: ignore[assignment]
+    terms = ("residual",)  # type: ignore[assignment]
+
+
+class AlignedField(MethodField):
+    """A process of rows that were turned to each other, without any Gaussians."""
+
+    kind = "aligned"
+    makes = ComplexGP
     count = 0  # type: ignore[assignment]
     terms = ("residual",)  # type: ignore[assignment]
