@@ -11,13 +11,15 @@ from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.physics.row_factors import Freedom, turning
 
-NEAR = 0.125  # wavelengths between rows whose channels are nearly alike
-PAIRS = 400
-FEWEST = 12  # pairs that tell
-PER_ROW = 4  # neighbours of a row that are looked at
-APART, ALIKE = 0.4, 0.8  # correlation of neighbours: below, their phases differ; above, their shapes do not
+NEAR, IN_LINE = 0.125, 0.5  # wavelengths between rows of nearly one channel, and of a steady phase advance
+MOST = 400  # pairs or triples that are looked at
+FEWEST = 12
+AROUND = 6  # neighbours of a row that are looked at
+STRAIGHT, EVEN = -0.9, 0.7  # cosine at the middle row of three, and ratio of its distances
+OWN = {NEAR: 0.7, IN_LINE: 0.45}  # share of the correlation that rows with phases of their own keep at most
+ALIKE = {NEAR: 0.8, IN_LINE: 0.6}  # correlation of neighbours, above which their shapes do not differ
 MORE = 0.1  # of correlation that a free delay must bring
-SCATTER_DB = 2.0  # of levels between neighbours of one shape, more than fading within an eighth wavelength
+SCATTER_DB = {NEAR: 2.0, IN_LINE: 3.2}  # of levels between neighbours, more than fading makes
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Coherence:
     Attributes:
         pairs: of neighbours that were compared.
         distance: between them, the median [m].
-        as_measured: size of the mean correlation, with the phases as they are.
+        as_measured: size of the mean correlation with phases as they are; where rows are further apart than
+            an eighth wavelength, of the advance of the phase between three rows in line.
         phase, delay: mean correlation after a free phase, and after a delay too, of each pair.
         level_db: scatter of levels between neighbours [dB].
         freedom: what each row must be allowed.
@@ -60,40 +63,59 @@ def coherence(data: Measurements) -> Coherence | None:
     rows = Snapshots.of(data, np.arange(len(data)))
     if rows.values[0].size < 2:
         return None
-    one, two, distance = _pairs(rows, NEAR * site.wavelength)
-    if len(one) < FEWEST:
+    power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
+    values, reach = rows.values / np.maximum(power, np.finfo(float).tiny), NEAR
+    near = _neighbours(rows, NEAR * site.wavelength, pairs=True)
+    if len(near) < FEWEST:
+        reach, near = IN_LINE, _neighbours(rows, IN_LINE * site.wavelength, pairs=False)
+    if len(near) < FEWEST:
         return None
-    a, b = rows.values[one], rows.values[two] * (rows.values[one] != 0)
-    a = a * (b != 0)
-    size = np.sqrt((np.abs(a) ** 2).sum((1, 2)) * (np.abs(b) ** 2).sum((1, 2)))
-    told = size > 0
-    a, b, size, distance = a[told], b[told], size[told], distance[told]
-    if len(a) < FEWEST:
-        return None
-    own = (a * b.conj()).sum((1, 2)) / size
-    delayed = a * turning(a, b, rows.tones, "phase+delay")[:, None]
-    after = (delayed * b.conj()).sum((1, 2)).real / size
-    levels = 10 * np.log10((np.abs(a) ** 2).sum((1, 2)) / (np.abs(b) ** 2).sum((1, 2)))
+    middle = values[near[:, 0]]
+    first, size = _correlation(middle, values[near[:, 1]])
+    measured = abs(first.mean())
+    if reach == IN_LINE:  # in the next step the phase advances as in this one
+        second, _ = _correlation(values[near[:, 2]], middle)
+        measured = np.sqrt(abs((first * second.conj()).mean()))
+    a, b = middle, values[near[:, 1]]
+    turned = a * turning(a, b, rows.tones, "phase+delay")[:, None]
+    phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
+    levels = 10 * np.log10(size[:, 0] / size[:, 1])
     scatter = float(1.4826 * np.median(np.abs(levels))) / np.sqrt(2)
-    measured, phase, delay = abs(own.mean()), float(np.abs(own).mean()), float(after.mean())
     freedom: Freedom = "none"
-    if measured < APART and max(phase, delay) > ALIKE:
-        slopes = delay > phase + MORE
-        freedom = "phase+delay" if slopes else "phase"
-        if scatter > SCATTER_DB:
-            freedom = "phase+delay+gain"
-    return Coherence(
-        len(a), float(np.median(distance)), float(measured), phase, delay, scatter, freedom
-    )
+    if measured < OWN[reach] * phase and max(phase, delay) > ALIKE[reach]:
+        freedom = "phase+delay" if delay > phase + MORE else "phase"
+        freedom = "phase+delay+gain" if scatter > SCATTER_DB[reach] else freedom
+    apart = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
+    return Coherence(len(near), float(np.median(apart)), float(measured), phase, delay, scatter, freedom)
 
 
-def _pairs(rows: Snapshots, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Neighbours of one run within `reach` [m]: numbers (P,) of both, and distances (P,) [m], near ones first."""
-    near, index = cKDTree(rows.places).query(rows.places, k=min(PER_ROW + 1, len(rows.places)))
-    near, index = near.reshape(len(rows.places), -1), index.reshape(len(rows.places), -1)
-    one = np.repeat(np.arange(len(index)), index.shape[1])
-    two, distance = index.ravel(), near.ravel()
-    good = (one < two) & (distance <= reach) & (rows.run[one] == rows.run[two % len(rows.run)])
-    one, two, distance = one[good], two[good], distance[good]
-    chosen = np.unique(np.linspace(0, len(one) - 1, PAIRS).astype(int)) if len(one) else one
-    return one[chosen], two[chosen], distance[chosen]
+def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of rows (P, A, K) each with each, (P,) complex, and what both measured (P, 2) of power."""
+    both = (a != 0) & (b != 0)
+    size = np.stack([(np.abs(one) ** 2 * both).sum((1, 2)) for one in (a, b)], 1).clip(1e-300)
+    return (a * b.conj()).sum((1, 2)) / np.sqrt(size.prod(1)), size
+
+
+def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
+    """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line, the middle one first."""
+    found = [np.zeros((0, 2 if pairs else 3), np.int64)]
+    for run in np.unique(rows.run):
+        own = np.flatnonzero(rows.run == run)
+        at = rows.places[own]
+        near, index = (part.reshape(len(own), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(own))))
+        good = (near <= reach) & (index != np.arange(len(own))[:, None])
+        if pairs:
+            one, column = np.nonzero(good & (index > np.arange(len(own))[:, None]))
+            found.append(own[np.c_[one, index[one, column]]])
+            continue
+        good &= near > 0
+        step = (at[index] - at[:, None]) / np.maximum(near, 1e-12)[..., None]
+        first = good.argmax(1)
+        towards = np.take_along_axis(step, first[:, None, None], 1)
+        length = np.take_along_axis(near, first[:, None], 1)
+        opposite = good & ((step * towards).sum(-1) < STRAIGHT) & (length > EVEN * near)
+        middle = np.flatnonzero(good.any(1) & opposite.any(1))
+        third = opposite.argmax(1)
+        found.append(own[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]])
+    every = np.concatenate(found)
+    return every[np.unique(np.linspace(0, len(every) - 1, MOST).astype(int))] if len(every) else every
