@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
 
 Kind = Literal["spectrum", "csi", "rssi"]
+Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
 End = Literal["rx", "tx"]
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
 OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
@@ -142,6 +143,11 @@ class Site:
     unit: str | None = None
     freedom: Freedom = "none"
     gauge: Literal["carrier", "free"] | None = None
+
+    @property
+    def scored(self) -> Scored:
+        """The figures of merit that tell of it; rows with factors of their own are aligned first."""
+        return "aligned csi" if self.kind == "csi" and self.freedom != "none" else self.kind
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
-from gsparc.physics.row_factors import Freedom, turning
+from gsparc.physics.row_factors import FREEDOMS, Freedom, turning
+
+log = logging.getLogger(__name__)
 
 NEAR, IN_LINE = 0.125, 0.5  # wavelengths between rows of nearly one channel, and of a steady phase advance
+MOST_ENTRIES = 4_000_000  # of channels from the first row on, which tell of all
 MOST = 400  # pairs or triples that are looked at
 FEWEST = 12
 AROUND = 6  # neighbours of a row that are looked at
@@ -45,8 +50,9 @@ class Coherence:
     freedom: Freedom
 
     def __str__(self) -> str:
+        own = "" if self.freedom == "none" else f"every row has a {self.freedom.replace('+', ', ')} of its own: "
         return (
-            f"rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, by "
+            f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, by "
             f"{self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
             f"scatter by {self.level_db:.1f} dB ({self.pairs} pairs)"
         )
@@ -60,7 +66,8 @@ def coherence(data: Measurements) -> Coherence | None:
     site = data.site
     if site.kind != "csi" or site.wavelength is None or data.uplink is not None:
         return None
-    rows = Snapshots.of(data, np.arange(len(data)))
+    few = max(MOST_ENTRIES // data.target[0].size, 1)
+    rows = Snapshots.of(data, np.arange(min(len(data), few)))
     if rows.values[0].size < 2:
         return None
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
@@ -87,6 +94,28 @@ def coherence(data: Measurements) -> Coherence | None:
         freedom = "phase+delay+gain" if scatter > SCATTER_DB[reach] else freedom
     apart = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
     return Coherence(len(near), float(np.median(apart)), float(measured), phase, delay, scatter, freedom)
+
+
+def allowed(data: Measurements, align: str) -> Measurements:
+    """The measurements with what of each row is free: as `align` says, `auto` by `coherence`.
+
+    Raises:
+        SettingError: no such freedom, or one of what are no channels.
+    """
+    if align not in ("auto", *FREEDOMS):
+        raise SettingError(f"dataset.align={align}: is none of auto, {', '.join(FREEDOMS)}")
+    if data.site.kind != "csi":
+        if align not in ("auto", "none"):
+            raise SettingError(f"dataset.align={align}: is for channels, these are {data.site.kind}")
+        return data
+    freedom: Freedom = align  # type: ignore[assignment]
+    if align == "auto":
+        found = coherence(data)
+        if found is None or found.freedom == "none":
+            return data
+        freedom = found.freedom
+        log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
+    return replace(data, site=replace(data.site, freedom=freedom))
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
