@@ -1,7 +1,8 @@
-"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; Atheros and ESP32 untested on logs of cards.
+"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; Atheros and ESP32 on no log of a card yet.
 
-`csiread` trusts the lengths that a file states (a longer packet than its buffer overwrites its stack, a file
-that is not there ends the process), so lengths are looked at before it reads.
+`csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a file
+that is not there ends the process. Lengths of Nexmon and Intel 5300 are looked at before it reads; Atheros'
+are not.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ STREAMS = 3  # most antennas at either end of the cards
 BUFFER = 1024  # bytes of `csiread` for a record of an Intel 5300
 TICKS = 2.0**32  # microseconds after which the clock of an Intel 5300 begins again
 HEADS = 16, 60  # bytes of a packet before its Ethernet frame, and of that before the channel
-POINTS = {256: 20, 512: 40, 1024: 80}  # MHz by bytes of the channel
+POINTS = {256: 20, 512: 40, 1024: 80}  # MHz by bytes of the channel, after which come a few that are none
+PADDING = 256  # bytes, more than those
 OLD_MAGIC = b"\x11" * 4  # of Nexmon's packets without RSSI
 ATHEROS_TONES = {0: (1, 28), 1: (2, 58)}  # first and last on each side, of 20 and 40 MHz
 
@@ -90,17 +92,17 @@ def address(octets: np.ndarray) -> np.ndarray:
 
 
 def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
-    magics = list(_magics(path))
-    sizes = sorted({size for size, _ in magics})
+    frames = list(_frames(path))
+    sizes = sorted({size for size, _, _ in frames})
     if len(sizes) != 1 or sizes[0] not in POINTS:
         found = ", ".join(map(str, sizes)) or "none"
         raise DataError(f"{path}: bytes of channels: {found}; expected those of one of 20, 40, 80 MHz")
-    silent = magics[0][1] == OLD_MAGIC
+    silent = frames[0][1] == OLD_MAGIC
     log = (csiread.Nexmon if silent else csiread.NexmonPull256)(str(path), chip, POINTS[sizes[0]], False)
     log.read()
     # Other cores and streams are packets of their own; the last packet may be cut short.
     one = np.flatnonzero((log.core == 0) & (log.spatial == 0))
-    one = one[one < len(magics)]
+    one = one[one < sum(whole for _, _, whole in frames)]
     spec, points = int(log.chan_spec[0]), sizes[0] // 4
     rssi = np.full(len(one), np.nan) if silent else log.rssi[one].astype(np.uint8).view(np.int8).astype(float)
     return Packets(
@@ -113,8 +115,8 @@ def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
     )
 
 
-def _magics(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Bytes of the channel and first bytes of each of Nexmon's packets that is there as a whole."""
+def _frames(path: Path) -> Iterator[tuple[int, bytes, bool]]:
+    """Bytes of the channel and first bytes of each of Nexmon's packets, and whether it is there as a whole."""
     content = path.read_bytes()
     order = "big" if content[:1] == b"\xa1" else "little"
     before, head = HEADS
@@ -122,18 +124,18 @@ def _magics(path: Path) -> Iterator[tuple[int, bytes]]:
     while at + before <= len(content):
         size = int.from_bytes(content[at + 8 : at + 12], order)  # type: ignore[arg-type]
         frame = content[at + before : at + before + size]
-        if frame[6:12] == b"NEXMON" and len(frame) == size:
-            yield size - head, frame[42:46]
+        if frame[6:12] == b"NEXMON":
+            yield (size - head) // PADDING * PADDING, frame[42:46], len(frame) == size
         at += before + size
 
 
 def _intel(path: Path, csiread: Any, _: str) -> Packets:
     content = path.read_bytes()
     size = int.from_bytes(content[:2], "big")
-    if size + 2 == RECORD.itemsize:  # with the time and the sender, which `csiread` would take for the channel
+    if size + 2 == RECORD.itemsize:  # with time and sender, which `csiread` would take for the channel
         own = read_log(path)
         power = np.sum(np.abs(own.csi) ** 2, axis=2).mean(axis=1)
-        sender = address(own.sender.view(np.uint8).reshape(-1, 6))
+        sender = address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
         return Packets(own.time, sender, own.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
     at = 0
     while at + 2 < len(content):
