@@ -1,7 +1,7 @@
 """Wi-Fi channels as cards log them: one log, or a folder of logs, and a table that says where each was taken.
 
 Places are a row per file (`file`, `x`, `y`), or a track (`time_s`, `x`, `y`) of all files or, with `file`, of
-each; `z`, `rssi_dbm` and `channel` may stand beside them. Every packet is a row; packets of one place share it.
+each; `z`, `rssi_dbm` and `channel` may stand beside them. Every packet is a row; those of one place share it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gsparc.data.raw import Raw
 
 log = logging.getLogger(__name__)
 
-PLACES = "places.csv"
+PLACES, NUMBERS = "places.csv", ("time_s", "x", "y", "z", "rssi_dbm", "channel")
 CHIPS = ("43455c0", "4339", "4358", "4366c0")
 # First and last subcarrier that a frame of 802.11a/g/n/ac fills, by the last that an FFT of its width has.
 FILLED = {32: (1, 26), 64: (2, 58), 128: (2, 122)}
@@ -138,7 +138,7 @@ class _Table:
         if not {"x", "y"} <= set(head) or not {"file", "time_s"} & set(head):
             raise DataError(f"{path}: columns {', '.join(head)}; expected x, y [m], and file or time_s")
         columns = dict(zip(head, np.array([row[: len(head)] for row in lines[1:]]).T, strict=False))
-        names = [name for name in ("time_s", "x", "y", "z", "rssi_dbm", "channel") if name in columns]
+        names: list[str] = [name for name in NUMBERS if name in columns]
         try:
             numbers = {name: columns[name].astype(np.float64) for name in names}
         except ValueError as error:

@@ -1,8 +1,8 @@
 """Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; Atheros and ESP32 on no log of a card yet.
 
-`csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a file
-that is not there ends the process. Lengths of Nexmon and Intel 5300 are looked at before it reads; Atheros'
-are not.
+`csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a
+file that is not there ends the process. Lengths of Nexmon and Intel 5300 are looked at before it reads; those
+of Atheros are not.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
 
 
 def _frames(path: Path) -> Iterator[tuple[int, bytes, bool]]:
-    """Bytes of the channel and first bytes of each of Nexmon's packets, and whether it is there as a whole."""
+    """Bytes of the channel and first bytes of each of Nexmon's packets, and whether it is there whole."""
     content = path.read_bytes()
     order = "big" if content[:1] == b"\xa1" else "little"
     before, head = HEADS
@@ -137,13 +137,13 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
         power = np.sum(np.abs(own.csi) ** 2, axis=2).mean(axis=1)
         sender = address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
         return Packets(own.time, sender, own.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
-    at = 0
+    at, count = 0, 0
     while at + 2 < len(content):
         size = int.from_bytes(content[at : at + 2], "big")
         if size > BUFFER:
             raise DataError(f"{path}, byte {at}: a record of {size} bytes; is it a log of an Intel 5300?")
-        at += 2 + size
-    log = csiread.Intel(str(path), STREAMS, STREAMS, if_report=False)
+        at, count = at + 2 + size, count + 1
+    log = csiread.Intel(str(path), STREAMS, STREAMS, if_report=False, bufsize=count)
     log.read()
     wide = (log.rate & HT40) > 0
     kept = (log.Nrx == log.Nrx.max(initial=0)) & (wide == wide[:1])
