@@ -7,9 +7,9 @@ each; `z`, `rssi_dbm` and `channel` may stand beside them. Every packet is a row
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,8 +18,11 @@ from gsparc.data.datasets.wifi_logs import READERS, SUFFIXES, Packets, channel_h
 from gsparc.data.datasets.wsr import SPACING_HZ
 from gsparc.data.errors import DataError, some
 from gsparc.data.files import read_csv
-from gsparc.data.limits import choice, number, or_null
+from gsparc.data.limits import choice, or_null
 from gsparc.data.raw import Raw
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 log = logging.getLogger(__name__)
 
@@ -31,18 +34,6 @@ WEAK_DB, STRONG_DB = -20.0, 10.0  # of a subcarrier beside the others: nothing i
 KEPT_DB = 2.0  # between the channel's power and RSSI, less a constant: the level is in the channel
 
 
-@dataclass(frozen=True)
-class Placed:
-    """Packets of one log whose places are known: positions (n, 3) [m] beside those of `Packets`."""
-
-    name: str
-    packets: Packets
-    position: np.ndarray
-    rows: np.ndarray
-    rssi_dbm: np.ndarray
-    carrier_hz: float | None
-
-
 def raw_of_wifi_csi(
     path: str | Path,
     places: str | Path | None = None,
@@ -50,8 +41,6 @@ def raw_of_wifi_csi(
     chip: str = CHIPS[0],
     carrier_hz: float | None = None,
     transmitters: Mapping[str, Sequence[float]] | None = None,
-    level: str = "auto",
-    target: str = "csi",
 ) -> Raw:
     """Read Wi-Fi logs; what was left out and where levels are from is logged.
 
@@ -61,13 +50,11 @@ def raw_of_wifi_csi(
         card, chip: see `read_packets`.
         carrier_hz: where neither logs nor places say a channel.
         transmitters: places [m] of senders by their addresses; None: nobody knows them.
-        level: `rssi`, `channel`, or `auto`: RSSI where the gain control took the level out of the channel.
-        target: `csi` or `rssi`, the mean level of each place.
 
     Returns:
         `rx_position` (S, 3), `station_position` (T, 3) [m], `station` (S,), `station_name` (T,), `time_s`
-        (S,), and `csi` (S, A, K) [root of mW where RSSI is known] with `frequency_hz` (K,), subcarriers in
-        ascending order, or `rssi_db` (S,) [dBm].
+        (S,), and `csi` (S, A, K) [root of mW where RSSI is known, of which the level is where the gain
+        control took it out of the channel] with `frequency_hz` (K,), subcarriers in ascending order.
 
     Raises:
         DataError: a log or a place is missing or damaged, or logs are not of one kind.
@@ -75,90 +62,62 @@ def raw_of_wifi_csi(
     """
     or_null(choice(*READERS)).check("dataset.card", card)
     choice(*CHIPS).check("dataset.chip", chip)
-    or_null(number(0, open_low=True)).check("dataset.carrier_hz", carrier_hz)
-    choice("auto", "rssi", "channel").check("dataset.level", level)
-    choice("csi", "rssi").check("dataset.target", target)
     path = Path(path)
-    folder = path if path.is_dir() else path.parent
-    table = _Table.read(Path(places) if places else folder / PLACES)
-    logs = list(_placed(_logs(path, card, table), table, card, chip))
+    table = _table(Path(places or (path if path.is_dir() else path.parent) / PLACES))
+    logs = [_placed(one, table, card, chip) for one in _logs(path, card)]
+    logs = [one for one in logs if len(one.csi)]
     if not logs:
-        raise DataError(f"{path}: no packet has a place in {table.path}; see the warnings above")
-    first = logs[0]
-    for one in logs:
-        shape = one.packets.csi.shape[1:], one.carrier_hz
-        if shape != (first.packets.csi.shape[1:], first.carrier_hz):
-            what = f"antennas, subcarriers and carrier {shape}, those of {first.name} are others"
-            raise DataError(f"{path}: {one.name} has {what}; give each kind a folder of its own")
-    carrier = carrier_hz or first.carrier_hz
+        raise DataError(f"{path}: no packet has a place in the table of places; see the warnings above")
+    kinds = sorted({(str(one.csi.shape[1:]), one.carrier_hz) for one in logs}, key=str)
+    if len(kinds) > 1:
+        raise DataError(
+            f"{path}: antennas, subcarriers and carriers {some(kinds)}; give each a folder of its own"
+        )
+    carrier = carrier_hz or logs[0].carrier_hz
     if carrier is None:
-        raise DataError(f"{path}: neither it nor {table.path} names the channel; say dataset.carrier_hz")
-    csi = np.concatenate([one.packets.csi[one.rows] for one in logs])
-    tone, csi = _filled(first.packets.tone, csi, path)
-    rssi = np.concatenate([one.rssi_dbm for one in logs])
-    sender = np.concatenate([one.packets.sender[one.rows] for one in logs])
+        raise DataError(f"{path}: neither it nor the places name the channel; say dataset.carrier_hz")
+    time, sender, csi, rssi, position = (
+        np.concatenate([getattr(one, name) for one in logs])
+        for name in ("time_s", "sender", "csi", "rssi_dbm", "position")
+    )
+    tone, csi = _filled(logs[0].tone, csi, path)
+    csi, unit = _levelled(csi, rssi, path)
     names, station = np.unique(sender, return_inverse=True)
-    known, nowhere = dict(transmitters or {}), [np.nan] * 3
+    known = dict(transmitters or {})
     for name in set(known) - set(names):
         raise DataError(f"dataset.transmitters: no packet is from {name!r}; there are {', '.join(names)}")
     arrays = {
-        "rx_position": np.concatenate([one.position for one in logs]),
-        "station_position": np.array([known.get(name, nowhere) for name in names], np.float64),
+        "rx_position": position,
+        "station_position": np.array([known.get(name, [np.nan] * 3) for name in names], np.float64),
         "station_name": np.array([name or "transmitter" for name in names]),
         "station": station.reshape(-1),
-        "time_s": np.concatenate([one.packets.time_s[one.rows] for one in logs]),
-        "row_name": np.array([f"{one.name} packet {row}" for one in logs for row in one.rows]),
+        "time_s": time,
+        "csi": csi.astype(np.complex64),
+        "frequency_hz": carrier + SPACING_HZ * tone,
     }
-    if target == "rssi":
-        _refuse_missing(rssi, arrays["row_name"])
-        link = np.column_stack([arrays["rx_position"], arrays["station"]])
-        _, at, which = np.unique(link, axis=0, return_index=True, return_inverse=True)
-        mean = np.bincount(which.reshape(-1), rssi) / np.bincount(which.reshape(-1))
-        per_row = {name: array for name, array in arrays.items() if not name.startswith("station_")}
-        arrays |= {name: array[at] for name, array in per_row.items()} | {"rssi_db": mean}
-        return Raw(arrays, {"name": "wifi_csi", "level_unit": "dBm"})
-    csi, unit = _levelled(csi, rssi, arrays["row_name"], level, path)
-    arrays |= {"csi": csi.astype(np.complex64), "frequency_hz": carrier + SPACING_HZ * tone}
     return Raw(arrays, {"name": "wifi_csi", "level_unit": unit})
 
 
-@dataclass(frozen=True)
-class _Table:
-    """Columns of a table of places, by head: numbers (n,), and names of files."""
+def _table(path: Path) -> pd.DataFrame:
+    """The places; `DataError` unless it has x, y and a file or a time."""
+    import pandas as pd  # here, as it takes half a second
 
-    path: Path
-    file: np.ndarray | None
-    number: Mapping[str, np.ndarray]
-
-    @staticmethod
-    def read(path: Path) -> _Table:
-        """`DataError` unless it has x, y and a file or a time."""
-        lines = [row for row in read_csv(path, "missing; expected a table of places: dataset.places") if row]
-        head = [name.strip().lower() for name in lines[0]] if lines else []
-        if not {"x", "y"} <= set(head) or not {"file", "time_s"} & set(head):
-            raise DataError(f"{path}: columns {', '.join(head)}; expected x, y [m], and file or time_s")
-        columns = dict(zip(head, np.array([row[: len(head)] for row in lines[1:]]).T, strict=False))
-        names: list[str] = [name for name in NUMBERS if name in columns]
-        try:
-            numbers = {name: columns[name].astype(np.float64) for name in names}
-        except ValueError as error:
-            raise DataError(f"{path}: {error}; expected numbers in {', '.join(names)}") from None
-        return _Table(path, columns.get("file"), numbers)
-
-    def of(self, name: str) -> dict[str, np.ndarray]:
-        """The rows of one log, in order of time; without a column of files all rows are."""
-        stem = name.rpartition(".")[0]
-        mine = slice(None) if self.file is None else (self.file == name) | (self.file == stem)
-        numbers = {key: column[mine] for key, column in self.number.items()}
-        order = np.argsort(numbers.get("time_s", numbers["x"]), kind="stable")
-        return {key: column[order] for key, column in numbers.items()}
+    rows = read_csv(path, "missing; expected a table of places: dataset.places")
+    head = [name.strip().lower() for name in rows[0]] if rows else []
+    if not {"x", "y"} <= set(head) or not {"file", "time_s"} & set(head):
+        raise DataError(f"{path}: columns {', '.join(head)}; expected x, y [m], and file or time_s")
+    try:
+        table = pd.DataFrame([row for row in rows[1:] if row], columns=head)
+        return table.astype({name: float for name in NUMBERS if name in head})
+    except (ValueError, AssertionError) as error:
+        raise DataError(f"{path}: {error}; expected numbers in {', '.join(NUMBERS)}") from None
 
 
-def _logs(path: Path, card: str | None, table: _Table) -> list[Path]:
+def _logs(path: Path, card: str | None) -> list[Path]:
     if path.is_file():
         return [path]
-    files = [one for one in sorted(path.rglob("*")) if one.resolve() != table.path.resolve()]
-    endings = [ending for ending, of in SUFFIXES.items() if card in (None, of)] or [".dat"]
+    files = [one for one in sorted(path.rglob("*")) if one.name != PLACES]
+    endings = [ending for ending, of in SUFFIXES.items() if card in (None, of)]
     for ending in endings:  # tables may lie beside logs
         found = [one for one in files if one.suffix.lower() == ending]
         if found:
@@ -166,37 +125,29 @@ def _logs(path: Path, card: str | None, table: _Table) -> list[Path]:
     raise DataError(f"{path}: no such log, or a folder without {', '.join(endings)}")
 
 
-def _placed(paths: Sequence[Path], table: _Table, card: str | None, chip: str) -> Iterator[Placed]:
-    """Logs with packets whose places are known; of the others how many there are is logged."""
-    without = []
-    for path in paths:
-        at = table.of(path.name)
-        if not len(at["x"]):
-            without.append(path.name)
-            continue
-        packets = read_packets(path, card, chip)
-        time, rows = packets.time_s, np.arange(len(packets.csi))
-        if "time_s" in at:
-            rows = rows[(time >= at["time_s"][0]) & (time <= at["time_s"][-1])]
-            if len(rows) < len(time):
-                ends = f"{time.min():.3f} to {time.max():.3f} s, the track is {at['time_s'][[0, -1]]}"
-                log.warning("%s: %d of %d packets left out: %s", path, len(time) - len(rows), len(time), ends)
-        elif len(at["x"]) > 1:
-            raise DataError(f"{table.path}: {path.name} has {len(at['x'])} places; expected one, or time_s")
-        clock = at.pop("time_s", np.zeros(1))
-        on = {key: np.interp(time[rows], clock, column) for key, column in at.items()}
-        if not len(rows):
-            continue
-        rssi, zeros = packets.rssi_dbm[rows], np.zeros(len(rows))
-        yield Placed(
-            path.name, packets, np.stack([on["x"], on["y"], on.get("z", zeros)], 1), rows,
-            np.where(np.isnan(rssi), on.get("rssi_dbm", rssi), rssi),
-            packets.carrier_hz or (channel_hz(int(on["channel"][0])) if "channel" in on else None),
-        )  # fmt: skip
-    if without:
-        log.warning("%s: no place for %d logs, left out: %s", table.path, len(without), some(without))
-    if "z" not in table.number:
-        log.info("%s: no column z: all places at height 0", table.path)
+def _placed(path: Path, table: pd.DataFrame, card: str | None, chip: str) -> Packets:
+    """Packets of a log whose places are known; how many are left out is logged."""
+    at = table[table["file"].isin([path.name, path.stem])] if "file" in table else table
+    packets = read_packets(path, card, chip)
+    time = packets.time_s
+    if "time_s" in at:
+        at = at.sort_values("time_s")
+        rows = np.flatnonzero((time >= at["time_s"].min()) & (time <= at["time_s"].max()))
+        clock = at["time_s"]
+    elif len(at) > 1:
+        raise DataError(f"{path}: {len(at)} places of this file; expected one, or time_s")
+    else:
+        rows, clock = np.arange(len(at) * len(time)), np.zeros(len(at))
+    if len(rows) < len(time):
+        ends = f"no place for them; they are of {time.min():.3f} to {time.max():.3f} s"
+        log.warning("%s: %d of %d packets left out: %s", path, len(time) - len(rows), len(time), ends)
+    if not len(rows):
+        return packets.part(rows, np.zeros((0, 3)), packets.rssi_dbm[rows])
+    on = {name: np.interp(time[rows], clock, at[name]) for name in NUMBERS if name in at}
+    height, rssi = on.get("z", np.zeros(len(rows))), packets.rssi_dbm[rows]
+    rssi = np.where(np.isnan(rssi), on.get("rssi_dbm", rssi), rssi)
+    carrier = channel_hz(int(on["channel"][0])) if "channel" in on else None
+    return packets.part(rows, np.stack([on["x"], on["y"], height], 1), rssi, carrier)
 
 
 def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -218,31 +169,23 @@ def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, 
     return tone[kept & right], csi[..., kept & right]
 
 
-def _levelled(
-    csi: np.ndarray, rssi_dbm: np.ndarray, names: np.ndarray, level: str, path: Path
-) -> tuple[np.ndarray, str]:
+def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
     """Channels (S, A, K) at the level of their RSSI (S,) where that is not in them, and the level's unit."""
-    with np.errstate(divide="ignore"):
-        power_db = 10 * np.log10(np.sum(np.abs(csi) ** 2, axis=1).mean(axis=1))
-    if level == "channel" or (level == "auto" and np.isnan(rssi_dbm).all()):
-        if level == "auto":
-            log.warning("%s: no RSSI: levels are what the gain control left, and may say nothing", path)
+    if np.isnan(rssi_dbm).all():
+        log.warning("%s: no RSSI: levels are what the gain control left, and may say nothing", path)
         return csi, "dB"
-    _refuse_missing(rssi_dbm, names)
+    if np.isnan(rssi_dbm).any():
+        raise DataError(
+            f"{path}: {np.isnan(rssi_dbm).sum()} packets without RSSI; give all places an rssi_dbm"
+        )
+    power_db = 10 * np.log10(np.sum(np.abs(csi) ** 2, axis=1).mean(axis=1))
     apart = rssi_dbm - power_db
-    if level == "auto" and np.std(apart) <= KEPT_DB:
+    if np.std(apart) <= KEPT_DB:
         return csi * 10 ** (np.median(apart) / 20), "dBm"
     alike = np.corrcoef(power_db, rssi_dbm)[0, 1] if np.ptp(rssi_dbm) and np.ptp(power_db) else 0.0
     why = f"the channel's own power, after the gain control, correlates with it by {alike:.2f}"
     log.warning("%s: the level of each row is its RSSI; %s", path, why)
     return csi * (10 ** (apart / 20))[:, None, None], "dBm"
-
-
-def _refuse_missing(rssi_dbm: np.ndarray, names: np.ndarray) -> None:
-    missing = np.flatnonzero(np.isnan(rssi_dbm))
-    if len(missing):
-        where = f"{names[missing[0]]} and {len(missing) - 1} more"
-        raise DataError(f"{where}: no RSSI in the log or in places (rssi_dbm); or say dataset.level=channel")
 
 
 class WifiCsi(Campaign):

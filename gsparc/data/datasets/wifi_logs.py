@@ -1,14 +1,13 @@
-"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; Atheros and ESP32 on no log of a card yet.
+"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; ESP32 on no log of a card yet.
 
 `csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a
-file that is not there ends the process. Lengths of Nexmon and Intel 5300 are looked at before it reads; those
-of Atheros are not.
+file that is not there ends the process. So lengths are looked at before it reads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ HEADS = 16, 60  # bytes of a packet before its Ethernet frame, and of that befor
 POINTS = {256: 20, 512: 40, 1024: 80}  # MHz by bytes of the channel, after which come a few that are none
 PADDING = 256  # bytes, more than those
 OLD_MAGIC = b"\x11" * 4  # of Nexmon's packets without RSSI
-ATHEROS_TONES = {0: (1, 28), 1: (2, 58)}  # first and last on each side, of 20 and 40 MHz
 
 
 @dataclass(frozen=True)
@@ -41,6 +39,7 @@ class Packets:
         tone: (K,) int, subcarriers counted from the carrier.
         rssi_dbm: (n,) float64, NaN where the log does not say.
         carrier_hz: of all packets; None where the log does not say.
+        position: (n, 3) [m] where they were received, which no log says.
     """
 
     time_s: np.ndarray
@@ -49,6 +48,14 @@ class Packets:
     tone: np.ndarray
     rssi_dbm: np.ndarray
     carrier_hz: float | None = None
+    position: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def part(
+        self, rows: np.ndarray, position: np.ndarray, rssi_dbm: np.ndarray, carrier_hz: float | None = None
+    ) -> Packets:
+        """Packets `rows` (m,) with their places (m, 3) [m], levels (m,), and a carrier that no log says."""
+        carrier, parts = self.carrier_hz or carrier_hz, (self.time_s[rows], self.sender[rows], self.csi[rows])
+        return Packets(*parts, self.tone, rssi_dbm, carrier, position)
 
 
 def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> Packets:
@@ -56,7 +63,7 @@ def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> 
 
     Args:
         path: *.pcap of Nexmon, *.dat of an Intel 5300, or what `card` names.
-        card: `nexmon`, `intel`, `atheros` or `esp32`; None: by the file's ending.
+        card: `nexmon`, `intel` or `esp32`; None: by the file's ending.
         chip: of Nexmon: `4339`, `43455c0`, `4358` or `4366c0`.
 
     Raises:
@@ -158,17 +165,6 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     )
 
 
-def _atheros(path: Path, csiread: Any, _: str) -> Packets:
-    log = csiread.Atheros(str(path), STREAMS, STREAMS, tones=114, if_report=False)
-    log.read()
-    kept = (log.nr == log.nr[:1]) & (log.bandWidth == log.bandWidth[:1]) & (log.csi_len > 0)
-    first, last = ATHEROS_TONES[int(log.bandWidth[0])]
-    tone = np.array([*range(-last, 1 - first), *range(first, last + 1)])
-    csi = log.csi[kept, : len(tone), : int(log.nr[0]), 0].swapaxes(1, 2)
-    sender, rssi = np.full(len(csi), ""), log.rssi[kept] - 95.0  # decibels above -95 dBm
-    return Packets(1e-6 * log.timestamp[kept], sender, csi, tone, rssi, 1e6 * float(log.tx_channel[0]))
-
-
 def _esp32(path: Path, csiread: Any, _: str) -> Packets:
     log = csiread.ESP32(str(path), if_report=False)
     log.read()
@@ -178,4 +174,4 @@ def _esp32(path: Path, csiread: Any, _: str) -> Packets:
     return Packets(1e-6 * log.local_timestamp, np.array(log.mac), csi, tone, log.rssi * 1.0, carrier)
 
 
-READERS = {"nexmon": _nexmon, "intel": _intel, "atheros": _atheros, "esp32": _esp32}
+READERS = {"nexmon": _nexmon, "intel": _intel, "esp32": _esp32}
