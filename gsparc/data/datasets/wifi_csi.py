@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -141,13 +142,14 @@ def _placed(path: Path, table: pd.DataFrame, card: str | None, chip: str) -> Pac
     if len(rows) < len(time):
         ends = f"no place for them; they are of {time.min():.3f} to {time.max():.3f} s"
         log.warning("%s: %d of %d packets left out: %s", path, len(time) - len(rows), len(time), ends)
-    if not len(rows):
-        return packets.part(rows, np.zeros((0, 3)), packets.rssi_dbm[rows])
-    on = {name: np.interp(time[rows], clock, at[name]) for name in NUMBERS if name in at}
-    height, rssi = on.get("z", np.zeros(len(rows))), packets.rssi_dbm[rows]
-    rssi = np.where(np.isnan(rssi), on.get("rssi_dbm", rssi), rssi)
-    carrier = channel_hz(int(on["channel"][0])) if "channel" in on else None
-    return packets.part(rows, np.stack([on["x"], on["y"], height], 1), rssi, carrier)
+    on = {name: np.interp(time[rows], clock, at[name]) for name in NUMBERS if len(rows) and name in at}
+    nothing, rssi = np.zeros(len(rows)), packets.rssi_dbm[rows]
+    return replace(
+        packets, time_s=time[rows], sender=packets.sender[rows], csi=packets.csi[rows],
+        rssi_dbm=np.where(np.isnan(rssi), on.get("rssi_dbm", rssi), rssi),
+        carrier_hz=packets.carrier_hz or (channel_hz(int(on["channel"][0])) if "channel" in on else None),
+        position=np.stack([on.get(axis, nothing) for axis in "xyz"], 1),
+    )  # fmt: skip
 
 
 def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:

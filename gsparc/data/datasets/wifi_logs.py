@@ -50,13 +50,6 @@ class Packets:
     carrier_hz: float | None = None
     position: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
-    def part(
-        self, rows: np.ndarray, position: np.ndarray, rssi_dbm: np.ndarray, carrier_hz: float | None = None
-    ) -> Packets:
-        """Packets `rows` (m,) with their places (m, 3) [m], levels (m,), and a carrier that no log says."""
-        carrier, parts = self.carrier_hz or carrier_hz, (self.time_s[rows], self.sender[rows], self.csi[rows])
-        return Packets(*parts, self.tone, rssi_dbm, carrier, position)
-
 
 def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> Packets:
     """Read the packets of a log.
