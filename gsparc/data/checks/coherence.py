@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
-from gsparc.physics.row_factors import FREEDOMS, Freedom, turning
+from gsparc.physics.row_factors import FREEDOMS, Freedom, delays, turning
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +22,8 @@ FEWEST = 12
 AROUND = 6  # neighbours of a row that are looked at
 STRAIGHT, EVEN = -0.9, 0.7  # cosine at the middle row of three, and ratio of its distances
 OWN = {NEAR: 0.7, IN_LINE: 0.45}  # share of the correlation that rows with phases of their own keep at most
-ALIKE = {NEAR: 0.8, IN_LINE: 0.6}  # correlation of neighbours, above which their shapes do not differ
+ALIKE = {NEAR: (0.5, 0.8), IN_LINE: (0.6, 0.8)}  # correlation of neighbours of one shape, at least
+CHANCE = 2.0  # times the correlation of noise, within these limits
 MORE = 0.1  # of correlation that a free delay must bring
 SCATTER_DB = {NEAR: 2.0, IN_LINE: 3.2}  # of levels between neighbours, more than fading makes
 
@@ -89,7 +90,8 @@ def coherence(data: Measurements) -> Coherence | None:
     levels = 10 * np.log10(size[:, 0] / size[:, 1])
     scatter = float(1.4826 * np.median(np.abs(levels))) / np.sqrt(2)
     freedom: Freedom = "none"
-    if measured < OWN[reach] * phase and max(phase, delay) > ALIKE[reach]:
+    noise = np.sqrt(max(np.log(max(len(delays(rows.tones)), 3)), 1.0) / values[0].size)
+    if measured < OWN[reach] * phase and max(phase, delay) > np.clip(CHANCE * noise, *ALIKE[reach]):
         freedom = "phase+delay" if delay > phase + MORE else "phase"
         freedom = "phase+delay+gain" if scatter > SCATTER_DB[reach] else freedom
     apart = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
@@ -115,7 +117,19 @@ def allowed(data: Measurements, align: str) -> Measurements:
             return data
         freedom = found.freedom
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
+        if (apart := _places_apart(data)) > IN_LINE:
+            log.warning(
+                "places are %.3g wavelengths apart: neighbours tell levels, not the shape over subcarriers", apart
+            )  # fmt: skip
     return replace(data, site=replace(data.site, freedom=freedom))
+
+
+def _places_apart(data: Measurements) -> float:
+    """Median distance from a place to the next other one [wavelengths]."""
+    places = np.unique(data.moving, axis=0)
+    if len(places) < 2 or data.site.wavelength is None:
+        return 0.0
+    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) / data.site.wavelength
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
