@@ -55,8 +55,6 @@ def main(names: list[str]) -> float:
 
 
 if __name__ == "__main__":
-    os.environ["PATH"] = (
-        f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # of `gsparc` in cells
-    )
+    os.environ["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # of `gsparc` in cells
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     main(sys.argv[1:])
