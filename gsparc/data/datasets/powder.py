@@ -17,12 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, converted
 from gsparc.data.errors import DataError, Problems, shortened
 from gsparc.data.files import read_text
 from gsparc.data.links.georeference import bad_degrees
-from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import TEXT
+from gsparc.data.raw import Raw
 
 CARRIER_HZ = 462.7e6
 NO_VALUE_DB = -101.0
@@ -30,14 +29,10 @@ NO_VALUE_DB = -101.0
 WALKER_M, STATION_M = 1.5, 10.0
 STATIONS = "location_coordinates.json"
 LATITUDE, LONGITUDE, TIME = "tx_x_coord", "tx_y_coord", "timestamp"
-LAYOUT = {
-    "mobile_position": Expected(("S", 2), place=True, field="tx_position"),
-    "station_position": Expected(("T", 2), place=True),
-    "rssi_db": Expected(("S", "T")),
-    "station": Expected(("T",), TEXT, optional=True, field="station_name"),
-    "latitude": Expected(("S",), optional=True),
-    "longitude": Expected(("S",), optional=True),
-    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
+NPZ = {
+    **{"mobile_position": "tx_position", "station_position": "station_position", "rssi_db": "rssi_db"},
+    **{"latitude": "latitude", "longitude": "longitude"},
+    **{"station": "station_name", "frequency_hz": "carrier_hz"},
 }
 
 
@@ -55,10 +50,10 @@ def raw_of_powder(
         tx_height, station_height: above ground [m], the same for all; the ground is taken as flat.
 
     Returns:
-        `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg] (of an npz without
-        degrees `tx_position` (S, 2), `station_position` (T, 2) [m]), `tx_height`, `station_height` () [m],
-        `rssi_db` (S, T) [dB, each station on a scale of its own], `station_name` (T,), `carrier_hz` (); of a
-        CSV also `row_name` (S,). The attribute `left_out` says which columns are no stations.
+        `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg], `tx_height`,
+        `station_height` () [m], `rssi_db` (S, T) [dB, each station on a scale of its own], `station_name`
+        (T,), `carrier_hz` (); of a CSV also `row_name` (S,). The attribute `left_out` says which columns are
+        no stations.
 
     Raises:
         DataError: no such file, or something in it is missing or wrong; all problems with line and column.
@@ -70,25 +65,20 @@ def raw_of_powder(
     if path.suffix.lower() == ".csv":
         raw = _of_csv(path, path.with_name(STATIONS) if station_table is None else Path(station_table))
     else:
-        raw = _of_npz(read_raw(path), path)
+        raw = _of_npz(path)
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
     return Raw({**raw.arrays, **heights}, {"name": "powder", **raw.attributes, "layout": "powder"})
 
 
-def _of_npz(raw: Raw, path: Path) -> Raw:
-    arrays = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
-    if "latitude" in arrays and "longitude" in arrays:
-        degrees = np.stack([arrays["latitude"], arrays["longitude"]], axis=1).astype(np.float64)
-        fault = bad_degrees(*degrees.T)
-        if fault:
-            raise DataError("{}, row {}: {}".format(path, *fault))
-        # Rows are known in degrees and in metres: over a campus an affine map is good to centimetres.
-        places, stations = arrays.pop("tx_position"), arrays.pop("station_position")
-        middle, mean = places.mean(axis=0), degrees.mean(axis=0)
-        turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
-        where = (stations - middle) @ turn + mean
-        arrays |= {"station_latitude": where[:, 0], "station_longitude": where[:, 1]}
-    return Raw(arrays, raw.attributes)
+def _of_npz(path: Path) -> Raw:
+    raw = converted(path, NPZ)
+    places, stations = raw.arrays.pop("tx_position"), raw.arrays.pop("station_position")
+    degrees = np.stack([raw.arrays["latitude"], raw.arrays["longitude"]], axis=1)
+    # Rows are known in degrees and in metres: over a campus an affine map is good to centimetres.
+    middle, mean = places.mean(axis=0), degrees.mean(axis=0)
+    turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
+    latitude, longitude = ((stations - middle) @ turn + mean).T
+    return Raw({**raw.arrays, "station_latitude": latitude, "station_longitude": longitude}, raw.attributes)
 
 
 def _of_csv(path: Path, table: Path) -> Raw:
