@@ -232,14 +232,6 @@ def test_files_that_are_no_files(tmp_path, csi_arrays, refused, name):
     refused(says, load_own, tmp_path / name)
 
 
-def test_wrong_units_are_refused(tmp_path, csi_arrays, refused):
-    with h5py.File(tmp_path / "units.h5", "w") as file:
-        for name, array in csi_arrays.items():
-            file[name] = array
-        file["rx_position"].attrs["units"] = "mm"
-    refused("rx_position: units are 'mm'; expected 'm'", load_own, tmp_path / "units.h5")
-
-
 def test_fuzzed_files_are_read_or_refused(tmp_path, csi_arrays):
     """Found by this: encrypted zip entries, HDF5 names that are no text, crashes inside libhdf5."""
     rng = np.random.default_rng(0)
