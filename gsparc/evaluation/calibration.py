@@ -321,7 +321,7 @@ def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, floa
     if data.uplink is None:
         return {}
     batches = (data.batch(fold.test[i : i + CHUNK]) for i in range(0, len(fold.test), CHUNK))
-    predicted = np.concatenate([method.answer(batch).mean.numpy() for batch in batches])
+    predicted = np.concatenate([method.predict(batch).mean.numpy() for batch in batches])
     target = data.target[fold.test]
     both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
     results = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}

@@ -124,7 +124,7 @@ def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.n
         mine, overlap = np.flatnonzero(data.run[rows] == run), 0j  # type: ignore[index]
         for start in range(0, len(mine), CHUNK):
             batch = data.batch(rows[mine[start : start + CHUNK]])
-            product = (method.answer(batch).mean.cpu().conj() * batch.target).to(torch.complex128)
+            product = (method.predict(batch).mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
         if overlap:
             turn[torch.from_numpy(mine)] = torch.tensor(overlap / abs(overlap), dtype=torch.complex64)
@@ -163,7 +163,7 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
         for start in range(0, len(rows), CHUNK):
             chunk = order[start : start + CHUNK]
             batch = data.batch(rows[chunk])
-            prediction = method.answer(batch)
+            prediction = method.predict(batch)
             mean = prediction.mean if turn is None else prediction.mean * turn[chunk, None, None]
             metric.update(mean, batch.target, batch.mask)
             for name, values in outputs.items():

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Site
 from gsparc.locate.snapshots import compared
 from gsparc.models.method import Method, suited_threads
 from gsparc.ops import Pose
@@ -67,14 +68,9 @@ class SiteField:
         rx = Pose(ends[1], turned)
         if self.count == 1 and site.static_end == "rx":
             rx = Pose(ends[1][0], turned[0])
-        dtype = torch.complex64 if site.kind == "csi" else torch.float32
-        target = torch.zeros(1, dtype=dtype).expand(many, 1)
-        batch = Batch(
-            torch.zeros(many, dtype=torch.int64), ends[0], rx, target,
-            station=None if site.stations is None else station,
-        )  # fmt: skip
+        query = Query(ends[0], rx, None if site.stations is None else station)
         with suited_threads(self.method, many):
-            prediction = self.method.answer(batch)
+            prediction = self.method.predict(query)
         if prediction.variance is None:
             raise ValueError(
                 f"locate: {self.method.name} states no variance, and has no likelihood of a place"

@@ -182,7 +182,7 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[
         chosen = np.flatnonzero(station == number)
         for start in range(0, len(chosen), CHUNK):
             part = chosen[start : start + CHUNK]
-            prediction = method.answer(data.batch(rows[part]))
+            prediction = method.predict(data.batch(rows[part]))
             mean[part], spread[part] = predicted(prediction, data.site.kind, data.site.target_scale)
     return mean, spread
 

@@ -54,7 +54,7 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
     for start in range(0, len(rows), CHUNK):
         some = rows[start : start + CHUNK]
         batch = data.batch(some)
-        parts.append(Evidence(some, data.moving[some], *judged(method.answer(batch), batch.target)))
+        parts.append(Evidence(some, data.moving[some], *judged(method.predict(batch), batch.target)))
     evidence = joined(parts)
     return replace(evidence, scores=evidence.scores | rivals(data, fold, rows))
 

@@ -19,6 +19,7 @@ from rooms import directed, shoebox
 from scenes import fold_of
 
 from gsparc.data.load import load
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
@@ -108,15 +109,15 @@ def places(method: Method, count: int = 5) -> torch.Tensor:
     return low + (0.2 + 0.6 * torch.rand(count, 3, generator=draw, dtype=torch.float64)) * (high - low)
 
 
-def ends(method: Method, moving: torch.Tensor) -> tuple[torch.Tensor, Pose]:
+def ends(method: Method, moving: torch.Tensor) -> Query:
     """Both ends, the moving one at places (B, 3); the static one where it stood."""
     site = method.site
     assert site is not None
     still = torch.zeros(3) if site.static_position is None else torch.from_numpy(site.static_position).float()
     if site.moving_end == "rx":
-        return still.expand(len(moving), 3), Pose.identity(moving)
+        return Query(still.expand(len(moving), 3), Pose.identity(moving))
     turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-    return moving, Pose(still, torch.from_numpy(turn).float())
+    return Query(moving, Pose(still, torch.from_numpy(turn).float()))
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -133,14 +134,14 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
     """Its state alone says all, without the settings."""
     method = fitted(name)[0]
     query = ends(method, places(method).float())
-    said = method.predict(*query)
+    said = method.predict(query)
     variance = said.variance
     assert variance is not None and variance.shape == (5,)
     assert variance.dtype == torch.float32 and (variance > 0).all()
     torch.save(method.state(), tmp_path / "state.pt")
     again = method_class(name)()
     again.restore(method.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    told = again.predict(*query)
+    told = again.predict(query)
     for part in ("mean", "confidence", "variance"):
         torch.testing.assert_close(getattr(told, part), getattr(said, part))
     assert again.size() == method.size()
@@ -159,10 +160,10 @@ def test_a_reduction_leaves_the_method_as_it_was(name, settings):
     method, data, fold = fitted(name)
     assert isinstance(method, Reducible) and set(settings) <= set(method.knobs())
     query = ends(method, places(method).float())
-    before = method.predict(*query)
+    before = method.predict(query)
     less = method.reduced(settings, method.contributions(data, fold.train))
-    assert not torch.equal(less.predict(*query).mean, before.mean)
-    after = method.predict(*query)
+    assert not torch.equal(less.predict(query).mean, before.mean)
+    after = method.predict(query)
     for part in ("mean", "confidence", "variance"):
         one, two = getattr(before, part), getattr(after, part)
         assert (one is None and two is None) or torch.equal(one, two)

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.models.method import Method, Prediction
-from gsparc.ops import Pose
 
 
 @runtime_checkable
@@ -35,21 +35,20 @@ def rms(channels: Tensor) -> Tensor:
 class UplinkMethod(Method):
     """A method that needs the snapshot's own uplink; a position alone is no question to it."""
 
-    def answer(self, batch: Batch) -> Prediction:
-        """Predict from `batch.uplink` (B, U, L).
+    def predict(self, query: Query) -> Prediction:
+        """Predict from `query.uplink` alone.
 
         Raises:
-            ValueError: the data hold no uplink, or nothing was fitted.
+            ValueError: there is no uplink, or nothing was fitted.
         """
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        if batch.uplink is None:
-            raise ValueError(f"{self.name}: reads a fresh uplink, and these data have none; take model=gp")
-        return self.from_uplink(batch.uplink, batch.noise_variance)
-
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """Always refused: `ValueError`."""
-        raise ValueError(f"{self.name}: answers snapshots with their uplink, not positions")
+        if query.uplink is None:
+            raise ValueError(
+                f"{self.name}: reads a fresh uplink, and positions alone have none: uplink= is needed, or "
+                "take model=gp"
+            )
+        return self.from_uplink(query.uplink, query.noise_variance)
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`."""

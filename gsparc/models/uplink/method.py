@@ -134,7 +134,7 @@ class UplinkField(UplinkMethod):
                 mean = mean / (1 + error)[:, None, None]
             variance = error * _power(mean)
         mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
-        return Prediction(mean, confidence=1 / (1 + error), variance=variance)
+        return Prediction(mean, variance, error / (1 + error))
 
     def _search(self, uplink: Tensor, noise: Tensor | None) -> SearchResult:
         aperture = self.search.aperture

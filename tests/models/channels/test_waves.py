@@ -74,7 +74,7 @@ def test_isotropic_term_alone_is_the_plain_process():
         field.values = replace(field.values, power=torch.tensor([1.0, plain.kernel.noise]).double())
         field.condition(data, np.concatenate([fold.train, fold.val]))
     batch = data.batch(fold.test)
-    before, after = plain.predict(batch.tx, batch.rx), field(batch.tx, batch.rx)
+    before, after = plain.predict(batch), field(batch)
     torch.testing.assert_close(after.mean, before.mean, rtol=1e-4, atol=1e-4)
     # Its power is the targets' mean square, the field's is that of largest likelihood.
     level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
@@ -159,7 +159,7 @@ def test_left_out_is_what_refitting_gives(correlated):
         again.condition(data, rest)
         batch = data.batch(np.array([row]))
         with torch.no_grad():
-            found = again(batch.tx, batch.rx)
+            found = again(batch)
         torch.testing.assert_close(found.mean[0], left.mean[row], rtol=1e-3, atol=1e-4)
         scale = field.weights[0].scale / again.weights[0].scale
         # A row's drift is also that of rows before and after it, which no query's is.
@@ -291,12 +291,12 @@ def test_a_restored_field_answers_the_same_and_a_fresh_one_is_refused(tmp_path):
     again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     batch = data.batch(np.arange(40, 60))
     with torch.no_grad():
-        before, after = field(batch.tx, batch.rx), again(batch.tx, batch.rx)
+        before, after = field(batch), again(batch)
     for name in ("mean", "variance", "explained", "unknown"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
     assert again.terms == field.terms
     with pytest.raises(ValueError, match="not conditioned"):
-        ChannelField(data.site, field.values, (1, 1))(batch.tx, batch.rx)
+        ChannelField(data.site, field.values, (1, 1))(batch)
     with pytest.raises(ValueError, match="known carrier"):
         initialise(replace(data, site=replace(data.site, carrier_hz=None)), np.arange(30), PLAIN)
 

@@ -59,7 +59,7 @@ class Case(NamedTuple):
 
     def answer(self, method: Method | None = None, rows: np.ndarray | None = None) -> Prediction:
         batch = self.data.batch(self.fold.test if rows is None else rows)
-        return (method or self.method).predict(batch.tx, batch.rx)
+        return (method or self.method).predict(batch)
 
     def away(self, other: Method) -> float:
         """Relative squared distance of its answers and another's."""
