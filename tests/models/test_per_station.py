@@ -188,8 +188,8 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
     whole = score([method], town, Split("random", (fold,), ""))
     asked = []
     monkeypatch.setattr("gsparc.evaluation.scores.CHUNK", 6)
-    answer = method.answer
-    monkeypatch.setattr(method, "answer", lambda b: asked.append(len(b.station.unique())) or answer(b))
+    answer = method.predict
+    monkeypatch.setattr(method, "predict", lambda b: asked.append(len(b.station.unique())) or answer(b))
     parts = score([method], town, Split("random", (fold,), ""))
     assert sum(asked) < len(asked) + len(POSTS)
     np.testing.assert_array_equal(parts.row, whole.row)

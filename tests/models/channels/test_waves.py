@@ -10,6 +10,7 @@ from rooms import WAVELENGTH, nmse, shoebox
 from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
 from gsparc.models.channels.columns import bands, gather
@@ -171,7 +172,7 @@ def test_far_away_nothing_is_known():
     data = _sent(60)
     field = _whole(data, mirrors=0)
     far = Pose(torch.tensor([3e4, 0.0, 0.0]), torch.eye(3))
-    found = field(torch.from_numpy(data.tx[:1]).float(), far)
+    found = field(Query(torch.from_numpy(data.tx[:1]).float(), far))
     assert found.unknown.item() > 0.999 and found.mean.abs().max() < 1e-3
     values, known = field.values, field.weights[0]
     place = torch.tensor([[3e4, 0.0, 0.0]], dtype=torch.float64)
@@ -215,7 +216,7 @@ def test_slopes_over_places():
     tx = torch.from_numpy(data.tx[:1]).float()
 
     def level(x):
-        found = field(tx, Pose(x, torch.eye(3)))
+        found = field(Query(tx, Pose(x, torch.eye(3))))
         return found.mean.real.sum() + found.variance.sum()
 
     known = place.clone().requires_grad_()

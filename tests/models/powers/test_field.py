@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
@@ -106,11 +107,11 @@ def test_far_away_the_variance_is_the_priors(blocked):
     data, field, _ = blocked
     near = data.batch(np.arange(5))
     far = Pose(near.rx.position + torch.tensor([0.0, 1e7, 0.0]), near.rx.rotation)
-    there, here = field(near.tx, far), field(near.tx, near.rx)
+    there, here = field(Query(near.tx, far)), field(near)
     assert here.unknown.max() < 0.6 and there.unknown.min() > here.unknown.max()
     bare = small_field(data)
     bare.condition(data, np.arange(50))
-    there = bare(near.tx, far)
+    there = bare(Query(near.tx, far))
     prior = 9.0 * (1 + 0.2 + 1)  # the level's own variance is learned, all else is not
     spread = there.variance.sqrt() / (math.log(10) / 10 * there.mean[:, 0])
     assert torch.all(spread.square() > 0.5 * prior) and torch.all(spread.square() <= prior * 1.001)

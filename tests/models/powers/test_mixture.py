@@ -10,6 +10,7 @@ import torch
 from releases import REAL
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
@@ -120,7 +121,7 @@ def test_a_mixture_has_slopes():
     tx, turned = batch.tx.double(), batch.rx.rotation.double()
 
     def mean(at: torch.Tensor) -> torch.Tensor:
-        return 10 * field(tx, Pose(at, turned)).mean.log10()
+        return 10 * field(Query(tx, Pose(at, turned))).mean.log10()
 
     assert torch.autograd.gradcheck(mean, place.requires_grad_(), eps=1e-5, atol=1e-4)
 

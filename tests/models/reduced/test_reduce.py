@@ -214,7 +214,7 @@ def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
 def test_what_a_process_beside_adds_stays(field):
     both = field._replace(method=copy.copy(field.method))
     plain = both.answer(both.less(stride=2)).mean
-    beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(plain)))
+    beside = SimpleNamespace(predict=lambda query: SimpleNamespace(mean=torch.ones_like(plain)))
     both.method._average = (beside, 0.25)
     assert torch.allclose(0.75 * plain + 0.25, both.answer(both.less(stride=2)).mean)
 

@@ -180,7 +180,7 @@ def test_a_station_never_heard_gains_from_the_others():
     asked = data.batch(np.flatnonzero(data.station == 3))
     field, notes = initialise(data, rows)
     field.condition(data, rows)
-    found = field(asked.tx, asked.rx)
+    found = field(Query(asked.tx, asked.rx))
     error = db(found.mean) - db(asked.target)
     places = torch.from_numpy(data.moving[asked.index.numpy()])
     still = torch.from_numpy(POSTS[3] - data.site.origin).expand(len(places), 3)
