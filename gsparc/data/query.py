@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,6 +61,31 @@ class Query:
     def places(self, site: Site) -> Tensor:
         """Return where the moving end is, (B, 3) float64 [m] on the CPU; (B, 6) of both where both move."""
         return site.moving(self.tx, self.rx).expand(len(self), -1).cpu().double()
+
+    @staticmethod
+    def at(site: Site, places: Tensor, station: Tensor | None = None) -> Query:
+        """Return what is asked of the moving end at places (B, 3) [m], with the static end where it stood.
+
+        Where nobody knows that it is NaN; receivers are turned as they were when measured.
+
+        Args:
+            site: what the dataset declares; one end is static.
+            places: local, in the precision of the query.
+            station: (B,) int64, of several stations; None of one.
+        """
+        several, count = site.stations, len(places)
+        still = np.full(3, np.nan) if site.static_position is None else site.static_position
+        turned = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+        if several is not None and station is not None:
+            still = several.position[station.numpy()]
+            if site.static_end == "rx" and several.rotation is not None:
+                turned = several.rotation[station.numpy()]
+        end, turn = (torch.from_numpy(value).to(places.dtype) for value in (still, turned))
+        if site.static_end == "rx" and end.ndim == 1:
+            return Query(places, Pose(end, turn), station)
+        ends = (places, end.expand(count, 3))
+        tx, rx = ends if site.static_end == "rx" else ends[::-1]
+        return Query(tx, Pose(rx, turn.expand(count, 3, 3)), station)
 
     def _with(self, change: Callable[[Any], Any]) -> Self:
         each = {name: value for name, value in vars(self).items() if isinstance(value, (Tensor, Pose))}

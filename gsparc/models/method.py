@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.query import Query
+from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
@@ -157,6 +157,20 @@ class Method(ABC):
             "model/variance_explained": None,
             "time/init_s": None,
         }
+
+
+def predictions(
+    method: Method, data: Measurements, rows: np.ndarray, size: int = 64
+) -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
+    """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch, and the answer.
+
+    One station after the other: each may have a model of its own, whose matrices are read for every batch.
+    """
+    order = np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
+    for start in range(0, len(rows), size):
+        chosen = order[start : start + size]
+        batch = data.batch(rows[chosen])
+        yield chosen, batch, method.predict(batch)
 
 
 @contextmanager

@@ -178,14 +178,10 @@ def _query(site: Site, measured: Measured | None) -> Query:
     places = np.random.default_rng(0).uniform(box[0], box[1], (QUERIES, 3))
     if measured is not None:
         places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)] - site.origin
-    still = np.zeros(3) if site.static_position is None else site.static_position
-    still = site.box.mean(0) if site.static_end is None else still
-    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-    moving, fixed = (torch.from_numpy(np.asarray(x, np.float32)) for x in (places, still))
-    turn = torch.from_numpy(np.asarray(rotation, np.float32))
-    if site.moving_end == "tx":
-        return Query(moving, Pose(fixed, turn))
-    return Query(fixed.expand(len(moving), 3), Pose(moving, turn.expand(len(moving), 3, 3)))
+    moving = torch.from_numpy(places).float()
+    if site.static_end is None:
+        return Query(torch.from_numpy(site.box.mean(0)).float().expand_as(moving), Pose.identity(moving))
+    return Query.at(site, moving)
 
 
 def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -35,11 +34,11 @@ def rms(channels: Tensor) -> Tensor:
 class UplinkMethod(Method):
     """A method that needs the snapshot's own uplink; a position alone is no question to it."""
 
-    def predict(self, query: Query) -> Prediction:
-        """Predict from `query.uplink` alone.
+    def heard(self, query: Query) -> Tensor:
+        """Return the uplinks (B, U, L) of a query.
 
         Raises:
-            ValueError: there is no uplink, or nothing was fitted.
+            ValueError: there is none, or nothing was fitted.
         """
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
@@ -48,15 +47,11 @@ class UplinkMethod(Method):
                 f"{self.name}: reads a fresh uplink, and positions alone have none: uplink= is needed, or "
                 "take model=gp"
             )
-        return self.from_uplink(query.uplink, query.noise_variance)
+        return query.uplink
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`."""
         return "predictions follow from an uplink, not from a position"
-
-    @abstractmethod
-    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """Channels of the downlink (B, A, K) from uplinks (B, U, L), with noise powers (B,) where known."""
 
     def own(self, uplink: Tensor) -> Tensor:
         """Of uplinks (B, U, L), those (B, A, L) heard by the antennas that answer."""

@@ -83,11 +83,11 @@ def test_beats_ridge_by_more_than_three_decibels(fitted) -> None:
 def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:
     """Whatever turns the uplink turns the prediction: offsets are the snapshot's, not the model's."""
     method, data = fitted
-    uplink = data.batch(fold().test[:4]).uplink
-    noise = torch.full((4,), float(data.noise_variance[0]))
-    plain = method.from_uplink(uplink, noise).mean
+    batch = data.batch(fold().test[:4])
+    plain = method.predict(batch).mean
     up, down = method.search.aperture.tones, method._downlink.tones
-    turned = method.from_uplink(uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up), noise).mean
+    uplink = batch.uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up)
+    turned = method.predict(replace(batch, uplink=uplink)).mean
     expected = plain * torch.polar(torch.ones(26), 0.4 - 0.15 * down)
     assert (turned - expected).abs().square().sum() < 1e-2 * expected.abs().square().sum()
 
@@ -128,7 +128,8 @@ def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     uplink[:, 0] = 0
     method = Ridge(inputs)
     method.fit(replace(data, uplink=uplink), fold(), FitContext())
-    predicted = method.from_uplink(torch.from_numpy(uplink[fold().test])).mean
+    heard = torch.from_numpy(uplink[fold().test])
+    predicted = method.predict(replace(data.batch(fold().test), uplink=heard)).mean
     assert torch.isfinite(predicted).all() and predicted[:, 1:].abs().min() > 0
     assert inputs == "all" or (predicted[:, 0] == 0).all()
 
