@@ -12,7 +12,9 @@ from rich.console import Console
 
 from gsparc.data.errors import Caution, DataError, gathered
 
-SETTINGS = ("dataset.stations_file=", "dataset.columns.", "dataset.not_heard=", "dataset.absent=")
+SETTINGS = tuple(
+    f"dataset.{name}" for name in ("stations_file=", "columns.", "not_heard=", "absent=", "saturation_db=")
+)
 SWITCH = re.compile(r"dataset\.(\w+)=(true|false)", re.IGNORECASE)
 
 
@@ -99,8 +101,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if name == "stations_file":
             args.stations_file = value
         elif "." not in name:
-            marks = re.findall(r"[-+.\de]+", value)
-            settings[name] = value if name == "absent" else [float(mark) for mark in marks]
+            marks = [float(mark) for mark in re.findall(r"[-+]?[.\d]+(?:e[-+]?\d+)?", value)]
+            settings[name] = marks if name == "not_heard" else marks[0] if marks else value
         else:
             columns[name.removeprefix("columns.")] = value
     if not args.path:

@@ -146,7 +146,7 @@ class Checker:
         mask = array.astype(bool)
         empty = ~mask.reshape(len(mask), -1).max(axis=1)
         if censored is not None:
-            empty &= ~censored
+            empty &= censored == 0
         self.refuse_rows("mask", empty, "nothing measured; expected a True, or drop the row")
         return mask
 

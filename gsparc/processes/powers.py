@@ -35,13 +35,18 @@ class Rows:
 
     Attributes:
         places: (n, 3) of the moving end, or (n, 6) of both [m].
-        decibels: (n,) powers, or levels where `silent` [dB].
-        silent: (n,) bool, True where nothing was heard.
+        decibels: (n,) powers, or levels [dB].
+        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
     """
 
     places: np.ndarray
     decibels: np.ndarray
-    silent: np.ndarray
+    side: np.ndarray
+
+    @property
+    def silent(self) -> np.ndarray:
+        """Rows (n,) bool of which a level is known, not a power."""
+        return self.side != 0
 
     def at(self, chosen: np.ndarray) -> Self:
         """The rows `chosen`."""
@@ -49,7 +54,7 @@ class Rows:
 
     @property
     def loud(self) -> Self:
-        """Those that were heard."""
+        """Those that were measured."""
         return self.at(np.flatnonzero(~self.silent))
 
     def drawn(self, most: int, seed: int) -> Self:
@@ -226,7 +231,9 @@ def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[Po
 def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
     notes: list[str] = []
     if rows.silent.any():
-        notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
+        faults = {1: "where nothing was heard are below", -1: "in saturation are above"}
+        counts = {said: int((rows.side == side).sum()) for side, said in faults.items()}
+        notes += [f"{count} rows {said} their level" for said, count in counts.items() if count]
     places, decibels, extra, factor = _with_pseudo_values(rows, prior, seed, notes)
     posterior = Exact.of(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
@@ -247,7 +254,8 @@ def _with_pseudo_values(
     gram.diagonal().add_(prior.kernel.noise)
     unit = (decibels - mean) / deviation
     known, level = ConditionalGaussian.of(gram, unit, silent), unit[silent]
-    doubt = known.doubt(level)
+    side = torch.from_numpy(rows.side)[silent]
+    doubt = side * known.doubt(level)
     near = (doubt < CERTAIN).nonzero()[:, 0]
     most = min(max(int((~silent).sum()), LEAST_SILENT), MOST_SILENT)
     if len(near) > most:
@@ -255,7 +263,7 @@ def _with_pseudo_values(
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):
-        sites = propagate(known.at(near), level[near])
+        sites = propagate(known.at(near), level[near], side[near])
         decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
         extra = extra.index_put((at,), sites.variance)
         if not sites.settled:

@@ -274,7 +274,24 @@ def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):
     data = read_any(write(wide(100))).data
     assert data.censored.sum() == 394 and (data.censored == DEAF.ravel()).all()
     level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
-    assert abs(level[~data.censored].min() - LEVELS[~DEAF].min()) < 1e-3  # of float32
+    assert abs(level[data.censored == 0].min() - LEVELS[~DEAF].min()) < 1e-3  # of float32
+
+
+def test_saturated_levels_were_learned_and_scored_as_measured(write):
+    path = write(long("t", range(ROWS), level=np.minimum(LEVELS[:, 0], -76)))
+    found, plain, given = (read_any(path, saturation_db=one).data for one in ("auto", "none", -79.5))
+    level = 10 * np.log10(found.target[:, 0] * found.site.target_scale)
+    assert plain.censored is None and plain.mask is None
+    for data, least in ((found, -76), (given, -79.5)):
+        above = LEVELS[:, 0] >= least
+        assert (data.censored == np.where(above, -1, 0)).all() and (data.mask[:, 0] == ~above).all()
+    np.testing.assert_allclose(level, np.minimum(LEVELS[:, 0], -76), atol=1e-3)
+
+
+@pytest.mark.parametrize("setting", ["full", 900])
+def test_a_level_of_saturation_that_is_none_is_refused(write, setting):
+    found = said(write(long("t", range(ROWS))), saturation_db=setting)
+    assert f"dataset.saturation_db={setting!r}: a number of at least -400 and at most 400" in found
 
 
 def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):

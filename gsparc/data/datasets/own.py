@@ -33,6 +33,7 @@ def raw_of_own(
     cell_m: float | None = None,
     not_heard: Sequence[float] | None = None,
     absent: str = "auto",
+    saturation_db: float | str = "auto",
     **conventions: bool | None,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
@@ -45,6 +46,8 @@ def raw_of_own(
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
         absent: `silent`: a station without a row at a place where others have one was not heard there;
             `auto`: one that a list of the strongest leaves out is below its weakest; `unknown`: neither.
+        saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where it
+            repeats; `none`: there is none.
         **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
 
     Raises:
@@ -52,7 +55,7 @@ def raw_of_own(
         SettingError: another word for `absent`.
     """
     raw, notes = raw_of(path, columns, stations_file, cell_m)
-    raw = understood(raw, not_heard, absent, **conventions)
+    raw = understood(raw, not_heard, absent, saturation_db, **conventions)
     campaign = campaign_of(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
@@ -65,12 +68,14 @@ def understood(
     raw: Raw,
     not_heard: Sequence[float] | None = None,
     absent: str = "auto",
+    saturation_db: float | str = "auto",
     **conventions: bool | None,
 ) -> Raw:
     """The same with what settings say of the file; see `raw_of_own`."""
     choice("auto", "unknown", "silent").check("dataset.absent", absent)
     said: dict[str, Any] = {} if not_heard is None else {"not_heard": [float(mark) for mark in not_heard]}
     said |= {} if absent == "auto" else {"absent": absent}
+    said |= {} if saturation_db == "auto" else {"saturation_db": saturation_db}
     for name, follows in conventions.items():
         or_null(switch()).check(f"dataset.{name}", follows)
     followed = [name for name, follows in conventions.items() if follows]
