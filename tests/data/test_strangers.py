@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from scipy.io import savemat
 
-from gsparc.commands.check import check
+from gsparc.commands.check import check, main
 from gsparc.data.datasets.own import Own, read_any
 from gsparc.data.own import write_own
 
@@ -380,6 +380,7 @@ STRANGERS = {
     "silent_200.csv": "exactly -200",
     "silent_NP.csv": "514 of 720 levels are 'NP'",
     "c10_compound.h5": "good",
+    "c10_ampphase.csv": "tx_position: missing; expected (3,), (S, 3), (2,) or (S, 2) [m]; or say dataset.tx",
 }
 
 
@@ -388,3 +389,17 @@ def test_a_file_of_a_stranger(name):
     if not (GIVEN / name).exists():
         pytest.skip(f"{GIVEN / name} is not there")
     assert STRANGERS[name] in said(GIVEN / name)
+
+
+def test_places_and_tones_that_a_file_lacks_can_be_said(capsys):
+    path = GIVEN / "c10_ampphase.csv"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    given = ["dataset.tx_position=[5,3,1.5]", "dataset.frequency_hz=[2.4e9,2.401e9,2.402e9,2.403e9]"]
+    assert main([str(path), *given, "--no-draw"]) == 0
+    assert "1 antenna x 4 subcarriers" in capsys.readouterr().out
+
+
+def test_groups_of_places_were_said_twice(write, caplog):
+    Own(write(long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES))).load()
+    assert sum("groups of places" in record.getMessage() for record in caplog.records) == 1

@@ -18,7 +18,7 @@ from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.datasets.techtile_power import raw_of_techtile_power
 from gsparc.data.datasets.wsr import raw_of_wsr
 from gsparc.data.errors import Caution, DataError
-from gsparc.data.limits import choice, or_null, switch
+from gsparc.data.limits import choice, finite, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
 from gsparc.data.tables import is_table
@@ -34,6 +34,8 @@ def raw_of_own(
     not_heard: Sequence[float] | None = None,
     absent: str = "auto",
     saturation_db: float | str = "auto",
+    tx_position: Sequence[float] | None = None,
+    frequency_hz: float | Sequence[float] | None = None,
     **conventions: bool | None,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
@@ -48,6 +50,8 @@ def raw_of_own(
             `auto`: one that a list of the strongest leaves out is below its weakest; `unknown`: neither.
         saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where it
             repeats; `none`: there is none.
+        tx_position: of a transmitter that stood still, where the file does not say it [m].
+        frequency_hz: of the tones, likewise [Hz].
         **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
 
     Raises:
@@ -55,7 +59,7 @@ def raw_of_own(
         SettingError: another word for `absent`.
     """
     raw, notes = raw_of(path, columns, stations_file, cell_m)
-    raw = understood(raw, not_heard, absent, saturation_db, **conventions)
+    raw = understood(raw, not_heard, absent, saturation_db, tx_position, frequency_hz, **conventions)
     campaign = campaign_of(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
@@ -69,18 +73,22 @@ def understood(
     not_heard: Sequence[float] | None = None,
     absent: str = "auto",
     saturation_db: float | str = "auto",
+    tx_position: Sequence[float] | None = None,
+    frequency_hz: float | Sequence[float] | None = None,
     **conventions: bool | None,
 ) -> Raw:
     """The same with what settings say of the file; see `raw_of_own`."""
     choice("auto", "unknown", "silent").check("dataset.absent", absent)
-    said: dict[str, Any] = {} if not_heard is None else {"not_heard": [float(mark) for mark in not_heard]}
+    said: dict[str, Any] = {} if not_heard is None else {"not_heard": finite(not_heard).reshape(-1).tolist()}
     said |= {} if absent == "auto" else {"absent": absent}
     said |= {} if saturation_db == "auto" else {"saturation_db": saturation_db}
     for name, follows in conventions.items():
         or_null(switch()).check(f"dataset.{name}", follows)
     followed = [name for name, follows in conventions.items() if follows]
     said |= {"conventions": " ".join(followed)} if followed else {}
-    return replace(raw, attributes={**raw.attributes, **said})
+    given = {"tx_position": tx_position, "frequency_hz": frequency_hz}
+    arrays = {name: finite(value) for name, value in given.items() if value is not None}
+    return replace(raw, arrays={**raw.arrays, **arrays}, attributes={**raw.attributes, **said})
 
 
 class Own(Campaign):

@@ -86,6 +86,7 @@ def understand_table(
         about = {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
         if not power.unit.name.startswith("x "):  # a column that is scaled has the schema's unit
             about["unit"] = power.unit.name
+    about |= {"zones": builder.zones} if builder.zones else {}
     return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
@@ -116,7 +117,7 @@ class Builder:
         self.refuse = sheet.refuse
         self.notes: list[str] = []
         self.arrays: dict[str, np.ndarray] = {}
-        self.tones = np.zeros(1, int)
+        self.tones, self.zones = np.zeros(1, int), ""
 
     def build(self) -> dict[str, np.ndarray]:
         """All arrays; what is wrong is in `sheet.problems`."""
@@ -137,7 +138,7 @@ class Builder:
         if role is None:
             fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
             for head in self.sheet.heads:
-                if {"loss", "pathloss"} & set(words_of(head)):
+                if {"loss", "pathloss", "pl"} & set(words_of(head)):
                     return self.refuse(f"{fault}; dataset.columns.rssi_db={head}*-1 takes losses for levels")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
@@ -226,7 +227,7 @@ class Builder:
             return
         stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
-        self._groups(where)
+        self.zones = self._zones(where)
         if stations is not None:
             self._add_stations(stations, where.degrees)
         self._splitting(measured, where, None if stations is None else stations.index)
@@ -240,16 +241,16 @@ class Builder:
         words = {head: self.sheet.words(head) for head in self.sheet.heads if head and head not in used}
         return {head: text for head, text in words.items() if (text != text[0]).any()}
 
-    def _groups(self, where: Places) -> None:
-        """Warn of two groups of places far apart, and say which column tells them apart."""
+    def _zones(self, where: Places) -> str:
+        """Head of a column that tells two groups of places far apart from each other; empty without."""
         groups = None if where.degrees else two_groups(where.across)
         if groups is None:
-            return
+            return ""
         for head, words in self._unused().items():
             values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
             if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
-                said = f"two groups of places {groups[1] / 1e3:.4g} km apart, as column {head!r} says"
-                self.notes.append(Caution(f"{said}: zones of a projection? give degrees, or a file for each"))
+                return head
+        return ""
 
     def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
         """Warn of unused columns whose groups have levels of their own at the places of one station."""
