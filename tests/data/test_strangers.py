@@ -47,6 +47,7 @@ def long(heads: str, *more, level=LEVELS[:, 0], places=PLACES) -> str:
 
 
 FLOOR = RNG.integers(0, 3, ROWS)
+FARTHER = AWAY[:, 1] > AWAY[:, 2]
 BAND = RNG.integers(0, 2, ROWS)
 ZERO = np.where(np.arange(ROWS)[:, None] < 12, 0, np.c_[NORTH, EAST])
 HALF = np.where(np.arange(ROWS)[:, None] < ROWS * 0.6, 0, np.c_[NORTH, EAST])
@@ -159,6 +160,8 @@ CASES = {
         "2 stations, 2 of them at unknown places: 7 1, 7 0",
         "",
     ),
+    "an area and a CI": (long("LAC,CI", BAND, 7 + 0 * BAND), {}, "2 stations", ""),
+    "a confidence interval": (long("CI", 7 + BAND), {}, "stays       the transmitter", "stations"),
     "columns that are said": (
         long("site,antenna", 7 + 0 * BAND, BAND),
         {"columns": {"station": "site+antenna"}},
@@ -170,6 +173,18 @@ CASES = {
         {},
         "dataset.columns.station=site+antenna tells them apart",
         "",
+    ),
+    "two cells of one name": (
+        long("site,layer", "a" * ROWS, FARTHER, level=np.where(FARTHER, LEVELS[:, 2], LEVELS[:, 1])),
+        {},
+        "another place for each value of column 'layer': dataset.columns.station=site+layer tells them apart",
+        "",
+    ),
+    "streets of one cell": (
+        long("site,street", "a" * ROWS, np.digitize(PLACES[:, 0], [15, 30, 45])),
+        {},
+        "1 stations",
+        "warning",
     ),
     "hopping": (
         long("gateway,freq_mhz", ["g"] * ROWS, RNG.choice([867.1, 868.1, 868.5], ROWS)),

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
 
 from gsparc.data.checks.outliers import two_groups
 from gsparc.data.errors import Caution, nearest, some
@@ -29,7 +28,7 @@ from gsparc.data.tables.columns import (
     schema_unit,
     station_names,
 )
-from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, PERCENT, about, words_of
+from gsparc.data.tables.heads import PERCENT, words_of
 from gsparc.data.tables.places import (
     PER_STATION,
     UNKNOWN_HEIGHT,
@@ -41,6 +40,7 @@ from gsparc.data.tables.places import (
 )
 from gsparc.data.tables.sheet import Sheet, read_parquet, sheet_of
 from gsparc.data.tables.slots import unfolded
+from gsparc.data.tables.splitting import splitting
 
 NOTHING: Mapping[str, object] = {}
 
@@ -88,21 +88,6 @@ def understand_table(
             about["unit"] = power.unit.name
     about |= {"zones": builder.zones} if builder.zones else {}
     return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
-
-
-MOST_GROUPS = 12  # values of a column that may tell stations apart
-LEAST_APART_DB = 6.0  # beyond what levels of one group differ by between neighbours
-NEAR, LEAST_ROWS = 4, 10  # neighbours looked at; rows of pairs within and between groups
-
-
-def groups_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> float:
-    """How much more levels (n,) [dB] differ between neighbours (n, 2) of two groups than of one, median."""
-    if len(level) <= NEAR:
-        return 0.0
-    near = cKDTree(places).query(places, k=NEAR + 1)[1][:, 1:]
-    apart, same = np.abs(level[near] - level[:, None]), group[near] == group[:, None]
-    few = min(same.sum(), (~same).sum()) < NEAR * LEAST_ROWS
-    return 0.0 if few else float(np.median(apart[~same]) - np.median(apart[same]))
 
 
 TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
@@ -253,24 +238,16 @@ class Builder:
         return ""
 
     def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
-        """Warn of unused columns whose groups have levels of their own at the places of one station."""
+        """Warn of unused columns whose groups have levels or places of their own within one station."""
         if measured not in LEVELS or self.arrays[measured].ndim > 1:
             return
         level = self.arrays[measured]
         station = np.zeros(len(level), int) if station is None else station
         stretch = np.cos(np.radians(np.nanmedian(where.across[:, 0]))) if where.degrees else 1.0
         names = [column.head or "" for column in self.chosen.get("station", ())]
-        for head, words in self._unused().items():
-            values, group = np.unique(words, return_inverse=True)
-            if about(head) or (NO_LEVEL | LEVEL_WORDS) & set(words_of(head)) or len(values) > MOST_GROUPS:
-                continue
-            known = np.isfinite(level) & (words != "")
-            of = [known & (station == t) for t in np.unique(station)]
-            apart = [groups_apart(where.across[t] * [1, stretch], level[t], group.reshape(-1)[t]) for t in of]
-            if max(apart) > LEAST_APART_DB:
-                said = f"levels at equal places differ by {max(apart):.0f} dB between values of column"
-                how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
-                self.notes.append(Caution(f"{said} {head!r}: {how}"))
+        for head, said in splitting(where.across * [1, stretch], level, station, self._unused()):
+            how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
+            self.notes.append(Caution(f"{said}: {how}"))
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
