@@ -26,6 +26,7 @@ LEAST_SILENT, MOST_SILENT = (
     200,
     3_000,
 )  # of them, where nothing was heard: no more than were heard, but for few
+BOUNDS = {1: "where nothing was heard are below", -1: "in saturation are above"}
 REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
 
 
@@ -229,11 +230,8 @@ def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[Po
 
 
 def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
-    notes: list[str] = []
-    if rows.silent.any():
-        faults = {1: "where nothing was heard are below", -1: "in saturation are above"}
-        counts = {said: int((rows.side == side).sum()) for side, said in faults.items()}
-        notes += [f"{count} rows {said} their level" for said, count in counts.items() if count]
+    counts = {said: int((rows.side == side).sum()) for side, said in BOUNDS.items()}
+    notes = [f"{count} rows {said} their level" for said, count in counts.items() if count]
     places, decibels, extra, factor = _with_pseudo_values(rows, prior, seed, notes)
     posterior = Exact.of(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place

@@ -37,12 +37,8 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     if site.target_scale != 1:
         lines.append(("scale", f"stored targets are the measurements divided by {site.target_scale:.4g}"))
     if data.censored is not None:
-        faults = {1: "too weak to be heard", -1: "too strong for the receiver"}
-        found = {what: int((data.censored == side).sum()) for side, what in faults.items()}
-        said = ", ".join(
-            f"{count} of {len(data)} powers were {what}" for what, count in found.items() if count
-        )
-        lines.append(("censored", said))
+        counts = [f"{(data.censored == side).sum()} of {len(data)} powers were too" for side in (1, -1)]
+        lines.append(("censored", f"{counts[0]} weak to be heard, {counts[1]} strong to be measured"))
     if data.run is not None:
         lines.append(("runs", f"{data.run.max() + 1}, each with an unknown complex factor of its own"))
     if data.mask is not None and data.censored is None:

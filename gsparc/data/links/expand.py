@@ -192,9 +192,7 @@ def _with_unlisted(check: Checker, links: Links, of_level: np.ndarray) -> tuple[
         return links, of_level
     floor = np.full(count, levels[heard].min() if level is None else np.min(level))
     if level is not None:
-        floor[links.station] = np.broadcast_to(level, (len(np.atleast_1d(level)),))[
-            of_level * (level.size > 1)
-        ]
+        floor[links.station] = level.reshape(-1)[of_level * (level.size > 1)]
     most = UNLISTED_EACH * len(heard)
     of_list, station, below = lists.unlisted(floor, links.stations.position, most)
     like = np.r_[heard, heard[lists.first[of_list]]]
@@ -386,36 +384,31 @@ def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, ce
         weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
         check.notes.append(text + weak)
     if censored.any():
-        check.notes.append(
-            f"{int(censored.sum())} of {len(keep)} powers were not heard: below sensitivity_db"
-        )
+        count = int(censored.sum())
+        check.notes.append(f"{count} of {len(keep)} powers were not heard: below sensitivity_db")
 
 
 def _heights(check: Checker) -> bool:
     """2-D positions get their stated height; False where it is missing (noted)."""
-    arrays = check.raw.arrays
-    good = True
+    arrays, before = check.raw.arrays, len(check.problems)
     for end in ("rx", "tx", "station"):
         name, height = f"{end}_position", f"{end}_height"
         flat = name in arrays and arrays[name].ndim in (1, 2) and arrays[name].shape[-1] == 2
         if not flat:
             if height in arrays:
                 check.refuse(height, f"given, but {name} has three coordinates or is missing")
-                good = False
             continue
         if height not in arrays:
             check.refuse(name, f"two coordinates; expected three, or the height above ground as {height} [m]")
-            good = False
             continue
         above = check.real(height, (), (len(arrays[name]),) if arrays[name].ndim == 2 else ())
         if above is None:
-            good = False
             continue
         place = arrays[name].astype(np.float64)
         column = np.broadcast_to(above, place.shape[:-1])[..., None]
         arrays[name] = np.concatenate([place, column], axis=-1)
         arrays.pop(height)
-    return good
+    return len(check.problems) == before
 
 
 def _run(check: Checker, rows: int) -> np.ndarray | None:

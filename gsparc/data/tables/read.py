@@ -381,10 +381,7 @@ class Builder:
 
     def _note_silent(self, where: str, names: list[str]) -> None:
         if names:
-            many = f"{len(names)} " * (len(names) > 8)
-            self.notes.append(
-                f"{many}listed, but {where}: {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
-            )
+            self.notes.append(f"listed, but {where}: {some(names, 8)}")
 
     def _second_in_degrees(self, ends: dict[str, Places]) -> Places | None:
         """Of two ends in degrees, the one with fewer places, which are then stations."""

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist, pdist
+from scipy.spatial.distance import cdist
 
 from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, about, words_of
 
-MOST_GROUPS = 12  # values of a column that may tell stations apart
+MOST_GROUPS, MOST_CELLS = 12, 4  # values of a column that may tell stations apart, and cells far apart
 LEAST_APART_DB = 6.0  # beyond what levels of one group differ by between neighbours
-NEAR, LEAST_ROWS = 4, 10  # neighbours looked at; rows of pairs within and between groups
-MOST_CELLS, LEAST_OWN = 4, 20  # groups that may be cells far apart, and rows of each
-CANDIDATES = 12  # places of a transmitter along each axis
-BETTER, FAR = 1.4, 0.4  # ratio of deviations about a law; of the site's extent, between places that fit best
-LOOKED_AT = 4_000  # rows of a station
+NEAR, LEAST_ROWS, LEAST_OWN = 4, 10, 20  # neighbours looked at; rows of pairs of groups; rows of a cell
+CANDIDATES, LOOKED_AT = 12, 2_000  # places of a transmitter along each axis; rows of a group
+BETTER, FAR = 1.7, 0.4  # ratio of deviations about a law; of the site's extent, between places that fit best
 NEAREST = 0.01  # of the extent: nearer, a law of distance rises no more
 
 
@@ -56,24 +55,28 @@ def levels_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> fl
 
 
 def places_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> bool:
-    """Whether a law of distance fits far better about a place for each group, far apart, than about one."""
+    """Whether two groups of rows (n,) follow a law of distance far better from a place each than from one.
+
+    Each has a level of its own, so that a gain alone makes no second place.
+    """
     groups, counts = np.unique(group, return_counts=True)
     groups = groups[counts >= LEAST_OWN]
-    rows = np.flatnonzero(np.isin(group, groups))
-    rows = rows[:: 1 + len(rows) // LOOKED_AT]
-    extent = float(np.linalg.norm(np.ptp(places[rows], axis=0))) if len(rows) else 0.0
+    extent = float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) else 0.0
     if not 2 <= len(groups) <= MOST_CELLS or not extent:
         return False
-    axes = np.linspace(places[rows].min(0), places[rows].max(0), CANDIDATES).T
-    grid = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
-    decades = np.log10(cdist(places[rows], grid).clip(NEAREST * extent))
-
-    def fitted(part: np.ndarray) -> tuple[float, np.ndarray]:
-        far, values = decades[part] - decades[part].mean(0), level[rows][part] - level[rows][part].mean()
-        slope = np.minimum(values @ far / np.maximum((far**2).sum(0), 1e-9), 0)
-        rest = ((values[:, None] - slope * far) ** 2).sum(0)
-        return float(rest.min()), grid[rest.argmin()]
-
-    each, at = zip(*(fitted(group[rows] == one) for one in groups), strict=True)
-    one = fitted(np.ones(len(rows), bool))[0]
-    return bool(one > BETTER**2 * sum(each) and pdist(np.array(at)).max() > FAR * extent)
+    grid = np.stack(np.meshgrid(*np.linspace(places.min(0), places.max(0), CANDIDATES).T), -1).reshape(-1, 2)
+    sums = []
+    for one in groups:
+        rows = np.flatnonzero(group == one)
+        rows = rows[:: 1 + len(rows) // LOOKED_AT]
+        decades = np.log10(cdist(places[rows], grid).clip(NEAREST * extent))
+        decades, values = decades - decades.mean(0), level[rows] - level[rows].mean()
+        sums.append(((decades**2).sum(0), values @ decades, values @ values))
+    for (square, product, rest), (square_, product_, rest_) in combinations(sums, 2):
+        fall = np.minimum(product[:, None] + product_, 0) ** 2 / (square[:, None] + square_).clip(1e-9)
+        left = rest + rest_ - fall  # for a place of each
+        first, second = np.unravel_index(left.argmin(), left.shape)
+        far = np.linalg.norm(grid[first] - grid[second]) > FAR * extent
+        if far and np.diag(left).min() > BETTER**2 * left.min():
+            return True
+    return False
