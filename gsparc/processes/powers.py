@@ -224,7 +224,7 @@ def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[Po
         posterior.values()[quiet],
         torch.ones(int(quiet.sum()), dtype=torch.float64),
     )
-    of = f"of {int(rows.silent.sum())} silent rows {int(part.silent.sum())}, drawn evenly, are looked at"
+    of = f"of {int(rows.silent.sum())} censored rows {int(part.silent.sum())}, drawn evenly, are looked at"
     nearest = given(prior, values, seed, stand_ins, posterior.extra[quiet])
     return PowerProcess(nearest, heard), (note, of, *notes)
 
