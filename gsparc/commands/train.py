@@ -64,7 +64,7 @@ def task(config: DictConfig) -> float:
 def _train_and_show(config: DictConfig) -> float:
     run_dir = run_directory()
     facts, objects = train(config, run_dir)
-    figure = objective_of(config, objects.data.site.kind)
+    figure = objective_of(config, objects.data.site.scored)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
     results = results_table(facts, facts["model/label"], title, config.eval_on)
     show(run_dir, results, lines=remarks(facts, config.eval_on))

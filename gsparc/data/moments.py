@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,15 +45,22 @@ class Snapshots:
         if data.mask is not None:
             target = np.where(data.mask[rows], target, 0)
         names, column = np.unique(station, return_inverse=True)
-        antenna = column * target.shape[1]
-        values = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
-        for offset in range(target.shape[1]):
-            values[moment, antenna + offset] = target[:, offset]
         tones = data.site.subcarriers_hz
-        tones = np.zeros(1) if tones is None or len(tones) != values.shape[2] else np.asarray(tones, float)
-        tones = np.zeros(values.shape[2]) if len(tones) != values.shape[2] else tones - tones.mean()
+        known = tones is not None and len(tones) == target.shape[2]
+        tones = np.asarray(tones, float) if known else np.zeros(target.shape[2])
         run = np.zeros(len(first), np.int64) if data.run is None else data.run[rows[first]]
-        return cls(rows, moment, antenna, data.moving[rows[first]], values, tones, run)
+        empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
+        one = cls(
+            rows, moment, column * target.shape[1], data.moving[rows[first]], empty, tones - tones.mean(), run
+        )
+        return replace(one, values=one.arranged(target))
+
+    def arranged(self, rows: np.ndarray) -> np.ndarray:
+        """Values (n, A, K) by moment and antenna of channels (S, a, K) of the same rows."""
+        values = np.zeros_like(self.values)
+        for offset in range(rows.shape[1]):
+            values[self.moment, self.antenna + offset] = rows[:, offset]
+        return values
 
     def to_rows(self, factors: np.ndarray) -> np.ndarray:
         """Factors (S, 1, K) of rows, by those (n, K) of moments."""

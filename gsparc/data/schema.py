@@ -1,4 +1,4 @@
-"""Facts of a dataset, its samples and batches of them."""
+"""Facts of a dataset and its samples."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
+from gsparc.data.query import Batch
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.row_factors import Freedom
@@ -57,7 +58,7 @@ class Links:
         static_end: which end the stations, or the one static end, are; None where both move.
         stations: in world coordinates; None where there is one static end, or none.
         station, place: (S,) int64, see `Measurements`; None without stations.
-        censored: (S,) bool; None where nothing is.
+        censored: (S,) int8, see `Measurements`; None where nothing is.
         run: (S,) int64; None without runs.
         unknown_transmitter: powers of a transmitter whose place nobody gave.
         georeference: of the world's origin, where places came in degrees.
@@ -149,6 +150,12 @@ class Site:
         """The figures of merit that tell of it; rows with factors of their own are aligned first."""
         return "aligned csi" if self.kind == "csi" and self.freedom != "none" else self.kind
 
+    def need_phase(self, what: str) -> None:
+        """`ValueError` where rows have phases of their own, so that `what` cannot be told."""
+        if self.freedom != "none":
+            free = self.freedom.replace("+", ", ")
+            raise ValueError(f"{what}: channels are known up to {free} of each row; levels and shapes are told")
+
     @property
     def moving_end(self) -> Literal["rx", "tx"]:
         """The end whose position is the query; the receiver where both move."""
@@ -219,45 +226,6 @@ class Site:
 
 
 @dataclass(frozen=True)
-class Batch:
-    """Samples handed to a model together; positions are local float32 [m].
-
-    Attributes:
-        index: (B,) int64 row in the dataset.
-        tx: (B, 3) [m].
-        rx: one shared Pose, or B poses.
-        target: (B, H, W) float32, or (B, antennas, subcarriers) complex64, or (B, 1) float32.
-        mask: like target, bool, True where measured; None when everything was.
-        noise_variance: (B,) float32 in target units; None when unknown.
-        uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
-        station: (B,) int64, which of the site's stations each is of; None where there is one.
-        run: (B,) int64, see `Measurements`; None where all are in phase.
-        share: of a training step's rows, where processes share them; 0 where another has these rows.
-    """
-
-    index: Tensor
-    tx: Tensor
-    rx: Pose
-    target: Tensor
-    mask: Tensor | None = None
-    noise_variance: Tensor | None = None
-    uplink: Tensor | None = None
-    station: Tensor | None = None
-    run: Tensor | None = None
-    share: float = 1.0
-
-    def __len__(self) -> int:
-        return self.index.shape[0]
-
-    def to(self, device: torch.device | str) -> Batch:
-        """The same samples on another device."""
-        moved: dict[str, Any] = {
-            k: v.to(device) for k, v in vars(self).items() if isinstance(v, (Tensor, Pose))
-        }
-        return replace(self, **moved)
-
-
-@dataclass(frozen=True)
 class Measurements:
     """A whole dataset, in memory but for large targets; arrays keep their stored precision and type.
 
@@ -277,8 +245,9 @@ class Measurements:
         station: (S,) int64, which of `site.stations` a row is of; None where there is one.
         place: (S,) int64, the number of the place that a row is of: one place, several stations, or visits;
             None where every row is one.
-        censored: (S,) bool, True where a power was below what can be heard: the target is that level, and its
-            mask is False. None where nothing is.
+        censored: (S,) int8, 1 where a power was below what can be heard and the target is that level, -1
+            where the receiver was saturated and the power is above the target, 0 where it was measured; the
+            mask of the former two is False. None where nothing is.
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
         position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
             where positions count as exact.
@@ -311,6 +280,10 @@ class Measurements:
         if self.site.static_end is None:
             return np.hstack([self.tx, self.rx_position])
         return self.tx if self.site.moving_end == "tx" else self.rx_position
+
+    def side(self, rows: np.ndarray) -> np.ndarray:
+        """`censored` of rows (n,), (n,) int8."""
+        return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
 
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
         """Targets of the given rows as float32 or complex64, in stored units."""

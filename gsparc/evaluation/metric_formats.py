@@ -49,7 +49,12 @@ TABLES: dict[Scored, tuple[str, ...]] = {
 }
 """The columns of a kind's tables; methods, fronts and effects are compared by the first."""
 DECIDING: dict[Scored, str] = {kind: names[0] for kind, names in TABLES.items()}
-PER_SAMPLE: dict[Scored, str] = {"spectrum": "psnr_db", "csi": "snr_db", "aligned csi": "snr_db", "rssi": "error_db"}
+PER_SAMPLE: dict[Scored, str] = {
+    "spectrum": "psnr_db",
+    "csi": "snr_db",
+    "aligned csi": "snr_db",
+    "rssi": "error_db",
+}
 """The figure of a single sample, in decibels."""
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.metrics import metrics_for
-from gsparc.models.method import Method
+from gsparc.models.method import Method, predictions
 
 SUBSETS = ("train", "val", "test")
 CHUNK = 64  # rows predicted at a time
@@ -26,13 +26,13 @@ class Scores:
     """Results of one method, sample by sample, in the order of the folds.
 
     Attributes:
-        kind: of the dataset.
+        kind: see `Site.scored`.
         fold, row: (S,) int64.
         samples: quantities of the metrics of `kind`, (S,) float64 each.
         confidence, variance: (S,) float64, NaN where the method gives none.
     """
 
-    kind: Kind
+    kind: Scored
     fold: np.ndarray
     row: np.ndarray
     samples: dict[str, np.ndarray]
@@ -108,7 +108,7 @@ def rows_of(fold: Fold, eval_on: str) -> np.ndarray:
 
 def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
     """Numbers (R,) of runs with channels among the rows `eval_on` and none among those learned from."""
-    if data.site.kind != "csi" or data.run is None:
+    if data.site.scored != "csi" or data.run is None:
         return np.zeros(0, np.int64)
     learned = fold.train if eval_on == "val" else np.concatenate([fold.train, fold.val])
     return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[learned])
@@ -122,9 +122,8 @@ def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.n
     turn = torch.ones(len(rows), dtype=torch.complex64)
     for run in runs:
         mine, overlap = np.flatnonzero(data.run[rows] == run), 0j  # type: ignore[index]
-        for start in range(0, len(mine), CHUNK):
-            batch = data.batch(rows[mine[start : start + CHUNK]])
-            product = (method.answer(batch).mean.cpu().conj() * batch.target).to(torch.complex128)
+        for _, batch, said in predictions(method, data, rows[mine], CHUNK):
+            product = (said.mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
         if overlap:
             turn[torch.from_numpy(mine)] = torch.tensor(overlap / abs(overlap), dtype=torch.complex64)
@@ -154,27 +153,22 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     for method, rows, fold in zip(methods, every, split.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
         turn = best_phases(method, data, rows, runs) if len(runs) else None
-        metric = metrics_for(data.site.kind, data.site.target_scale)
-        # One station at a time: each has a model of its own, whose matrices are read for every chunk.
-        order = (
-            np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
-        )
-        outputs: dict[str, list[np.ndarray]] = {"confidence": [], "variance": []}
-        for start in range(0, len(rows), CHUNK):
-            chunk = order[start : start + CHUNK]
-            batch = data.batch(rows[chunk])
-            prediction = method.answer(batch)
-            mean = prediction.mean if turn is None else prediction.mean * turn[chunk, None, None]
+        metric = metrics_for(data.site.scored, data.site.target_scale)
+        outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
+        order = []
+        for chosen, batch, prediction in predictions(method, data, rows, CHUNK):
+            mean = prediction.mean if turn is None else prediction.mean * turn[chosen, None, None]
             metric.update(mean, batch.target, batch.mask)
             for name, values in outputs.items():
-                output, none = getattr(prediction, name), np.full(len(batch), np.nan)
-                values.append(none if output is None else output.detach().cpu().double().numpy())
-        back = np.argsort(order)
+                if (output := getattr(prediction, name)) is not None:
+                    values[chosen] = output.detach().cpu().double().numpy()
+            order.append(chosen)
+        back = np.argsort(np.concatenate(order))
         samples.append({name: values[back] for name, values in metric.compute().items()})
-        confidence.append(np.concatenate(outputs["confidence"])[back])
-        variance.append(np.concatenate(outputs["variance"])[back])
+        confidence.append(outputs["confidence"])
+        variance.append(outputs["variance"])
     return Scores(
-        kind=data.site.kind,
+        kind=data.site.scored,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),
         row=np.concatenate(every),
         samples={name: np.concatenate([s[name] for s in samples]) for name in samples[0]},

@@ -1,10 +1,10 @@
 """Channels whose rows have phases, delays and gains of their own, turned until they fit their neighbours.
 
-With one unknown factor a row, what rows share is their shape. Rows are turned along a spanning tree of near
-places, then each to what a process of all other rows says of it, in turns with the process's settings. Many
-gauges fit: phases that vary slowly over places are as good as the carrier's ("free"), unless antennas at known
-places see the same factor, which leaves one gauge alone, that of waves ("carrier"); the one that predicts rows
-left out better, after the same freedom, is taken.
+With one unknown factor a row, what rows share is their shape. Rows are turned along a spanning tree of
+near places, then each to what a process of all other rows says of it, in turns with the process's settings.
+Many gauges fit: phases that vary slowly over places are as good as the carrier's ("free"), unless antennas at
+known places see the same factor, which leaves one gauge alone, that of waves ("carrier"); the one that
+predicts rows left out better, after the same freedom, is taken.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import Freedom, turning
 from gsparc.processes.kernel import Kernel, WaveKernel
 from gsparc.processes.nearest import weights_of
-from gsparc.processes.two_lengths import first_kernel, two_lengths
 from gsparc.processes.neighbourhood import covering
+from gsparc.processes.two_lengths import first_kernel, two_lengths
 
 log = logging.getLogger(__name__)
 
@@ -78,9 +78,7 @@ def in_one_gauge(data: Measurements, fold: Fold) -> Measurements:
         if site.freedom == "phase+delay+gain":
             factors = factors / np.maximum(_rms(rows.values), 1e-30)[rows.moment][:, None, None]
         target[rows.rows] = (own * factors).astype(target.dtype)
-    gauge: Literal["carrier", "free"] = (
-        "carrier" if all(one.gauge == "carrier" for one in found) else "free"
-    )
+    gauge: Literal["carrier", "free"] = "carrier" if all(one.gauge == "carrier" for one in found) else "free"
     log.info(
         "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
         len(known), site.freedom, float(np.mean([one.error for one in found])),
@@ -187,9 +185,7 @@ class _Rows:
         turned = self.values * factors[:, None]
         return np.einsum("nk,nkat->nat", weight, turned[near])
 
-    def _swept(
-        self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray], sweeps: int
-    ) -> np.ndarray:
+    def _swept(self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray], sweeps: int) -> np.ndarray:
         for _ in range(sweeps):
             told = self._told(factors, weights)
             factors = turning(self.values, told, self.tones, self.freedom_of_phase)

@@ -145,7 +145,7 @@ def process(
 def aligned(
     data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
-    """A process of two lengths on rows that were turned to each other; `init` and `clutter` mean nothing to it."""
+    """A process of two lengths on rows that were turned to each other; `init` and `clutter` mean nothing."""
     method = ComplexGP()
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
     return AlignedField(method), report

@@ -22,6 +22,7 @@ from gsparc.data.errors import some
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, indices_hash
 from gsparc.models import checkpoint
+from gsparc.models.aligned_rows import in_one_gauge
 from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
 from gsparc.training.context import FitContext, FitReport
@@ -55,7 +56,7 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
     Raises:
         ValueError: the folder holds a part of other data, rows, seed or settings.
     """
-    left = context.resume
+    data, left = in_one_gauge(data, fold), context.resume
     if left is not None:  # what was read then is not known
         heeded.count("*")
     if left is not None and left.is_dir():

@@ -18,7 +18,7 @@ MOST_DELAYS = 1024
 
 
 def delays(tones: np.ndarray) -> np.ndarray:
-    """Delays (T,) [s] that tones (K,) [Hz] tell apart, from the middle of a period outwards, evenly spaced."""
+    """Delays (T,) [s] that tones (K,) [Hz] tell apart, evenly spaced about 0."""
     tones = np.sort(tones)
     width, gaps = tones[-1] - tones[0], np.diff(tones)
     if width <= 0:

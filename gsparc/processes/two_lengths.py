@@ -1,7 +1,7 @@
 """A process of complex values with a short and a long length, chosen by evidence in units of a wavelength.
 
 Of channels whose rows were turned to be like their neighbours, the carrier's phase is gone: what is left
-varies within a fraction of a wavelength where paths interfere, and over many wavelengths as the strongest does.
+varies within a fraction of a wavelength where paths interfere, and over many as the strongest does.
 """
 
 from __future__ import annotations

@@ -15,8 +15,10 @@ FOLDER = Path(__file__).parents[3] / "shared/data/ofdm"
 RUNS = 5
 
 
-def robot(transmitter: int = 0, first: int = 0, layout: str = "los") -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Places (n, 3) [m], frequencies and the transmitter's place, and channels (n, 30), coherent within runs."""
+def robot(
+    transmitter: int = 0, first: int = 0, layout: str = "los"
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Places (n, 3) [m], frequencies, the transmitter's place; channels (n, 30), coherent within runs."""
     released = np.load(FOLDER / f"wsr-{layout}-a.npz")
     channel = released["root_sign"] * np.sqrt(released["h2"])
     good = released["good"] & (released["tx_index"] == transmitter) & (channel != 0).all(1)

@@ -7,8 +7,8 @@ import packets
 import pytest
 
 from gsparc.data.checks.coherence import allowed
-from gsparc.models.aligned_rows import align, in_one_gauge
 from gsparc.data.moments import Snapshots
+from gsparc.models.aligned_rows import align, in_one_gauge
 from gsparc.physics.row_factors import turning
 
 pytestmark = pytest.mark.skipif(not packets.FOLDER.exists(), reason="../shared/data is not here")

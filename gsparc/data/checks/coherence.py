@@ -51,7 +51,11 @@ class Coherence:
     freedom: Freedom
 
     def __str__(self) -> str:
-        own = "" if self.freedom == "none" else f"every row has a {self.freedom.replace('+', ', ')} of its own: "
+        own = (
+            ""
+            if self.freedom == "none"
+            else f"every row has a {self.freedom.replace('+', ', ')} of its own: "
+        )
         return (
             f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, by "
             f"{self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
@@ -119,7 +123,8 @@ def allowed(data: Measurements, align: str) -> Measurements:
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
         if (apart := _places_apart(data)) > IN_LINE:
             log.warning(
-                "places are %.3g wavelengths apart: neighbours tell levels, not the shape over subcarriers", apart
+                "places are %.3g wavelengths apart: neighbours tell levels, not the shape over subcarriers",
+                apart,
             )  # fmt: skip
     return replace(data, site=replace(data.site, freedom=freedom))
 

@@ -80,7 +80,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         module = _data(config)
         data = module.measurements
         split = split_for(plain(config.split), data)
-    objective_of(config, data.site.kind)  # refused now, not after the training
+    objective_of(config, data.site.scored)  # refused now, not after the training
     walls = config.get("known_walls") or OmegaConf.select(config, "init.file")
     known_walls = None if walls is None else read_walls(walls)
     split.check()  # none without rows to learn from or to test on
@@ -119,7 +119,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             make = partial(build, config.model)
             with heeded.recording(reads):
                 fitted = fit_and_score(make, data, split, context, eval_on=None, keep=keep)
-                fitted.methods[0].answer(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
+                fitted.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
         except KeyboardInterrupt as stopped:
             if count == 1:
                 raise
