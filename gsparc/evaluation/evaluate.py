@@ -65,7 +65,7 @@ def evaluate(
         data: the dataset.
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
-        baselines: names in `gsparc.models.registry.METHODS`; None: all plain ones that serve these rows.
+        baselines: names in `gsparc.models.registry.known()`; None: all plain ones that serve these rows.
         cache: folder where baselines are kept between runs; None keeps nothing.
         clock: how long to measure latencies.
         learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.

@@ -27,7 +27,7 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Reducible, suited_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.registry import METHODS, build, method_class
+from gsparc.models.registry import build, method_class, methods
 from gsparc.models.splat.array import ArrayField
 from gsparc.ops import Pose
 
@@ -119,7 +119,7 @@ def ends(method: Method, moving: torch.Tensor) -> tuple[torch.Tensor, Pose]:
     return moving, Pose(still, torch.from_numpy(turn).float())
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", methods())
 def test_a_method_is_what_the_table_says(name):
     method = method_class(name)()
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}

@@ -17,7 +17,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import plain as plain
-from gsparc.models.registry import build, known
+from gsparc.models.registry import build, complete, known
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,13 @@ class RunSettings(Checked):
 
     @classmethod
     def of(cls, config: DictConfig) -> RunSettings:
-        """Check what can be checked before anything is read, and set the number of threads.
+        """Check what can be checked before anything is read, complete `model`, and set the number of threads.
 
         Raises:
             ValueError: a setting that cannot be, named as it is in the configuration.
         """
+        if "model" in config:
+            complete(config.model)
         values = OmegaConf.to_container(config, resolve=True)
         assert isinstance(values, dict)
         known: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}

@@ -17,7 +17,7 @@ from hydra.core.config_store import ConfigStore
 
 from gsparc.data.instantiate import find, plugins, targets
 from gsparc.evaluation.experiment.problem import Problem
-from gsparc.models.registry import METHODS
+from gsparc.models.registry import methods
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 
@@ -80,13 +80,13 @@ class Cell:
 
 def plugged() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
-    offered, methods = ConfigStore.instance().repo.get("model", {}), {}
+    offered, found = ConfigStore.instance().repo.get("model", {}), {}
     for name, path in plugins("model").items():
-        if name not in METHODS and f"{name}.yaml" in offered:
+        if name not in methods() and f"{name}.yaml" in offered:
             kind = find(path)
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
-            methods[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
-    return methods
+            found[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
+    return found
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from gsparc.data import heeded
 from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
 from gsparc.data.files import is_address, platform_cache
-from gsparc.data.instantiate import suggest
+from gsparc.data.instantiate import find, node_of, suggest
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Split, write_split
@@ -32,7 +32,7 @@ from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import new_run_id, provenance, result_rows, write_samples, write_summary
 from gsparc.models import checkpoint, parts
 from gsparc.models.method import Method, TrainsByGradient
-from gsparc.models.registry import build, known, method_node
+from gsparc.models.registry import build, known
 from gsparc.training import curve, tracking
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -185,7 +185,7 @@ def _as_baseline(config: DictConfig, method: Method) -> str | None:
     """Its name where a baseline of that name would be fitted in the same way."""
     plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
     kind = known().get(method.name)
-    return method.name if plainly and kind and plain(config.model) == method_node(kind) else None
+    return method.name if plainly and kind and plain(config.model) == node_of(find(kind)) else None
 
 
 def _check_model(config: DictConfig, resumed: bool) -> None:
