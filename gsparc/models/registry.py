@@ -62,17 +62,15 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
             refuse_foreign(path)
     from gsparc.models.method import Method
 
-    node = deepcopy(node)
-    complete(node)
     with heeded.apart():  # what is handed on is not used yet
-        method = instantiate(node)
+        method = instantiate(complete(deepcopy(node)))
     if not isinstance(method, Method):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method
 
 
-def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model") -> None:
-    """Add in place what the class of a node takes and the node does not say, with defaults, at any depth.
+def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model") -> DictConfig:
+    """Return a node, completed in place at any depth by what its class takes with defaults.
 
     Args:
         node: `_target_` and some of its arguments.
@@ -84,7 +82,7 @@ def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str 
     """
     kind = find(str(node.get("_target_", (own or {}).get("_target_"))))
     if not isinstance(kind, type):  # refused where it is built
-        return
+        return node
     own = node_of(kind) if own is None else own
     given, taken = set(node), {*own, *arguments(kind)} - {"_target_"}
     for name in (name for name in given - taken if not name.startswith("_")):
@@ -104,3 +102,4 @@ def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str 
             raise SettingError(f"{said}, given one by one: {some}=...")
         if isinstance(default, Mapping):
             complete(value, default, f"{group}.{name}")
+    return node

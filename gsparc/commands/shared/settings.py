@@ -17,7 +17,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import plain as plain
-from gsparc.models.registry import build, complete, known
+from gsparc.models.registry import known
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,11 @@ class RunSettings(Checked):
 
     @classmethod
     def of(cls, config: DictConfig) -> RunSettings:
-        """Check what can be checked before anything is read, complete `model`, and set the number of threads.
+        """Check what can be checked before anything is read, and set the number of threads.
 
         Raises:
             ValueError: a setting that cannot be, named as it is in the configuration.
         """
-        if "model" in config:
-            complete(config.model)
         values = OmegaConf.to_container(config, resolve=True)
         assert isinstance(values, dict)
         known: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}
@@ -66,12 +64,10 @@ class RunSettings(Checked):
             raise SettingError(f"trainer.accelerator={accelerator!r}: one of {', '.join(kinds)}")
         if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
             raise SettingError(f"trainer.accelerator={accelerator}: there is no GPU here; say trainer=cpu")
-        if "model" in config:
-            build(config.model)  # its parts check themselves, and so do callbacks
         for name, node in (config.get("callbacks") or {}).items():
             if node is not None and not isinstance(node, Mapping):
                 raise SettingError(f"callbacks.{name}={node}: is a group of settings; null leaves it out")
-            instantiate(node)
+            instantiate(node)  # checks itself
         for key, value in _leaves(values):
             if isinstance(value, float):
                 Limit("a finite number", math.isfinite).check(key, value)
