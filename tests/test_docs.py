@@ -35,6 +35,16 @@ def test_every_package_is_on_the_map():
     assert not groups - set(re.findall(r"(\w+)/", MAP))
 
 
+def test_the_walk_is_through_functions_that_are_there():
+    """At most 12 steps of a spectrum and of a power, each a file and what it defines."""
+    for walk in MAP.partition("## The walk")[2].partition("\n## ")[0].split("**A ")[1:]:
+        steps = re.findall(r"(?:^|\s)(\d+) `([\w/]+\.py) ([\w.]+)`", walk)
+        assert len(steps) > 5 and int(steps[-1][0]) == 12
+        for _, file, name in steps:
+            text = (ROOT / "gsparc" / file).read_text(encoding="utf-8")
+            assert all(re.search(rf"(?:def|class) {part}\b", text) for part in name.split(".")), (file, name)
+
+
 @PER_PAGE
 def test_what_a_page_names_is_there(page):
     """Files that it links, names or shows, headings of other pages, and tests."""

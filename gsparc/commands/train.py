@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,7 +34,7 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.fit import Outcome, context_of, fit_and_score
+from gsparc.evaluation.experiment.fit import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.metrics import figure_names
@@ -109,11 +110,12 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
 
         with tracking.opened(config) as loggers:
             whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=module)
-            contexts = _of_folds(whole, resumes, watch.spent)
-            with heeded.recording(reads):
-                # `Method.fit` of every fold. Where that takes gradient steps, training/fit.py `run_stage`
-                # makes the Trainer of `config.trainer` and calls `trainer.fit(module, datamodule)`.
-                fits = _fit(method, data, split, contexts, run_id)
+            contexts = _of_folds(whole, split, resumes, watch.spent)
+            with heeded.recording(reads), _advising(contexts):
+                # `Method.fit` of every fold. For gradient steps training/fit.py `run_stage` makes the Trainer
+                # of `config.trainer` and calls `trainer.fit(module, datamodule)`.
+                keep = partial(_keep, data, split, contexts, run_id)
+                fits = fit_folds(partial(deepcopy, method), data, split, contexts, keep=keep)
                 fits.methods[0].answer(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
 
             unused = options.unheeded(reads, fits.methods[0], data)
@@ -202,45 +204,47 @@ def _known_walls(config: DictConfig) -> Any:
     return None if walls is None else read_walls(walls)
 
 
-def _of_folds(whole: FitContext, resumes: Sequence[Path | None], read_s: float) -> list[FitContext]:
-    """What the fit of each fold is given; of several, each has a folder and series of figures of its own.
+def _of_folds(
+    whole: FitContext, split: Split, resumes: Sequence[Path | None], read_s: float
+) -> list[FitContext]:
+    """What the fit of each fold is given.
 
     Args:
         read_s: that reading took [s]: the seconds that are given begin with the first read.
     """
-    contexts = [whole.within(f"fold{number}", resume=resume) for number, resume in enumerate(resumes)]
-    if len(resumes) == 1:
-        contexts = [replace(whole, resume=resumes[0])]
+    contexts = in_folders(whole, split) if len(resumes) > 1 else [whole]
+    contexts = [replace(one, resume=resume) for one, resume in zip(contexts, resumes, strict=True)]
     if whole.budget_s is not None:
         left_s = max(whole.budget_s - read_s, LEAST_SHARE * whole.budget_s)
         contexts[0] = replace(contexts[0], budget_s=left_s)
     return contexts
 
 
-def _fit(
-    method: Method, data: Measurements, split: Split, contexts: Sequence[FitContext], run_id: str
-) -> Outcome:
-    """Fit a copy of the method on every fold; each is kept as soon as it is fitted."""
-
-    def keep(number: int, fitted: Method, report: FitReport) -> None:
-        context = contexts[number]
-        for note in report.notes:
-            log_of_models.info("%s", note)
-        if not curve.read(context.run_dir):  # a method that trains in one piece
-            context.curve(report.seconds, fitted.name, report.error)
-        marks = parts.marks(report, data, split.folds[number], context)
-        extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
-        checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
-
-    make = partial(deepcopy, method)
+@contextmanager
+def _advising(contexts: Sequence[FitContext]) -> Iterator[None]:
+    """Say of an interrupt among several folds that the run's folder is what to go on from."""
     try:
-        return fit_and_score(make, data, split, contexts.__getitem__, eval_on=None, keep=keep)
+        yield
     except KeyboardInterrupt as stopped:
         if len(contexts) == 1:
             raise
         cause = str(stopped).partition("; ")[0] or "interrupted"
-        advice = f"go on with ckpt_path={contexts[0].run_dir.parent}"
-        raise KeyboardInterrupt(f"{cause}; {advice}") from None
+        raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={contexts[0].run_dir.parent}") from None
+
+
+def _keep(
+    data: Measurements, split: Split, contexts: Sequence[FitContext], run_id: str,
+    number: int, fitted: Method, report: FitReport,
+) -> None:  # fmt: skip
+    """Write the checkpoint of a fold as soon as it is fitted."""
+    context = contexts[number]
+    for note in report.notes:
+        log_of_models.info("%s", note)
+    if not curve.read(context.run_dir):  # a method that trains in one piece
+        context.curve(report.seconds, fitted.name, report.error)
+    marks = parts.marks(report, data, split.folds[number], context)
+    extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
+    checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
 
 def _as_baseline(config: DictConfig, method: Method) -> str | None:

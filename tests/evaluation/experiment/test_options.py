@@ -19,7 +19,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.load import datamodule, split_for
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.fit import context_of, fit_and_score
+from gsparc.evaluation.experiment.fit import context_of, fit_folds
 from gsparc.models.registry import build, complete
 
 WORLDS = {
@@ -54,12 +54,11 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
             data = datamodule(config.dataset).measurements
             split = split_for(plain(config.split), data)
             folder = Path(mkdtemp())
-            fits = fit_and_score(
+            fits = fit_folds(
                 partial(deepcopy, method),
                 data,
                 split,
-                lambda n: context_of(config, run_dir=folder),
-                eval_on=None,
+                [context_of(config, run_dir=folder)] * len(split.folds),
             )
             method, rows = fits.methods[0], split.folds[0].test
             method.answer(data.batch(rows[:1]))
