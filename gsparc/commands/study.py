@@ -23,7 +23,7 @@ from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Study, facts_of
 from gsparc.evaluation.summary import run_conditions, shown, table, write_samples
 from gsparc.models.method import Method
-from gsparc.models.registry import build, complete, method_class
+from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
 
 
@@ -53,7 +53,7 @@ def study_of(config: DictConfig) -> Study:
 def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
     settings = RunSettings.of(config)
-    build(complete(config.model))  # its parts check themselves
+    build(config.model)  # its parts check themselves
     run_dir = run_directory()
     study = study_of(config)
     data = load(plain(config.dataset))

@@ -94,9 +94,9 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         ValueError: bad data, settings or checkpoint, one line each; or another run writes there.
     """
     with locked(run_dir):
-        _set_earlier_aside(config, run_dir)
         method = build(complete(config.model))  # once: each fold, and each station, fits a copy of it
         RunSettings.of(config)
+        _set_earlier_aside(config, run_dir)
         run_id, watch = summary.new_run_id(), TimeBudget(clock=config.budget_clock)
         reads = options.noting(config, method)
 

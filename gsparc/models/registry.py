@@ -86,7 +86,7 @@ def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str 
     own = node_of(kind) if own is None else own
     given, taken = set(node), {*own, *arguments(kind)} - {"_target_"}
     for name in (name for name in given - taken if not name.startswith("_")):
-        hint = suggest(name, taken).replace("mean '", f"mean '{group}.")
+        hint = suggest(name, taken).replace("mean '", f"mean '{group}.") if taken else ", which has none"
         raise SettingError(f"{group}.{name}: no such setting of {kind.__name__}{hint}")
     with open_dict(node):
         node.update({name: default for name, default in own.items() if name not in given})

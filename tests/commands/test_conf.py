@@ -96,10 +96,14 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
     }  # fmt: skip
 
 
-def test_all_settings_of_a_model_are_printed():
+def test_all_settings_of_a_model_are_printed_and_kept(tmp_path):
     """Also those that its file leaves to its class."""
-    said = knock(COMMANDS["train"].run, "train", ["model=idw", "model.power=3", "--cfg", "job"])
+    given = "model=idw", "model.power=3", "dataset=own", f"dataset.file={spectra(tmp_path / 'own.npz')}"
+    said = knock(COMMANDS["train"].run, "train", [*given, "--cfg", "job"])
     assert {"  power: 3", "  neighbours: 8"} < set(said.out)
+    done = knock(main, "train.py", [*given, "baselines=[]", f"hydra.run.dir={tmp_path / 'run'}"])
+    kept = yaml.safe_load((tmp_path / "run" / ".hydra" / "config.yaml").read_text())["model"]
+    assert done.status == 0 and (kept["power"], kept["neighbours"]) == (3, 8)
 
 
 def test_trainer_defaults_in_code_are_those_of_the_configuration():

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from functools import partial, wraps
 from io import StringIO
+from pathlib import Path
 from types import FrameType
 
 import hydra
@@ -182,11 +183,23 @@ def overview(answers: str, config: str) -> str:
     return "\n\n".join(texts) + f"\n\n`gsparc {config} key=value ... --cfg job` shows every value.\n"
 
 
+def _complete(config: DictConfig) -> None:
+    """Add the settings of a model that its file leaves to its class, also to what Hydra has written."""
+    registry.complete(config.model)
+    hydra_config = HydraConfig.get()
+    if hydra_config.output_subdir is not None:
+        OmegaConf.save(
+            config, Path(hydra_config.runtime.output_dir, hydra_config.output_subdir, "config.yaml")
+        )
+
+
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
     @wraps(task)
     def wrapped(config: DictConfig) -> object:
         logging.captureWarnings(True)  # now that there is a log
         try:
+            if "model" in config:
+                _complete(config)
             return task(config)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.RUN:

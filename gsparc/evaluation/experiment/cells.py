@@ -13,8 +13,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
-
 from gsparc.data.instantiate import find, plugins, targets
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models.registry import methods
@@ -80,10 +78,10 @@ class Cell:
 
 def plugged() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
-    offered, found = ConfigStore.instance().repo.get("model", {}), {}
+    found = {}
     for name, path in plugins("model").items():
-        if name not in methods() and f"{name}.yaml" in offered:
-            kind = find(path)
+        kind = find(path)
+        if name not in methods() and kind is not None:  # one that cannot be imported is warned of
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
             found[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
     return found
