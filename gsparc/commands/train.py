@@ -24,7 +24,7 @@ from gsparc.commands.shared.settings import RunSettings
 from gsparc.data import heeded
 from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
-from gsparc.data.files import is_address, platform_cache, set_aside
+from gsparc.data.files import is_address, set_aside
 from gsparc.data.instantiate import find, node_of, suggest
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Kind, Measurements
@@ -121,7 +121,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             unused = options.unheeded(reads, fits.methods[0], data)
             evaluation = evaluate(
                 fits.methods, fits.train_s, data, split, eval_on=config.eval_on, baselines=config.baselines,
-                cache=platform_cache(), shared=_as_baseline(config, method),
+                shared=_as_baseline(config, method),
             )  # fmt: skip
 
             facts = {**evaluation.facts, **summary.provenance(), **_of_fits(fits)}

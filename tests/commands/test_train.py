@@ -108,7 +108,6 @@ def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
     more, times, spectra_file, tmp_path, monkeypatch
 ):
     fits, fit = [], GaussianProcess.fit
-    monkeypatch.setattr("gsparc.commands.train.platform_cache", lambda: None)
     monkeypatch.setattr(GaussianProcess, "fit", lambda *given: fits.append(1) or fit(*given))
     facts, _ = train(plain(spectra_file, "gp", "baselines=[gp]", *more), tmp_path)
     assert len(fits) == times
