@@ -116,7 +116,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
                 # of `config.trainer` and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
                 fits = fit_folds(partial(deepcopy, method), data, split, contexts, keep=keep)
-                fits.methods[0].answer(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
+                fits.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
 
             unused = options.unheeded(reads, fits.methods[0], data)
             evaluation = evaluate(
