@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsparc.data.errors import Caution, some
+from gsparc.data.links.stations import SECTOR
 from gsparc.data.tables.columns import Chosen, as_station, choose, station_names
 from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, understand, words_of
 from gsparc.data.tables.sectors import TILTS, meaning, read_sectors
@@ -132,7 +133,6 @@ def one_each(
     return None
 
 
-SECTOR = ("station_azimuth", "station_tilt", "station_width", "station_thickness", "station_power_db")
 LEAST_LISTED = 10  # stations of a drive: of fewer, one that the list lacks is a mistake
 PER_STATION = ("sensitivity_db", "carrier_hz", *SECTOR)
 
