@@ -65,7 +65,6 @@ class Method(ABC):
 
     name: str
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
-    linked: ClassVar[Mapping[str, str]] = {"seed": "${seed}"}  # settings that follow those of the run
     # Attributes that hold settings of other names, by setting; "": it tells `heeded.count` itself.
     stored_names: ClassVar[Mapping[str, str]] = {}
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
