@@ -260,6 +260,10 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: station {name} had too few training rows")
         return OfStation(copy, number) if self._shared else copy
 
+    def every(self) -> Method | None:
+        """One that answers each place for all stations at once (B, T); None: each has a copy of its own."""
+        return OfStations(self._copies[UNHEARD], self.site) if self._shared and self.site else None
+
     def _site_of(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
         return site if number == UNHEARD and self.wrapped.shares(site) else of_station(site, number)
@@ -338,6 +342,28 @@ class OfStation(View):
         rows = torch.arange(len(tx))
         station = torch.full_like(rows, self.number)
         return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
+
+
+class OfStations(View):
+    """A method that knows all stations of powers, asked about each of them at every place."""
+
+    def __init__(self, inner: Method, site: Site) -> None:
+        super().__init__(inner)
+        assert site.stations is not None
+        self.count = len(site.stations)
+
+    def gradient_problem(self) -> str | None:
+        """That of all stations."""
+        return self.inner.gradient_problem()
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """Mean and variance (B, T); the ends that stand are not read."""
+        rows = torch.arange(len(tx)).repeat_interleave(self.count)
+        station = torch.arange(self.count).repeat(len(tx))
+        at = Pose(rx.position[rows], rx.rotation[rows]) if rx.batched else rx
+        said = self.inner.answer(Batch(rows, tx[rows], at, torch.zeros(len(rows), 1), station=station))
+        variance = None if said.variance is None else said.variance.view(-1, self.count)
+        return Prediction(said.mean.view(-1, self.count), None, variance)
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:

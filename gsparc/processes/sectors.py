@@ -151,10 +151,10 @@ class Pairs:
 
     @classmethod
     def of(cls, a: Tensor, b: Tensor) -> Pairs:
-        """Of places (n, 7) and (m, 7)."""
-        towards = [torch.nn.functional.normalize(at[:, :2] - at[:, 3:5], dim=1) for at in (a, b)]
-        alike = ((towards[0] @ towards[1].T - 1) / BEARING**2).exp()
-        return cls(apart(a[:, :3], b[:, :3]), (a[:, 6:] == b[:, 6:].T).to(a), alike)
+        """Of places (..., n, 7) and (..., m, 7)."""
+        towards = [torch.nn.functional.normalize(at[..., :2] - at[..., 3:5], dim=-1) for at in (a, b)]
+        alike = ((towards[0] @ towards[1].mT - 1) / BEARING**2).exp()
+        return cls(apart(a[..., :3], b[..., :3]), (a[..., 6:] == b[..., 6:].mT).to(a), alike)
 
 
 def with_sectors(trend: Trend, state: Mapping[str, Any]) -> Sectors:

@@ -32,7 +32,6 @@ from gsparc.processes.shared import Shared
 from gsparc.training.time_budget import TimeBudget
 
 NEVER = -1  # in place of a station's number: one that was never heard
-QUERIES = 512  # at a time: memory
 MOST_EACH = 6_000  # rows of a station
 MEMORY = 3e9  # bytes of all stations' factors
 PLACES = 600  # that the shared process is known at in the end
@@ -110,20 +109,41 @@ class JointPowerField(ConditionalField):
             ValueError: before `condition`.
         """
         posterior, elsewhere = self._conditioned()
-        places, number = self._ends(tx, rx, station)
-        if self.network is not None:
-            places = torch.cat([places, number[:, None].clamp_min(0)], 1)
-            number = torch.where(number < 0, NEVER, torch.from_numpy(self.network.site)[number.clamp_min(0)])
+        places, number = self._by_process(*self._ends(tx, rx, station))
         mean, spread, share = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
-        for one in number.unique().tolist():
-            of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
-            for chosen in torch.nonzero(number == one)[:, 0].split(QUERIES):
-                mean[chosen], left = of.answer(places[chosen], one)
+        heard = torch.isin(number, torch.tensor([*posterior.processes]))
+        for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
+            if chosen.any():
+                mean[chosen], left = of.answer(places[chosen], number[chosen])
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
         mean, spread, share = (part.to(tx.dtype) for part in (mean, spread, share))
         power = self._power(mean)
         return Posterior(power, entry_variance(spread, power, "rssi"), None, share)
+
+    @torch.no_grad()
+    def cells(self, moving: Tensor, stations: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Levels (B, T) and their covariance (B, T, T) float64 [dB] of measurements, of T stations.
+
+        Args:
+            moving: (B, 3) [m] of the moving end.
+            stations: (T,) int64 numbers.
+        """
+        count = len(stations)
+        posterior, elsewhere = self._conditioned()
+        ends = torch.cat([moving.double().repeat_interleave(count, 0),
+                          torch.from_numpy(self.places[stations]).repeat(len(moving), 1)], 1)  # fmt: skip
+        places, number = self._by_process(ends, torch.from_numpy(stations).repeat(len(moving)))
+        places = places.unflatten(0, (len(moving), count))
+        mean, covariance = torch.zeros(len(moving), count).double(), torch.zeros(len(moving), count, count).double()
+        process = number[:count]
+        for one in process.unique().tolist():
+            at = (process == one).nonzero()[:, 0]
+            of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
+            level, left = of.together(places[:, at], one)
+            mean[:, at] = level
+            covariance[:, at[:, None], at] = inflation * left
+        return mean, covariance
 
     def answer(self, batch: Batch) -> Posterior:
         """See `ConditionalField`; two stations may stand at one place."""
@@ -182,6 +202,13 @@ class JointPowerField(ConditionalField):
         here, there = torch.cat([moving, still], 1), torch.cat([still, moving], 1)
         places = torch.where(turned[:, None], there, here)
         return places, self._standing(places[:, 3:])
+
+    def _by_process(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+        """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""
+        if self.network is None:
+            return places, number
+        site = torch.from_numpy(self.network.site)[number.clamp_min(0)]
+        return torch.cat([places, number[:, None].clamp_min(0)], 1), torch.where(number < 0, NEVER, site)
 
     def _by_law(self, moving: Tensor) -> Tensor:
         """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.
