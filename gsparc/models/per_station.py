@@ -25,7 +25,7 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, parts
-from gsparc.models.method import Method, Prediction, Reconditions
+from gsparc.models.method import HasJoint, Method, Prediction, Reconditions
 from gsparc.models.parts import common_label
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
@@ -260,7 +260,7 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: station {name} had too few training rows")
         return OfStation(copy, number) if self._shared else copy
 
-    def every(self) -> Method | None:
+    def every(self) -> OfStations | None:
         """One that answers each place for all stations at once (B, T); None: each has a copy of its own."""
         return OfStations(self._copies[UNHEARD], self.site) if self._shared and self.site else None
 
@@ -355,6 +355,11 @@ class OfStations(View):
     def gradient_problem(self) -> str | None:
         """That of all stations."""
         return self.inner.gradient_problem()
+
+    def joint(self) -> HasJoint | None:
+        """What knows how levels of stations go together; None where nothing does."""
+        field = getattr(self.inner, "field", None)
+        return field if isinstance(field, HasJoint) else None
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """Mean and variance (B, T); the ends that stand are not read."""

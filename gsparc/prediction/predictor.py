@@ -217,7 +217,9 @@ class Predictor:
         every = self.method.every() if isinstance(self.method, PerStation) else None
         if every is not None:
             site = of_station(self.site, 0)
-            return ask(Predictor(every, site, None, self.point, self.trusted, self.kind, self.extra, self._unit))
+            return ask(
+                Predictor(every, site, None, self.point, self.trusted, self.kind, self.extra, self._unit)
+            )
         stations = self._stations()
         answers = [None if asked is None else ask(asked) for asked in stations]
         known = next(one for one in answers if one is not None)

@@ -19,7 +19,6 @@ from gsparc.processes.left_out import left_out
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 
-
 QUERIES = 512  # at a time: memory
 
 
@@ -52,8 +51,13 @@ class Block:
 
 @dataclass(frozen=True)
 class _Said:
-    """Of B queries of one process: its prior, the mean beyond the prior's (B,), and roots of what is known of the
-    variance by its rows (B, n), None without any, and of what the shared weights leave (B, P).
+    """What is said of B queries of one process.
+
+    Attributes:
+        prior: of the process.
+        more: (B,) mean beyond the prior's.
+        white: (B, n) root of the variance that its rows take away; None without rows.
+        shared: (B, P) root of the variance that the shared weights leave.
     """
 
     prior: Prior

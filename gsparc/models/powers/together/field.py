@@ -122,28 +122,29 @@ class JointPowerField(ConditionalField):
         return Posterior(power, entry_variance(spread, power, "rssi"), None, share)
 
     @torch.no_grad()
-    def cells(self, moving: Tensor, stations: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Levels (B, T) and their covariance (B, T, T) float64 [dB] of measurements, of T stations.
+    def joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Levels (G, k) of measurements [dB], covariances (G, k, k) and noise (k,) [dB^2], float64.
 
         Args:
-            moving: (B, 3) [m] of the moving end.
-            stations: (T,) int64 numbers.
+            moving: (G, k, 3) places of the moving end [m].
+            stations: (k,) int64, of each place of a group: several of one place, or one of several.
         """
-        count = len(stations)
         posterior, elsewhere = self._conditioned()
-        ends = torch.cat([moving.double().repeat_interleave(count, 0),
-                          torch.from_numpy(self.places[stations]).repeat(len(moving), 1)], 1)  # fmt: skip
-        places, number = self._by_process(ends, torch.from_numpy(stations).repeat(len(moving)))
-        places = places.unflatten(0, (len(moving), count))
-        mean, covariance = torch.zeros(len(moving), count).double(), torch.zeros(len(moving), count, count).double()
-        process = number[:count]
-        for one in process.unique().tolist():
-            at = (process == one).nonzero()[:, 0]
+        still = torch.from_numpy(self.places)[stations].expand(*moving.shape[:2], 3)
+        places = torch.cat([moving.double(), still], 2).flatten(0, 1)
+        places, number = self._by_process(places, stations.repeat(len(moving)))
+        places, number = places.unflatten(0, moving.shape[:2]), number[: len(stations)]
+        groups, count = moving.shape[:2]
+        mean, noise = torch.zeros(groups, count).double(), torch.zeros(count).double()
+        covariance = torch.zeros(groups, count, count).double()
+        for one in number.unique().tolist():
+            at = (number == one).nonzero()[:, 0]
             of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
-            level, left = of.together(places[:, at], one)
-            mean[:, at] = level
+            mean[:, at], left = of.together(places[:, at], one)
             covariance[:, at[:, None], at] = inflation * left
-        return mean, covariance
+            kernel = self.own.prior(one).kernel
+            noise[at] = inflation * kernel.amplitude * kernel.noise
+        return mean, covariance, noise
 
     def answer(self, batch: Batch) -> Posterior:
         """See `ConditionalField`; two stations may stand at one place."""
