@@ -6,11 +6,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
 
 MOST_POINTS = 1500  # measured places that are drawn
 MOST_WALLS = 50_000
+DART = Path([(-0.22, 0.75), (0.0, 0.0), (0.22, 0.75), (0.0, 1.0), (-0.22, 0.75)], closed=True)
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -35,6 +39,20 @@ def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", 
     """Marks at places (n, 2) [m], black unless `how` says another colour."""
     marks = {"marker": "^", "color": "k", "markersize": 9, "markeredgecolor": "white", "linestyle": ""}
     axis.plot(*places.T, label=label, **{**marks, "zorder": 4, **how})
+
+
+def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
+    """A dart at each of places (n, 2) [m] towards its azimuth (n,) [deg from north]."""
+    how: dict[str, Any] = {
+        "linestyle": "",
+        "color": "k",
+        "markeredgecolor": "white",
+        "markersize": 17,
+        "zorder": 4,
+    }
+    for where, turn in zip(places, azimuth, strict=True):
+        axis.plot(*where, marker=MarkerStyle(DART, transform=Affine2D().rotate_deg(-turn)), **how)
+    axis.plot([], [], marker="d", label="sector", **how | {"markersize": 7})
 
 
 def draw_measured(axis: Any, places: np.ndarray) -> None:
