@@ -14,6 +14,7 @@ from matplotlib.transforms import Affine2D
 from scipy.ndimage import distance_transform_edt
 from scipy.ndimage import label as areas_of
 
+from gsparc.data.links.georeference import Georeference
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import (
     OUTLINE,
@@ -22,6 +23,7 @@ from gsparc.evaluation.from_above import (
     draw_measured,
     draw_sectors,
     draw_stations,
+    in_degrees,
     legend_below,
     scale_bar,
 )
@@ -180,8 +182,11 @@ def file_name(layer: Layer) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
 
 
-def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
-    """Save one layer as PNG, over a floor plan."""
+def draw_layer(
+    field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None,
+    degrees: Georeference | None = None,
+) -> None:  # fmt: skip
+    """Save one layer as PNG, over a floor plan; with axes in degrees where `degrees` says how."""
     left, right, low, high = field.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
@@ -195,13 +200,16 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     if layer.words:
         _name_areas(axis, field.grid, layer)
     else:
-        ends = "both" if ((known < legend.low) | (known > legend.high)).any() else "neither"
+        beyond = bool((known < legend.low).any()), bool((known > legend.high).any())
+        ends = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
     bounded(axis, (left, low), (right, high), title=title)
     draw_places(axis, field)
     scale_bar(axis)
+    if degrees is not None:
+        in_degrees(axis, degrees)
     if field.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
     legend_below(figure)
