@@ -1,5 +1,6 @@
 """A network of sectors: what lists of the strongest leave out, patterns, wrong azimuths, a known truth."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,9 +96,22 @@ def test_stations_at_places_of_their_own_are_no_network():
     one = network(0)
     data = one.data(6, azimuths=False)
     assert network_of(data, one.place).site.max() == 9
-    assert network_of(data, one.place + 50 * np.arange(30)[:, None]) is None
+    assert network_of(data, one.place + 500 * np.arange(30)[:, None]) is None
     whole = from_arrays({"rx_position": one.moment, "station_position": one.place, "rssi_db": one.measured})
     assert network_of(whole) is None  # of all stations, not of the strongest
+
+
+def test_sectors_belong_to_a_site_by_name_or_by_a_column():
+    """Sectors on the corners of a roof, more than 5 m apart, were sites of their own."""
+    one = network(0)
+    apart = replace(one, place=one.place + np.tile([[0.0, 0, 0], [20, 0, 0], [0, 20, 0]], (10, 1)))
+    arrays = apart.arrays(6)
+    said = from_arrays(arrays, {"name": "network"})
+    assert network_of(said).site.tolist() == np.repeat(np.arange(10), 3).tolist()
+    names = {"station_name": np.array([f"cell{i}" for i in range(30)])}
+    assert network_of(from_arrays(arrays | names, {"name": "network"})).site.max() == 29
+    column = {"station_site": np.repeat(np.arange(10.0), 3)}
+    assert network_of(from_arrays(arrays | names | column, {"name": "network"})).site.max() == 9
 
 
 def sectors() -> Sectors:
