@@ -78,7 +78,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     if coverage is not None and promise is not None:
         reach = promise.calibration(how.share).reach
-        facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items()}
+        facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
     before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map "
     return finish(run_dir, facts, lines=lines, before=before)
