@@ -11,6 +11,7 @@ from networks import Network, judged, network, reference
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.data.units import in_decibels
+from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, for_links
@@ -51,6 +52,16 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6))
     assert found["rmse"] < 0.7 * plain["rmse"] and abs(found["bias_unlisted"]) < 3
     assert all(0.8 < found[name] < 0.97 for name in ("hold", "hold_listed", "hold_unlisted"))
+    every = method.every()
+    assert every is not None and every.joint() is not None
+    moving = torch.from_numpy(one.asked - method.site.origin)[:, None].expand(-1, 30, 3)
+    level, covariance, noise = every.joint().joint(moving, torch.arange(30))
+    mean, spread = levels(method, one)
+    assert np.allclose(level + 10 * np.log10(method.site.target_scale), mean, atol=1e-3)
+    assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
+    assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
+    assert (covariance[:, 0, 3] == 0).all() and (noise > 0).all()  # of sectors of two sites
+    assert draw_sector_levels(method, one.data(6), np.arange(500), tmp_path / "sectors.png")
     wrong = one.azimuth != network(1, moments=300, asked=120).azimuth
     named = [
         note.split("azimuth of ")[1].split(":")[0]
