@@ -15,7 +15,7 @@ import gsparc
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.baseline_cache import fitting
+from gsparc.evaluation.baselines import fitting
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
 from gsparc.evaluation.scores import score

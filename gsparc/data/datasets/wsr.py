@@ -18,11 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, converted
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_csv
-from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import COMPLEX, FLAGS
+from gsparc.data.raw import Raw
 
 CARRIER_HZ = 5.54e9  # Wi-Fi channel 108
 TONES = np.array([*range(-28, 0, 2), -1, *range(1, 28, 2), 28])  # of 64 that an Intel 5300 reports, at 20 MHz
@@ -39,20 +38,14 @@ LEAST_AGREEMENT = 0.6  # of neighbours: right pairs have .94 or more, others .36
 GAP_M = 0.007  # an eighth of a wavelength without a packet: the root's sign is lost
 AVERAGED = 5  # packets of a row: within 3 mm
 NPZ = {
-    "rx_position": Expected(("S", 3), place=True),
-    "tx_position": Expected(("T", 3), place=True, field="station_position"),
-    "tx_index": Expected(("S",), "iu", field="station"),
-    "segment": Expected(("S",), "iu", field="run"),
-    "h2": Expected(("S", "K"), COMPLEX, field="csi"),
-    "root_sign": Expected(("S", "K"), "iu"),
-    "subcarrier_hz": Expected(("K",), field="frequency_hz"),
-    "good": Expected(("S",), FLAGS, optional=True),
+    **{"rx_position": "rx_position", "tx_position": "station_position", "tx_index": "station"},
+    **{"segment": "run", "h2": "csi", "root_sign": "sign", "subcarrier_hz": "frequency_hz", "good": "good"},
 }
 
 
 @dataclass(frozen=True)
 class Log:
-    """One end's packets: card's and computer's time [s], sender, counter, channel (n, 30) [root of mW]."""
+    """One end's packets: card's and computer's time [s], sender, counter, channel (n, 30, 3) [root of mW]."""
 
     tick: np.ndarray
     time: np.ndarray
@@ -81,10 +74,9 @@ def raw_of_wsr(
     path = Path(path)
     if path.is_dir():
         return _of_release(path, LOS_SET_A if transmitters is None else transmitters, spacing_m)
-    raw = read_raw(path)
-    arrays = check_layout(raw, path, NPZ)
-    arrays["csi"] = np.sqrt(arrays["csi"]) * arrays.pop("root_sign")
-    good = arrays.pop("good", np.ones(len(arrays["run"]))) == 1
+    arrays = converted(path, NPZ).arrays
+    arrays["csi"] = np.sqrt(arrays["csi"]) * arrays.pop("sign")
+    good = arrays.pop("good")
     kept = {name: arrays[name][good] for name in ("rx_position", "station", "run", "csi")}
     return Raw({**arrays, **kept}, {"name": "wsr"})
 
@@ -117,7 +109,7 @@ def _of_release(root: Path, transmitters: Mapping[str, Sequence[float]], spacing
 
 
 def read_log(path: Path) -> Log:
-    """Packets of an Intel 5300, of the first of its three antennas.
+    """Packets of an Intel 5300 with three antennas.
 
     Raises:
         DataError: missing, or its records are of another form.
@@ -146,7 +138,10 @@ def read_log(path: Path) -> Log:
     scale = np.sqrt(heard_mw * len(TONES) / np.maximum(np.sum(np.abs(csi) ** 2, axis=(1, 2)), 1))
     time = records["second"] + 1e-6 * records["microsecond"]
     numbers = records["number"].astype(np.int64)
-    return Log(1e-6 * records["tick_us"], time, records["sender"], numbers, csi[..., 0] * scale[:, None])
+    # Antennas come in the order of the card's receivers, which changes from packet to packet.
+    order = np.argsort(records["order"][:, None] >> [0, 2, 4] & 3, axis=1, kind="stable")
+    csi = np.take_along_axis(csi, order[:, None], axis=2) * scale[:, None, None]
+    return Log(1e-6 * records["tick_us"], time, records["sender"], numbers, csi)
 
 
 def _way(path: Path) -> np.ndarray:
@@ -183,7 +178,7 @@ def _link(
 def _square(robot: Log, other: Log, sender: np.void) -> tuple[float, np.ndarray, np.ndarray]:
     """How well neighbours agree (at most 1), the robot's packets (n,), the square of the channel (n, 30)."""
     mine, theirs, late = _paired(robot, other, sender)
-    square = without_slope(robot.csi[mine] * other.csi[theirs])
+    square = without_slope(robot.csi[mine, :, 0] * other.csi[theirs, :, 0])
     turn, step = np.sum(square[1:] * square[:-1].conj(), axis=1), np.diff(late)
     offsets = np.arange(-MOST_OFFSET_HZ, MOST_OFFSET_HZ, OFFSET_STEP_HZ)  # of the two oscillators [Hz]
     agree = [np.real(np.sum(turn * np.exp(-2j * np.pi * hz * step))) for hz in offsets]

@@ -11,7 +11,6 @@ from campaigns import compose
 from contexts import short
 from known_arrays import spectra
 
-from gsparc.data.files import platform_cache
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import seen_by_array
 from gsparc.models.array_vectors import splat_init
@@ -47,7 +46,7 @@ def process(trained):
     site, places = data.site, data.tx[fold.train]
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
     matrix, partner = steering(site.array, site.grid, site.wavelength).numpy(), mirror_elements(site.array)
-    found, _ = recovered(data, fold.train, platform_cache())  # the same solutions
+    found, _ = recovered(data, fold.train)  # the same solutions
     kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = aligned_by(found.vectors, places, partner, kernel)
     rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])

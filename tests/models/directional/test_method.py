@@ -11,7 +11,7 @@ from releases import REAL
 from rooms import directed
 from scenes import error
 
-from gsparc.data.datasets.newrf import load_newrf
+from gsparc.data.load import load
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.experiment.study import turned
 from gsparc.models.directional.method import DirectionalGP
@@ -203,7 +203,7 @@ def test_the_conference_room_from_43_receivers():
     """A search finds nothing there: NMSE 1.1; a network along the rays leaves 0.17."""
     if not ROOM.exists():
         pytest.skip(f"real data not found at {ROOM}")
-    data = load_newrf(ROOM)
+    data = load({"name": "newrf", "file": str(ROOM)})
     fold = make_split(data.moving, SplitSettings(name="sparse")).folds[0]
     method, _ = fitted(data, fold)
     assert len(fold.train) + len(fold.val) == 43

@@ -11,7 +11,7 @@ from worlds import World, arrays
 from gsparc.commands.train import train
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.scores import score, unseen_runs
 from gsparc.models import loading
 from gsparc.models.gsparc import Gsparc

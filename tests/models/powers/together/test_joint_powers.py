@@ -250,8 +250,6 @@ def test_what_it_refuses():
     own, terms = prior_of(data)
     with pytest.raises(ValueError, match="condition it first"):
         JointPowerField(data.site, POSTS, own, terms, terms).left_out()
-    with pytest.raises(ValueError, match=r"Gaussians along paths.*train again"):  # of an earlier version
-        Terms.read(terms.trend, {**terms.state(), "shadow_db": 1.0})
 
 
 def test_gsparc_learns_stations_together(tmp_path):
