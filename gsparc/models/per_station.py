@@ -262,7 +262,8 @@ class PerStation(Method):
 
     def every(self) -> OfStations | None:
         """One that answers each place for all stations at once (B, T); None: each has a copy of its own."""
-        return OfStations(self._copies[UNHEARD], self.site) if self._shared and self.site else None
+        stations = None if self.site is None else self.site.stations
+        return OfStations(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
 
     def _site_of(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
@@ -344,17 +345,12 @@ class OfStation(View):
         return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
 
 
-class OfStations(View):
+class OfStations(OfStation):
     """A method that knows all stations of powers, asked about each of them at every place."""
 
-    def __init__(self, inner: Method, site: Site) -> None:
-        super().__init__(inner)
-        assert site.stations is not None
-        self.count = len(site.stations)
-
-    def gradient_problem(self) -> str | None:
-        """That of all stations."""
-        return self.inner.gradient_problem()
+    def __init__(self, inner: Method, count: int) -> None:
+        super().__init__(inner, UNHEARD)
+        self.count = count
 
     def joint(self) -> HasJoint | None:
         """What knows how levels of stations go together; None where nothing does."""
