@@ -172,9 +172,9 @@ class Remembering(Method):
     def fit(self, data, fold, run_dir):
         raise NotImplementedError
 
-    def predict(self, tx, rx):
-        self.asked.append(tx.clone())
-        return Prediction(torch.zeros(len(tx), *self.shape))
+    def predict(self, query):
+        self.asked.append(query.tx.clone())
+        return Prediction(torch.zeros(len(query), *self.shape))
 
     def state(self):
         return {}

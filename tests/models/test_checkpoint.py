@@ -43,7 +43,7 @@ def path(fitted, tmp_path):
 def test_predictions_survive_bit_for_bit(fitted, path):
     method, batch = fitted
     again, stored = loading.load(path)
-    before, after = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
+    before, after = method.predict(batch), again.predict(batch)
     assert torch.equal(before.mean, after.mean) and torch.equal(before.variance, after.variance)
     assert stored.method == "gp" and stored.site.grid == method.site.grid
     for name in ("origin", "box", "static_position", "rx_rotation"):

@@ -14,7 +14,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.drawing import logarithmic, look, panels
@@ -93,9 +94,9 @@ class Recorded(View):
         super().__init__(inner)
         self.means: list[Tensor] = []
 
-    def answer(self, batch: Batch) -> Prediction:
-        """See `Method.answer`."""
-        prediction = self.inner.answer(batch)
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
+        prediction = self.inner.predict(query)
         self.means.append(prediction.mean)
         return prediction
 
