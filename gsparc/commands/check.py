@@ -12,8 +12,8 @@ from rich.console import Console
 
 from gsparc.data.errors import Caution, DataError, gathered
 
-SETTINGS = ("dataset.stations_file=", "dataset.columns.", "dataset.not_heard=", "dataset.absent=")
-SWITCH = re.compile(r"dataset\.(\w+)=(true|false)", re.IGNORECASE)
+SETTING = re.compile(r"dataset\.([\w.]+)=(.*)", re.DOTALL)
+NUMBER = re.compile(r"[-+]?[.\d]+(?:e[-+]?\d+)?", re.IGNORECASE)
 
 
 def check(
@@ -76,6 +76,14 @@ def _line(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True, emoji=False)
 
 
+def _value(text: str) -> Any:
+    """A setting's numbers, truth value or word."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    numbers = [float(one) for one in NUMBER.findall(text)]
+    return numbers if text.startswith("[") else numbers[0] if numbers else text
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; exit status 0 when everything given is good, else 1."""
     parser = argparse.ArgumentParser(prog="gsparc check", description=__doc__)
@@ -90,19 +98,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_intermixed_args(arguments)
     columns = dict(text.partition("=")[::2] for text in args.column)
     settings: dict[str, Any] = {}
-    for said in filter(None, map(SWITCH.fullmatch, args.path[:])):
+    for said in filter(None, map(SETTING.fullmatch, args.path[:])):  # as refusals and notes say them
         args.path.remove(said[0])
-        settings[said[1]] = said[2].lower() == "true"
-    for text in [text for text in args.path if text.startswith(SETTINGS)]:  # as refusals and notes say them
-        name, _, value = text.removeprefix("dataset.").partition("=")
-        args.path.remove(text)
-        if name == "stations_file":
-            args.stations_file = value
-        elif "." not in name:
-            marks = re.findall(r"[-+.\de]+", value)
-            settings[name] = value if name == "absent" else [float(mark) for mark in marks]
+        if said[1] == "stations_file":
+            args.stations_file = said[2]
+        elif said[1].startswith("columns."):
+            columns[said[1].removeprefix("columns.")] = said[2]
         else:
-            columns[name.removeprefix("columns.")] = value
+            settings[said[1]] = _value(said[2])
     if not args.path:
         parser.error("name a file or a folder, too")
     if args.draw is not None and (len(args.path) > 1 or not args.draw.lower().endswith(".png")):

@@ -356,7 +356,8 @@ def _scaled(
     """The target as stored and the constant it was divided by (0 for silence); censored rows are levels."""
     mask_or_level = mask
     if censored is not None:
-        mask_or_level = censored[:, None] if mask is None else mask | censored[:, None]
+        bound = censored[:, None] != 0
+        mask_or_level = bound if mask is None else mask | bound
     if mask_or_level is not None:
         values = np.where(mask_or_level, values, np.zeros((), values.dtype))
     if values.dtype == np.uint8:

@@ -116,7 +116,8 @@ class Checker:
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
         """(S, 3) or (3,) float64 [m]."""
         if name not in self.raw.arrays:
-            return self.refuse(name, f"missing; expected {FIELDS[name].shape} [{FIELDS[name].unit}]")
+            remedy = "; or say dataset.tx_position=[X,Y,Z]" if name == "tx_position" else ""
+            return self.refuse(name, f"missing; expected {FIELDS[name].shape} [{FIELDS[name].unit}]{remedy}")
         array = self.real(name, (3,), (rows, 3))
         if array is None:
             return None
@@ -146,7 +147,7 @@ class Checker:
         mask = array.astype(bool)
         empty = ~mask.reshape(len(mask), -1).max(axis=1)
         if censored is not None:
-            empty &= ~censored
+            empty &= censored == 0
         self.refuse_rows("mask", empty, "nothing measured; expected a True, or drop the row")
         return mask
 
@@ -154,7 +155,8 @@ class Checker:
         """(K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` of them (None without csi)."""
         frequency = self.real("frequency_hz", (), (None,) if count is None else (count,))
         if count is not None and "frequency_hz" not in self.raw.arrays:
-            self.refuse("frequency_hz", f"missing; csi needs the {count} frequencies [Hz]")
+            fault = f"missing; csi needs the {count} frequencies [Hz]; or say dataset.frequency_hz=[...]"
+            self.refuse("frequency_hz", fault)
         carrier = self.real("carrier_hz", ())
         if frequency is not None and carrier is not None and frequency.size:
             away = np.abs(frequency)

@@ -56,7 +56,7 @@ class Links:
         static_end: which end the stations, or the one static end, are; None where both move.
         stations: in world coordinates; None where there is one static end, or none.
         station, place: (S,) int64, see `Measurements`; None without stations.
-        censored: (S,) bool; None where nothing is.
+        censored: (S,) int8, see `Measurements`; None where nothing is.
         run: (S,) int64; None without runs.
         unknown_transmitter: powers of a transmitter whose place nobody gave.
         georeference: of the world's origin, where places came in degrees.
@@ -227,8 +227,9 @@ class Measurements:
         station: (S,) int64, which of `site.stations` a row is of; None where there is one.
         place: (S,) int64, the number of the place that a row is of: one place, several stations, or visits;
             None where every row is one.
-        censored: (S,) bool, True where a power was below what can be heard: the target is that level, and its
-            mask is False. None where nothing is.
+        censored: (S,) int8, 1 where a power was below what can be heard and the target is that level, -1
+            where the receiver was saturated and the power is above the target, 0 where it was measured; the
+            mask of the former two is False. None where nothing is.
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
         position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
             where positions count as exact.
@@ -261,6 +262,10 @@ class Measurements:
         if self.site.static_end is None:
             return np.hstack([self.tx, self.rx_position])
         return self.tx if self.site.moving_end == "tx" else self.rx_position
+
+    def side(self, rows: np.ndarray) -> np.ndarray:
+        """`censored` of rows (n,), (n,) int8."""
+        return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
 
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
         """Targets of the given rows as float32 or complex64, in stored units."""

@@ -28,8 +28,8 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     mean_db, spread_db = in_decibels(mean[known], variance[known])
     row = scores.row[known]
     power = data.target[row, 0].astype(np.float64) * data.site.target_scale
-    silent = np.zeros(len(row), bool) if data.censored is None else data.censored[row]
-    heard = ~silent & (power > 0)
+    silent = data.side(row) > 0
+    heard = (data.side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}
     if heard.any():
         half = norm.ppf((1 + SHARE) / 2) * spread_db[heard]
@@ -53,11 +53,11 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
 
 def levels(data: Measurements) -> np.ndarray | None:
     """Level (T,) [dB] below which each station hears nothing, NaN where it heard all; None without any."""
-    if data.censored is None or not data.censored.any():
+    rows = np.flatnonzero(data.side(np.arange(len(data))) > 0)
+    if not len(rows):
         return None
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
     level = np.full(1 if data.site.stations is None else len(data.site.stations), np.nan)
-    rows = np.flatnonzero(data.censored)
     level[station[rows]] = 10 * np.log10(data.target[rows, 0].astype(np.float64) * data.site.target_scale)
     return level
 

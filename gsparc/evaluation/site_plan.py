@@ -78,6 +78,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
         power * data.site.target_scale if data.site.kind == "rssi" else (power * data.site.target_scale) ** 2
     )
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
+    heard = heard | (data.side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
     value = power[row, entry]
     if data.site.kind == "rssi":

@@ -58,15 +58,15 @@ def snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     measured = measured.to(torch.complex128) if measured.is_complex() else measured.double()
     if site.kind == "rssi":
         measured = _decibels(measured)
-    silent = torch.from_numpy(np.zeros(len(rows), bool) if data.censored is None else data.censored[rows])
+    side = torch.from_numpy(data.side(rows))
     if data.mask is not None:
-        mask = compared(torch.from_numpy(data.mask[rows])) | silent[:, None]
+        mask = compared(torch.from_numpy(data.mask[rows])) | (side != 0)[:, None]
         measured = torch.where(mask, measured, torch.full_like(measured, np.nan))
     values = torch.full((len(first), count, measured.shape[1]), np.nan, dtype=measured.dtype)
     values[which, station] = measured
     quiet = torch.zeros(values.shape, dtype=torch.bool)
-    quiet[which, station] = silent[:, None]
-    own = _without_silence(values.flatten(1), quiet.flatten(1) if silent.any() else None)
+    quiet[which, station] = (side > 0)[:, None]
+    own = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
     return Snapshots(site.kind, *own, data.moving[rows][first], rows[first])
 
 

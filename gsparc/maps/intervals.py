@@ -31,12 +31,12 @@ class Evidence:
     """Rows predicted by models that did not learn from the block of places around them.
 
     Attributes:
-        level_db: (n,) measured [dB]; of silent rows, the level they lie below.
+        level_db: (n,) measured [dB]; of censored rows, the level they lie below or above.
         mean_db, spread_db: (n,) predicted, and its deviation [dB].
         distance: (n,) to the nearest place that was learned from [m].
         block: (n,) int64, rows of one were held out together.
         station: (n,) int64; 0 where there is one.
-        silent: (n,) bool, nothing was heard.
+        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
     """
 
     level_db: np.ndarray
@@ -45,7 +45,7 @@ class Evidence:
     distance: np.ndarray
     block: np.ndarray
     station: np.ndarray
-    silent: np.ndarray
+    side: np.ndarray
 
     def __len__(self) -> int:
         return len(self.level_db)
@@ -56,14 +56,14 @@ class Evidence:
 
     @property
     def error(self) -> np.ndarray:
-        """Measured less predicted (n,), in deviations; of silent rows the least it can be in size."""
+        """Measured less predicted (n,), in deviations; of censored rows the least it can be in size."""
         error = (self.level_db - self.mean_db) / self.spread_db
-        return np.where(self.silent, np.minimum(error, 0.0), error)
+        return np.where(self.side != 0, self.side * np.minimum(self.side * error, 0.0), error)
 
     @property
     def informative(self) -> np.ndarray:
-        """Rows (n,) bool that bound an error: heard, or predicted above the level they lie below."""
-        return ~self.silent | (self.level_db < self.mean_db)
+        """Rows (n,) bool that bound an error: measured, or predicted on the wrong side of their level."""
+        return (self.side == 0) | (self.side * (self.level_db - self.mean_db) < 0)
 
     def state(self) -> dict[str, Any]:
         """For the `extra` of a checkpoint."""
@@ -84,7 +84,7 @@ class Calibration:
         distance: (K,) middles of bins [m].
         half: (K,) half of an interval, in deviations.
         rms: (K,) expected error, in deviations.
-        tail: (Q,) quantiles `TAIL` of errors in expected errors; None where silent rows hide some of them.
+        tail: (Q,) quantiles `TAIL` of errors in expected errors; None where censored rows hide some of them.
         reach: beyond this distance nothing is said [m].
         station: (T,) what deviations of each are multiplied with before; of those not among them, 1.
     """
@@ -151,7 +151,7 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     weight = np.array([len(one) for one in bins], float)
     half, rms = (_rising(middle, one * typical, weight) / typical for one in (half, rms))
     tail = None
-    if not evidence.silent.any():
+    if not evidence.side.any():
         standard = used.error / np.interp(used.distance, middle, rms)
         tail = np.quantile(standard, TAIL)
         tail = tail + np.arange(len(tail)) * 1e-9 * max(float(size.max()), 1.0)  # no two are equal
@@ -181,7 +181,7 @@ def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.n
 def covered(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     """Rows (n,) bool whose measurement lies in the interval, and widths (n,) [dB], NaN where nothing is said.
 
-    A silent row is in an interval that reaches below its level.
+    A censored row is in an interval that reaches beyond its level.
     """
     half = calibration.interval(evidence.spread_db, evidence.distance, evidence.station)
     inside = np.abs(evidence.error * evidence.spread_db) <= half
@@ -198,7 +198,7 @@ class Coverage:
         reached: share of all rows that lay in reach.
         rows, blocks: tried.
         own_share, own_width_db: of the intervals that the model states by itself.
-        heard_share, silent_share: of the rows with a level, and of those below one; NaN of none.
+        heard_share, silent_share: of the rows with a level, and of those beyond one; NaN of none.
     """
 
     share: float
@@ -227,7 +227,7 @@ def cross_validated(evidence: Evidence, share: float) -> Coverage:
         float(inside[known].mean()), float(width[known].mean()), float(known.mean()), int(known.sum()),
         len(blocks), float(own[known].mean()), float(2 * half * evidence.spread_db[known].mean()),
         *(float(inside[part].mean()) if part.any() else np.nan
-          for part in (known & ~evidence.silent, known & evidence.silent)),
+          for part in (known & (evidence.side == 0), known & (evidence.side != 0))),
     )  # fmt: skip
 
 

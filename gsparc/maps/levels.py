@@ -45,18 +45,18 @@ def predicted(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[n
 
 
 def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level (n,) [dB] of rows (n,), NaN where nothing was measured, and which (n,) bool lie below theirs."""
+    """Level (n,) [dB] of rows (n,), NaN where nothing was measured, and `Measurements.side` of these."""
     target = np.abs(data.target[rows].reshape(len(rows), -1)).astype(np.float64) * data.site.target_scale
     power = target if data.site.kind == "rssi" else target**2
-    silent = np.zeros(len(rows), bool) if data.censored is None else data.censored[rows]
+    side = data.side(rows)
     if data.mask is not None:
-        seen = data.mask[rows].reshape(power.shape) | silent[:, None]
+        seen = data.mask[rows].reshape(power.shape) | (side != 0)[:, None]
         power = np.where(seen, power, np.nan)
     known = np.isfinite(power)
     mean = np.where(known, power, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = np.where(mean > 0, 10 * np.log10(mean), np.nan)
-    return level, silent
+    return level, side
 
 
 def joint_of(method: Method) -> HasJoint | None:

@@ -318,7 +318,7 @@ def _usual(
         own = promise.evidence.at(np.flatnonzero(promise.evidence.station == number))
         if len(own):
             usual[row] = own.level_db.mean(), own.level_db.std()
-            quiet = own.level_db[own.silent]
+            quiet = own.level_db[own.side > 0]
             floor[row] = max(least, quiet.max() if len(quiet) else np.quantile(own.level_db, 0.01))
     return usual, floor
 

@@ -175,10 +175,10 @@ def new_station_error(
         inner = Fold(known[~own], known[:0], known[own])
         learned = without(method, make, data, inner, context)
         parts.append(evidence_of(learned, data, inner, np.full(int(own.sum()), one)))
-    errors = [(one.level_db - one.mean_db)[~one.silent] for one in parts]
+    errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
     means = np.array([error.mean() for error in errors if len(error)])
     pairs = zip(errors, means, parts, strict=False)
-    inside = [(error - mean) / one.spread_db[~one.silent] for error, mean, one in pairs]
+    inside = [(error - mean) / one.spread_db[one.side == 0] for error, mean, one in pairs]
     within = float(np.sqrt(np.mean(np.concatenate(inside) ** 2)))
     return NewStation(float(np.sqrt(np.mean(means**2))), within, len(means))
 

@@ -167,10 +167,10 @@ def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarra
     """Of the test rows of a fold, which `method` was fitted to; `block` (n,) says which belong together."""
     rows, known = fold.test, np.concatenate([fold.train, fold.val])
     mean, spread = predict_rows(method, data, rows)
-    level, silent = measured(data, rows)
+    level, side = measured(data, rows)
     station = station_of(data, rows)
     far = distances(data.moving[known], station_of(data, known), data.moving[rows], station)
-    evidence = Evidence(level, mean, spread, far, block, station, silent)
+    evidence = Evidence(level, mean, spread, far, block, station, side)
     return evidence.at(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
 
 

@@ -45,7 +45,8 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
     budget = context.time_budget()
     errors, folds, most = [], budget.effort.station_folds, budget.effort.station_rows
     for inner in cut_inside(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
-        learned, queries = (heard(data, part) for part in (np.union1d(inner.train, inner.val), inner.test))
+        learned = heard(data, np.union1d(inner.train, inner.val))
+        queries = inner.test[data.side(inner.test) == 0]
         if len(learned) > most:
             learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:most])
         own = replace(context, run_dir=Path(), resume=None, budget_s=budget.left_s)

@@ -18,7 +18,7 @@ TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Targets of `rows` in stored type and units; unmeasured entries get the mean over the other rows.
 
-    Many large ones of a file stay on disk. Rows where nothing was heard (`data.censored`) keep their level.
+    Many large ones of a file stay on disk. Rows of which only a level is known (`data.censored`) keep it.
 
     Returns:
         (n, ...) like `data.target`; an entry measured in no row is 0.
@@ -29,7 +29,7 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
     measured = data.mask[rows]
     total = np.where(measured, target, 0).sum(0) / np.maximum(measured.sum(0), 1)
     if data.censored is not None:
-        measured = measured | data.censored[rows].reshape(-1, *(1,) * (target.ndim - 1))
+        measured = measured | (data.side(rows) != 0).reshape(-1, *(1,) * (target.ndim - 1))
     return np.where(measured, target, total.astype(target.dtype))
 
 
@@ -67,23 +67,19 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     return variance
 
 
-def silent(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Where of rows (n,) nothing was heard, (n,) bool."""
-    return np.zeros(len(rows), bool) if data.censored is None else data.censored[rows]
-
-
 def heard(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Those of rows (n,) where something was heard, in their order."""
-    return rows[~silent(data, rows)]
+    """Those of rows (n,) where something was heard, in their order; a saturated one counts as its level."""
+    return rows[data.side(rows) <= 0]
 
 
 def left_out_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     """What a reader must know of a fit to `heard(data, rows)`; nothing where all of rows (n,) were heard."""
-    count = int(silent(data, rows).sum())
-    return (f"{count} rows where nothing was heard are not learned from",) if count else ()
+    side, notes = data.side(rows), {1: "where nothing was heard are not learned from"}
+    notes[-1] = "in saturation are learned from as if measured at that level"
+    return tuple(f"{n} rows {said}" for one, said in notes.items() if (n := int((side == one).sum())))
 
 
 def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
-    """Powers of rows (n,) in decibels, levels where nothing was heard."""
+    """Powers of rows (n,) in decibels, levels where they are censored."""
     decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
-    return Rows(data.moving[rows], decibels, silent(data, rows))
+    return Rows(data.moving[rows], decibels, data.side(rows))

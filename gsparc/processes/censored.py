@@ -1,6 +1,6 @@
-"""A Gaussian vector of which some entries are known and others only to lie below a level.
+"""A Gaussian vector of which some entries are known and others only to lie below or above a level.
 
-Expectation propagation: each factor "below the level" is replaced by a Gaussian that gives the same mean
+Expectation propagation: each factor "beyond the level" is replaced by a Gaussian that gives the same mean
 and variance together with all others (T. Minka, "Expectation propagation for approximate Bayesian inference",
 UAI 2001; Rasmussen and Williams 2006, section 3.6; for truncated Gaussians J. P. Cunningham et al., "Gaussian
 probabilities and expectation propagation", 2011). Noise belongs to the vector's covariance, so the factors
@@ -52,11 +52,11 @@ def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
 
 
-def propagate(known: ConditionalGaussian, level: Tensor) -> Sites:
-    """Stand-ins for "below `level`" (m,) of the unknown entries of a Gaussian vector."""
+def propagate(known: ConditionalGaussian, level: Tensor, side: Tensor | float = 1.0) -> Sites:
+    """Stand-ins for "below `level`" (m,), or "above" where `side` is -1, of a vector's unknown entries."""
     mean, covariance = known.mean, known.covariance
     total = covariance.diagonal()
-    value, variance = _sites(mean, total, level)
+    value, variance = _sites(mean, total, level, side)
     settled, before = False, mean
     for _ in range(MOST_SWEEPS):
         factor = Factor.of(covariance + torch.diag(variance), "raise")
@@ -64,7 +64,7 @@ def propagate(known: ConditionalGaussian, level: Tensor) -> Sites:
         weights = factor.inverse @ (value - mean)
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
-        result, wide = _sites(cavity, cavity_variance, level)
+        result, wide = _sites(cavity, cavity_variance, level, side)
         settled = bool(((cavity - before).abs() / total.sqrt()).max() < SETTLED)
         if settled:
             break
@@ -74,16 +74,16 @@ def propagate(known: ConditionalGaussian, level: Tensor) -> Sites:
         variance = 1 / both
     apart = cavity_variance + variance
     evidence = -0.5 * (((value - mean) @ weights) + factor.log_determinant)
-    evidence += torch.special.log_ndtr((level - cavity) / cavity_variance.sqrt()).sum()
+    evidence += torch.special.log_ndtr(side * (level - cavity) / cavity_variance.sqrt()).sum()
     evidence += 0.5 * (apart.log() + (cavity - value).square() / apart).sum()
     return Sites(value, variance, float(evidence), settled)
 
 
-def _sites(mean: Tensor, variance: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
-    """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of their lower parts."""
+def _sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of the parts allowed."""
     deviation = variance.sqrt()
-    ratio, lost = truncated((level - mean) / deviation)
-    return mean - deviation * ratio / lost, variance * (1 - lost) / lost
+    ratio, lost = truncated(side * (level - mean) / deviation)
+    return mean - side * deviation * ratio / lost, variance * (1 - lost) / lost
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ class ConditionalGaussian:
         return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
 
 
-def log_evidence(gram: Tensor, values: Tensor, unknown: Tensor) -> tuple[float, Tensor, Tensor]:
-    """Logarithm of the probability of known values and of the rest below their levels.
+def log_evidence(gram: Tensor, values: Tensor, side: Tensor) -> tuple[float, Tensor, Tensor]:
+    """Logarithm of the probability of known values and of the rest beyond their levels.
 
     Returns:
         It, its slopes by `gram`, and minus its slopes by values and levels.
@@ -134,16 +134,17 @@ def log_evidence(gram: Tensor, values: Tensor, unknown: Tensor) -> tuple[float, 
 
     Args:
         gram: (n, n) covariance with noise.
-        values: (n,) known values, levels where `unknown`.
-        unknown: (n,) bool.
+        values: (n,) known values, or levels.
+        side: (n,) 0 where known, 1 below the level, -1 above it.
     """
+    unknown = side != 0
     if not unknown.any():
         factor = Factor.of(gram, "raise")
         weights = factor.solved(values[:, None])[:, 0]
         value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
     known = ConditionalGaussian.of(gram, values, unknown)
-    sites = propagate(known, values[unknown])
+    sites = propagate(known, values[unknown], side[unknown])
     extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
     inverse = Factor.of(gram + torch.diag(extra), "raise").inverse
     weights = inverse @ values.masked_scatter(unknown, sites.value)

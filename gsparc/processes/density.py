@@ -74,12 +74,12 @@ class LeftOutDensity(torch.autograd.Function):
 
 
 class Evidence(torch.autograd.Function):
-    """Negative logarithm of the probability of values, some of them only below a level."""
+    """Negative logarithm of the probability of values, some of them only beyond a level."""
 
     @staticmethod
-    def forward(ctx: Any, gram: Tensor, values: Tensor, unknown: Tensor) -> Tensor:
+    def forward(ctx: Any, gram: Tensor, values: Tensor, side: Tensor) -> Tensor:
         """See `log_evidence`."""
-        value, slope, weights = log_evidence(gram.detach(), values.detach(), unknown)
+        value, slope, weights = log_evidence(gram.detach(), values.detach(), side)
         ctx.save_for_backward(slope, weights)
         return gram.new_tensor(-value)
 

@@ -26,6 +26,7 @@ LEAST_SILENT, MOST_SILENT = (
     200,
     3_000,
 )  # of them, where nothing was heard: no more than were heard, but for few
+BOUNDS = {1: "where nothing was heard are below", -1: "in saturation are above"}
 REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
 
 
@@ -35,13 +36,18 @@ class Rows:
 
     Attributes:
         places: (n, 3) of the moving end, or (n, 6) of both [m].
-        decibels: (n,) powers, or levels where `silent` [dB].
-        silent: (n,) bool, True where nothing was heard.
+        decibels: (n,) powers, or levels [dB].
+        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
     """
 
     places: np.ndarray
     decibels: np.ndarray
-    silent: np.ndarray
+    side: np.ndarray
+
+    @property
+    def silent(self) -> np.ndarray:
+        """Rows (n,) bool of which a level is known, not a power."""
+        return self.side != 0
 
     def at(self, chosen: np.ndarray) -> Self:
         """The rows `chosen`."""
@@ -49,7 +55,7 @@ class Rows:
 
     @property
     def loud(self) -> Self:
-        """Those that were heard."""
+        """Those that were measured."""
         return self.at(np.flatnonzero(~self.silent))
 
     def drawn(self, most: int, seed: int) -> Self:
@@ -218,15 +224,14 @@ def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[Po
         posterior.values()[quiet],
         torch.ones(int(quiet.sum()), dtype=torch.float64),
     )
-    of = f"of {int(rows.silent.sum())} silent rows {int(part.silent.sum())}, drawn evenly, are looked at"
+    of = f"of {int(rows.silent.sum())} censored rows {int(part.silent.sum())}, drawn evenly, are looked at"
     nearest = given(prior, values, seed, stand_ins, posterior.extra[quiet])
     return PowerProcess(nearest, heard), (note, of, *notes)
 
 
 def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
-    notes: list[str] = []
-    if rows.silent.any():
-        notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
+    counts = {said: int((rows.side == side).sum()) for side, said in BOUNDS.items()}
+    notes = [f"{count} rows {said} their level" for said, count in counts.items() if count]
     places, decibels, extra, factor = _with_pseudo_values(rows, prior, seed, notes)
     posterior = Exact.of(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
@@ -247,7 +252,8 @@ def _with_pseudo_values(
     gram.diagonal().add_(prior.kernel.noise)
     unit = (decibels - mean) / deviation
     known, level = ConditionalGaussian.of(gram, unit, silent), unit[silent]
-    doubt = known.doubt(level)
+    side = torch.from_numpy(rows.side)[silent]
+    doubt = side * known.doubt(level)
     near = (doubt < CERTAIN).nonzero()[:, 0]
     most = min(max(int((~silent).sum()), LEAST_SILENT), MOST_SILENT)
     if len(near) > most:
@@ -255,7 +261,7 @@ def _with_pseudo_values(
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):
-        sites = propagate(known.at(near), level[near])
+        sites = propagate(known.at(near), level[near], side[near])
         decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
         extra = extra.index_put((at,), sites.variance)
         if not sites.settled:

@@ -134,8 +134,8 @@ class Viewed:
             values = np.concatenate([data.targets(part).flatten(1).mean(1).numpy() for part in chunks])
             label, error_label = "mean of a measured spectrum", "PSNR of test rows [dB]"
         else:
-            values, silent = levels.measured(data, rows)
-            values[silent] = np.nan
+            values, side = levels.measured(data, rows)
+            values[side > 0] = np.nan
             what = "received power" if data.site.kind == "rssi" else "power of a channel"
             label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
         errors = np.full(len(rows), np.nan)

@@ -133,4 +133,4 @@ def test_slots_of_neighbours_become_rows(tmp_path):
     reading = read_any(write(tmp_path / "drive.csv", heads, rows))
     data = reading.data
     assert set(data.site.stations.name) == {str(c + 10) for c in np.unique(order)} | set()
-    assert (~data.censored).sum() == 299 and "299 rows of 100 moments" in " ".join(reading.notes)
+    assert (data.censored == 0).sum() == 299 and "299 rows of 100 moments" in " ".join(reading.notes)

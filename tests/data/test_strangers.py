@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from scipy.io import savemat
 
-from gsparc.commands.check import check
+from gsparc.commands.check import check, main
 from gsparc.data.datasets.own import Own, read_any
 from gsparc.data.own import write_own
 
@@ -47,6 +47,7 @@ def long(heads: str, *more, level=LEVELS[:, 0], places=PLACES) -> str:
 
 
 FLOOR = RNG.integers(0, 3, ROWS)
+FARTHER = AWAY[:, 1] > AWAY[:, 2]
 BAND = RNG.integers(0, 2, ROWS)
 ZERO = np.where(np.arange(ROWS)[:, None] < 12, 0, np.c_[NORTH, EAST])
 HALF = np.where(np.arange(ROWS)[:, None] < ROWS * 0.6, 0, np.c_[NORTH, EAST])
@@ -159,6 +160,8 @@ CASES = {
         "2 stations, 2 of them at unknown places: 7 1, 7 0",
         "",
     ),
+    "an area and a CI": (long("LAC,CI", BAND, 7 + 0 * BAND), {}, "2 stations", ""),
+    "a confidence interval": (long("CI", 7 + BAND), {}, "stays       the transmitter", "stations"),
     "columns that are said": (
         long("site,antenna", 7 + 0 * BAND, BAND),
         {"columns": {"station": "site+antenna"}},
@@ -170,6 +173,18 @@ CASES = {
         {},
         "dataset.columns.station=site+antenna tells them apart",
         "",
+    ),
+    "two cells of one name": (
+        long("site,layer", "a" * ROWS, FARTHER, level=np.where(FARTHER, LEVELS[:, 2], LEVELS[:, 1])),
+        {},
+        "another place for each value of column 'layer': dataset.columns.station=site+layer tells them apart",
+        "",
+    ),
+    "streets of one cell": (
+        long("site,street", "a" * ROWS, np.digitize(PLACES[:, 0], [15, 30, 45])),
+        {},
+        "1 stations",
+        "warning",
     ),
     "hopping": (
         long("gateway,freq_mhz", ["g"] * ROWS, RNG.choice([867.1, 868.1, 868.5], ROWS)),
@@ -274,7 +289,24 @@ def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):
     data = read_any(write(wide(100))).data
     assert data.censored.sum() == 394 and (data.censored == DEAF.ravel()).all()
     level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
-    assert abs(level[~data.censored].min() - LEVELS[~DEAF].min()) < 1e-3  # of float32
+    assert abs(level[data.censored == 0].min() - LEVELS[~DEAF].min()) < 1e-3  # of float32
+
+
+def test_saturated_levels_were_learned_and_scored_as_measured(write):
+    path = write(long("t", range(ROWS), level=np.minimum(LEVELS[:, 0], -76)))
+    found, plain, given = (read_any(path, saturation_db=one).data for one in ("auto", "none", -79.5))
+    level = 10 * np.log10(found.target[:, 0] * found.site.target_scale)
+    assert plain.censored is None and plain.mask is None
+    for data, least in ((found, -76), (given, -79.5)):
+        above = LEVELS[:, 0] >= least
+        assert (data.censored == np.where(above, -1, 0)).all() and (data.mask[:, 0] == ~above).all()
+    np.testing.assert_allclose(level, np.minimum(LEVELS[:, 0], -76), atol=1e-3)
+
+
+@pytest.mark.parametrize("setting", ["full", 900])
+def test_a_level_of_saturation_that_is_none_is_refused(write, setting):
+    found = said(write(long("t", range(ROWS))), saturation_db=setting)
+    assert f"dataset.saturation_db={setting!r}: a number of at least -400 and at most 400" in found
 
 
 def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
@@ -363,6 +395,7 @@ STRANGERS = {
     "silent_200.csv": "exactly -200",
     "silent_NP.csv": "514 of 720 levels are 'NP'",
     "c10_compound.h5": "good",
+    "c10_ampphase.csv": "tx_position: missing; expected (3,), (S, 3), (2,) or (S, 2) [m]; or say dataset.tx",
 }
 
 
@@ -371,3 +404,17 @@ def test_a_file_of_a_stranger(name):
     if not (GIVEN / name).exists():
         pytest.skip(f"{GIVEN / name} is not there")
     assert STRANGERS[name] in said(GIVEN / name)
+
+
+def test_places_and_tones_that_a_file_lacks_can_be_said(capsys):
+    path = GIVEN / "c10_ampphase.csv"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    given = ["dataset.tx_position=[5,3,1.5]", "dataset.frequency_hz=[2.4e9,2.401e9,2.402e9,2.403e9]"]
+    assert main([str(path), *given, "--no-draw"]) == 0
+    assert "1 antenna x 4 subcarriers" in capsys.readouterr().out
+
+
+def test_groups_of_places_were_said_twice(write, caplog):
+    Own(write(long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES))).load()
+    assert sum("groups of places" in record.getMessage() for record in caplog.records) == 1

@@ -228,6 +228,14 @@ def test_the_dataset_own_reads_tables(write):
     assert len(data) == 30 and data.site.static_end == "tx" and data.row_names[0] == "line 2"
 
 
+def test_line_breaks_in_quoted_cells_were_refused(write):
+    heads = '"Latitude\n(deg)",lon,"RSRP\r\n[dBm]",note'
+    table = understand_table(write(heads + '\n48.1,16,-80,"a\nb ""c"", d"\n48.2,16,"-81",\n'))
+    assert table.raw.arrays["rssi_db"].tolist() == [-80, -81]
+    assert table.raw.arrays["row_name"].tolist() == ["line 4", "line 6"]
+    assert any("'RSRP [dBm]' taken as rssi_db" in note for note in table.notes)
+
+
 # What is in the file, settings, and words of the line that refuses it.
 SPOILT = {
     "empty": ("", {}, "empty; expected a line of heads"),
@@ -240,6 +248,8 @@ SPOILT = {
     "a line too short": ("x,y,rssi\n1,2,-80\n1,2\n", {}, "line 3 (2 cells): expected 3 cells"),
     "decimal commas between commas": ("x,y\n1,5,2,5\n2,5,3,5\n", {}, "2 heads, but every line below has 4"),
     "an open quote": ('x,y,rssi\n1,2,"-80\n3,4,-81\n', {}, "line 2: a quotation mark is not closed"),
+    "two open quotes": ('x,y,rssi\n1,"2,-80\n3,"4,-81\n', {}, "line 2: a quotation mark is not closed"),
+    "path losses in short": ("x,y,PL [dB]\n1,2,80\n", {}, "dataset.columns.rssi_db=PL [dB]*-1 takes losses"),
     "two columns of one name": ("x,y,x,rssi\n1,2,3,-80\n", {}, "columns 1 and 3 are both named 'x'"),
     "mixed decimal marks": (
         "x;y;rssi\n1,5;2;-80,5\n1,6;2;-80.5\n", {}, "column 'rssi', line 3: '-80.5': is no finite number; this",

@@ -343,7 +343,7 @@ def rows_of(data: Measurements) -> list[tuple]:
     names = [""] * len(data) if stations is None else [stations.name[t] for t in data.station]
     run = np.zeros(len(data)) if data.run is None else data.run
     values = data.target.reshape(len(data), -1).astype(complex) * data.site.target_scale
-    heard = np.ones(len(data)) if data.censored is None else ~data.censored
+    heard = np.ones(len(data)) if data.censored is None else data.censored == 0
     return list(zip(names, run, heard, ends, values, strict=True))
 
 

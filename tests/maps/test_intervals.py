@@ -65,15 +65,17 @@ def test_outage_follows_the_errors_and_not_a_bell():
         assert abs(said - np.mean(known.level_db < below)) < 0.03
 
 
-def test_silent_rows_bound_errors_from_below():
+@pytest.mark.parametrize("side", [1, -1])
+def test_silent_and_saturated_rows_bound_errors_from_below(side):
     known = evidence()
-    silent = known.level_db < -72
-    level = np.where(silent, -72.0, known.level_db)
-    found = calibrate(Evidence(**{**vars(known), "silent": silent, "level_db": level}))
+    bound = side * known.level_db < -side * 71 - 1
+    level = np.where(bound, -71.0 - side, known.level_db)
+    parts = {**vars(known), "side": side * bound.astype(np.int8), "level_db": level}
+    found = calibrate(Evidence(**parts))
     assert found.tail is None and found.half[0] > 0
-    high = Evidence(**{**vars(known), "silent": silent, "level_db": level, "mean_db": known.mean_db - 10})
-    assert high.informative[~silent].all() and not high.informative[silent].any()
-    assert (high.error[silent] == 0).all()
+    right = Evidence(**{**parts, "mean_db": known.mean_db - 10 * side})
+    assert 0 < bound.sum() < len(known) and right.informative[~bound].all()
+    assert not right.informative[bound].any() and (right.error[bound] == 0).all()
 
 
 def test_too_little_evidence_promises_nothing():

@@ -148,7 +148,7 @@ def test_sectors_that_err_together_are_told_apart():
 
 
 def test_twenty_one_stations_had_twenty_colours():
-    """Those of neighbours were shades of one hue: areas side by side have different ones of ten, and names."""
+    """Those of neighbours were shades of one hue: areas side by side have different ones, and names."""
     classes = np.kron(np.arange(24.0).reshape(4, 6), np.ones((6, 6)))
     found = shades(classes, 24)
     assert found.min() >= 0 and found.max() < 10

@@ -76,11 +76,35 @@ def test_silent_rows_tell_of_a_half_silent_town(model, margin):
     assert 0.84 < np.mean(inside) < 0.96, np.mean(inside)  # of 90 %
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_saturated_rows_were_learned_as_measured(model):
+    """The strongest 8.6 %, as one receiver in flight had them: too weak by 5 dB about the station."""
+    data, true, _ = town()
+    level = np.where(data.censored, true, 10 * np.log10(data.target[:, 0] * data.site.target_scale))
+    arrays = {"rx_position": data.rx_position + data.site.origin, "tx_position": STATION}
+    top = np.quantile(level, 0.914)
+    error = {}
+    for how in ("none", "auto"):
+        clipped = from_arrays(arrays | {"rssi_db": np.minimum(level, top)}, {"saturation_db": how})
+        found = predicted(model, clipped, fold_of(clipped).train, np.arange(len(clipped)))
+        error[how] = (found[0] - true)[level > top]
+    assert any("in saturation are above their level" in note for note in found[2]) == ("gp" in model)
+    assert np.abs(error["auto"]).mean() < 0.7 * np.abs(error["none"]).mean()
+
+
 def test_the_process_says_what_it_did_with_silent_rows():
     data, _, silent = town(200)
     rows = np.arange(len(data))
     notes = predicted(MODELS[1], data, rows, rows)[2]
     assert f"gp: {silent.sum()} rows where nothing was heard are below their level" in notes
+
+
+def test_baselines_take_saturated_rows_as_measured_and_say_so():
+    data, _, silent = town(60)
+    rows, above = np.arange(60), replace(data, censored=-silent.astype(np.int8))
+    fold = Fold(rows, rows[:0], rows[:5])
+    notes = build({"_target_": "gsparc.models.baselines.mean.Mean"}).fit(above, fold, FitContext()).notes
+    assert notes == (f"{silent.sum()} rows in saturation are learned from as if measured at that level",)
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_silent_rows_stay_known_and_are_counted(many):
     silent = data.target[:, 0] < level
     rows = Rows(data.moving, 10 * np.log10(np.where(silent, level, data.target[:, 0])).astype(float), silent)
     process, notes = conditioned(rows, Trend(-100.0), KERNEL, 0)
-    assert any("of 90 silent rows 30, drawn evenly, are looked at" in note for note in notes), notes
+    assert any("of 90 censored rows 30, drawn evenly, are looked at" in note for note in notes), notes
     loud = rows.at(np.flatnonzero(~silent))
     deaf = given(loud)
     truth = 10 * np.log10(data.target[silent, 0])

@@ -37,7 +37,8 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     if site.target_scale != 1:
         lines.append(("scale", f"stored targets are the measurements divided by {site.target_scale:.4g}"))
     if data.censored is not None:
-        lines.append(("censored", f"{data.censored.sum()} of {len(data)} powers were too weak to be heard"))
+        counts = [f"{(data.censored == side).sum()} of {len(data)} powers were too" for side in (1, -1)]
+        lines.append(("censored", f"{counts[0]} weak to be heard, {counts[1]} strong to be measured"))
     if data.run is not None:
         lines.append(("runs", f"{data.run.max() + 1}, each with an unknown complex factor of its own"))
     if data.mask is not None and data.censored is None:
@@ -137,7 +138,8 @@ def suspicious_values(data: Measurements) -> list[str]:
     if not np.ptp(data.moving, axis=0).any():
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is None:  # degrees became metres: no unit to mistake
-        hints = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3] + site.origin)
+        places, zones = ends[np.isfinite(ends).all(axis=1)], data.provenance.get("zones", "")
+        hints = _units(places, zones) or _units(data.moving[:, :3] + site.origin, zones)
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
@@ -160,8 +162,8 @@ def suspicious_values(data: Measurements) -> list[str]:
     return hints
 
 
-def _units(positions: np.ndarray) -> list[str]:
-    """Warnings that positions (n, 3), in the world, may not be metres."""
+def _units(positions: np.ndarray, zones: str) -> list[str]:
+    """Warnings that positions (n, 3), in the world, may not be metres; `zones` is a column of a table."""
     extent, middle = np.ptp(positions, axis=0), np.abs(np.median(positions[:, :2], axis=0))
     height, width, across = float(extent[2]), float(extent.max()), float(extent[:2].max())
     reach = np.abs(positions[:, :2]).max(axis=0)
@@ -173,7 +175,9 @@ def _units(positions: np.ndarray) -> list[str]:
         ]
     groups = outliers.two_groups(positions[:, :2])
     if groups is not None:
-        return [f"two groups of places {groups[1] / 1e3:.4g} km apart: zones of a projection, or two sites?"]
+        by = f", as column {zones!r} says" if zones else ""
+        said = f"two groups of places {groups[1] / 1e3:.4g} km apart{by}"
+        return [f"{said}: zones of a projection, or two sites? give degrees, or a file for each"]
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)

@@ -63,10 +63,7 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
     warnings = []
     different, counts = np.unique(values, return_counts=True)
-    least, most = (f"{round(float(value), 6) + 0:g}" for value in different[[0, -1]])
-    if counts[-1] > max(SATURATED * len(values), 10, 5 * counts[-2]):
-        share = f"{counts[-1]} of {len(values)} levels are exactly {most}, the most"
-        warnings.append(f"{share}: a receiver in saturation? the field is stronger there; leave them out")
+    least = f"{round(float(different[0]), 6) + 0:g}"
     usual = max(5 * float(np.median(counts)), 3 * counts[1])
     if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, usual):
         share = f"{counts[0]} of {len(values)} levels are exactly {least}"
@@ -87,6 +84,13 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     elif low >= 0 and (values % 1 == 0).all():
         warnings.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
     return warnings
+
+
+def saturation(values: np.ndarray) -> float | None:
+    """The highest of levels (n,) where it repeats as no level of a receiver does by chance."""
+    different, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+    piled = len(counts) > 1 and counts[-1] > max(SATURATED * counts.sum(), 10, 5 * counts[-2])
+    return float(different[-1]) if piled else None
 
 
 def not_heard(values: np.ndarray) -> list[float]:
@@ -369,7 +373,7 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     with np.errstate(divide="ignore"):
         level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
     link, called = which.reshape(-1) * count + station, data.row_names
-    rows = np.arange(len(data)) if data.censored is None else np.flatnonzero(~data.censored)
+    rows = np.flatnonzero(data.side(np.arange(len(data))) <= 0)
     absent = np.zeros(0, np.int64)
     # What was not heard is known to be weak; a file with a station for each place has no empty cells.
     if data.censored is None and len(first) < len(data):

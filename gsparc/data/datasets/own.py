@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +21,7 @@ from gsparc.data.datasets.wifi_csi import raw_of_wifi_csi
 from gsparc.data.datasets.wsr import raw_of_wsr
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.files import Several
-from gsparc.data.limits import choice, or_null, switch
+from gsparc.data.limits import choice, finite, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
 from gsparc.data.tables import is_table
@@ -33,9 +34,7 @@ def raw_of_own(
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
-    not_heard: Sequence[float] | None = None,
-    absent: str = "auto",
-    **conventions: bool | None,
+    **settings: Any,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
 
@@ -44,17 +43,14 @@ def raw_of_own(
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
         cell_m: of Parquet, also a folder or a URL of it: means of rows [dB] by cells of this side [m].
-        not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
-        absent: `silent`: a station without a row at a place where others have one was not heard there;
-            `auto`: one that a list of the strongest leaves out is below its weakest; `unknown`: neither.
-        **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
+        **settings: see `understood`.
 
     Raises:
         DataError: bad input, or a file of another campaign.
-        SettingError: another word for `absent`.
+        SettingError: see `understood`.
     """
     raw, notes = raw_of(path, columns, stations_file, cell_m)
-    raw = understood(raw, not_heard, absent, **conventions)
+    raw = understood(raw, **settings)
     campaign = campaign_of(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
@@ -67,23 +63,45 @@ def understood(
     raw: Raw,
     not_heard: Sequence[float] | None = None,
     absent: str = "auto",
+    saturation_db: float | str = "auto",
+    tx_position: Sequence[float] | None = None,
+    frequency_hz: float | Sequence[float] | None = None,
     **conventions: bool | None,
 ) -> Raw:
-    """The same with what settings say of the file; see `raw_of_own`."""
+    """The same with what settings say of the file.
+
+    Args:
+        raw: as it was read.
+        not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
+        absent: `silent`: a station without a row at a place where others have one was not heard there;
+            `auto`: one that a list of the strongest leaves out is below its weakest; `unknown`: neither.
+        saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where it
+            repeats; `none`: there is none.
+        tx_position: of a transmitter that stood still, where the file does not say it [m].
+        frequency_hz: of the tones, likewise [Hz].
+        **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
+
+    Raises:
+        SettingError: another word for `absent`, or for a convention.
+    """
     choice("auto", "unknown", "silent").check("dataset.absent", absent)
-    said: dict[str, Any] = {} if not_heard is None else {"not_heard": [float(mark) for mark in not_heard]}
+    said: dict[str, Any] = {} if not_heard is None else {"not_heard": finite(not_heard).reshape(-1).tolist()}
     said |= {} if absent == "auto" else {"absent": absent}
+    said |= {} if saturation_db == "auto" else {"saturation_db": saturation_db}
     for name, follows in conventions.items():
         or_null(switch()).check(f"dataset.{name}", follows)
     followed = [name for name, follows in conventions.items() if follows]
     said |= {"conventions": " ".join(followed)} if followed else {}
-    return replace(raw, attributes={**raw.attributes, **said})
+    given = {"tx_position": tx_position, "frequency_hz": frequency_hz}
+    arrays = {name: finite(value) for name, value in given.items() if value is not None}
+    return replace(raw, arrays={**raw.arrays, **arrays}, attributes={**raw.attributes, **said})
 
 
 class Own(Campaign):
     """Measurements of one's own; suspicious units are warned of. Settings of `raw_of_own` and `Campaign`."""
 
-    choice, reader, switches = "own", staticmethod(raw_of_own), tuple(CONVENTIONS)
+    choice, reader = "own", staticmethod(raw_of_own)
+    switches = tuple(inspect.signature(understood).parameters)[1:-1] + tuple(CONVENTIONS)
 
 
 LOADERS: dict[str, Callable[[Path], Raw]] = {

@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.blocks import is_big
-from gsparc.data.checks.plausibility import degree_warnings, not_heard
+from gsparc.data.checks.plausibility import degree_warnings, not_heard, saturation
 from gsparc.data.errors import Caution, lines_of, some
+from gsparc.data.limits import number, or_word
 from gsparc.data.links.georeference import Georeference, bad_degrees
 from gsparc.data.links.stations import SECTOR, by_carrier, ends_of, numbered, station_of_row, station_table
 from gsparc.data.links.strongest import Lists, moments
@@ -25,6 +26,7 @@ POWERS = ("rssi", "rssi_db")
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 LEAST_LISTED = 3  # stations, for lists of the strongest
+SATURATION = or_word(or_word(number(-400, 400), "auto"), "none")  # [dB]
 UNLISTED_EACH = 2  # rows of what is not listed for one that is
 STATION_FIELDS = (
     "station",
@@ -190,9 +192,7 @@ def _with_unlisted(check: Checker, links: Links, of_level: np.ndarray) -> tuple[
         return links, of_level
     floor = np.full(count, levels[heard].min() if level is None else np.min(level))
     if level is not None:
-        floor[links.station] = np.broadcast_to(level, (len(np.atleast_1d(level)),))[
-            of_level * (level.size > 1)
-        ]
+        floor[links.station] = level.reshape(-1)[of_level * (level.size > 1)]
     most = UNLISTED_EACH * len(heard)
     of_list, station, below = lists.unlisted(floor, links.stations.position, most)
     like = np.r_[heard, heard[lists.first[of_list]]]
@@ -277,14 +277,34 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     return silent
 
 
+def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Which of levels (S,) are at least the file's, or the found, level of saturation, (S,) bool."""
+    given = check.raw.attributes.get("saturation_db", "auto")
+    SATURATION.check("dataset.saturation_db", given)
+    level = saturation(values[known]) if given == "auto" else None if given == "none" else float(given)
+    if level is None:
+        return np.zeros(len(values), bool)
+    above = known & (values.astype(np.float32) >= np.float32(level))
+    said = f"{int(above.sum())} of {int(known.sum())} levels are"
+    if given == "auto":
+        said += f" exactly {level:.6g}, the most: a receiver in saturation? taken as at least that"
+        check.notes.append(Caution(f"{said}; dataset.saturation_db=none takes them as measured"))
+    else:
+        check.notes.append(f"{said} {level:g} dB or more: saturated, taken as at least that")
+    check.raw.arrays["rssi_db"] = np.where(above, level, values)
+    return above
+
+
 def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
-    """Rows without a missing value; censored ones hold the level below which nothing is heard, masked."""
+    """Rows without a missing value; censored ones hold the level that they lie below or above, masked."""
     values, arrays = check.raw.arrays[measured], check.raw.arrays
     level = check.real("sensitivity_db", (), (count,), values.shape[:1])
     if "sensitivity_db" in arrays and level is None:
         return None
     if level is not None and measured != "rssi_db":
         return check.refuse("sensitivity_db", f"goes with rssi_db, not with {measured}")
+    if measured != "rssi_db" and not isinstance(check.raw.attributes.get("saturation_db", "auto"), str):
+        return check.refuse("dataset.saturation_db", f"goes with rssi_db, not with {measured}")
     by_row = level is not None and level.shape == values.shape != (count,)
     if level is not None and by_row:  # what was heard needs none
         level = np.where(np.isnan(level) & np.isfinite(values), values, level)
@@ -303,12 +323,14 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
     unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
     marked = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
-    censored = np.zeros(len(values), bool)
+    censored = saturated = np.zeros(len(values), bool)
     if measured == "rssi_db" and values.ndim == 1 and values.dtype.kind in "iuf":
         unheard = _without_marks(check, values, level) & marked
         unknown |= unheard
         if level is None and unheard.any() and np.isfinite(values[~unheard]).any():
             level, censored = values[~unheard & np.isfinite(values)].min(), unheard
+        saturated = _saturated(check, values, ~unknown & marked)
+        values = arrays[measured]
     if level is not None:
         censored = censored if censored.any() else unknown & marked
         of_row = level if by_row else np.atleast_1d(level)[of_level if level.size > 1 else 0]
@@ -332,7 +354,8 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     keep = marked & ~lost
     if silent and values.any():
         keep &= values.any(axis=axes)
-    if not (keep & ~censored).any():
+    side = censored.astype(np.int8) - saturated
+    if not (keep & (side == 0)).any():
         why = "nothing was heard in any row" if censored.any() else "nothing was measured"
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
@@ -342,10 +365,10 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         parts = {name: getattr(links, name) for name in ("station", "place", "run")}
         pick = {name: value[keep] for name, value in parts.items() if value is not None}
         links = replace(links, **pick)
-        censored = censored[keep]
-    if censored.any():
-        arrays["mask"] = ~censored if "mask" not in arrays else arrays["mask"].astype(bool) & ~censored
-        return replace(links, censored=censored)
+        side = side[keep]
+    if side.any():
+        arrays["mask"] = arrays.get("mask", np.ones(len(side), bool)).astype(bool) & (side == 0)
+        return replace(links, censored=side)
     return links
 
 
@@ -361,36 +384,31 @@ def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, ce
         weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
         check.notes.append(text + weak)
     if censored.any():
-        check.notes.append(
-            f"{int(censored.sum())} of {len(keep)} powers were not heard: below sensitivity_db"
-        )
+        count = int(censored.sum())
+        check.notes.append(f"{count} of {len(keep)} powers were not heard: below sensitivity_db")
 
 
 def _heights(check: Checker) -> bool:
     """2-D positions get their stated height; False where it is missing (noted)."""
-    arrays = check.raw.arrays
-    good = True
+    arrays, before = check.raw.arrays, len(check.problems)
     for end in ("rx", "tx", "station"):
         name, height = f"{end}_position", f"{end}_height"
         flat = name in arrays and arrays[name].ndim in (1, 2) and arrays[name].shape[-1] == 2
         if not flat:
             if height in arrays:
                 check.refuse(height, f"given, but {name} has three coordinates or is missing")
-                good = False
             continue
         if height not in arrays:
             check.refuse(name, f"two coordinates; expected three, or the height above ground as {height} [m]")
-            good = False
             continue
         above = check.real(height, (), (len(arrays[name]),) if arrays[name].ndim == 2 else ())
         if above is None:
-            good = False
             continue
         place = arrays[name].astype(np.float64)
         column = np.broadcast_to(above, place.shape[:-1])[..., None]
         arrays[name] = np.concatenate([place, column], axis=-1)
         arrays.pop(height)
-    return good
+    return len(check.problems) == before
 
 
 def _run(check: Checker, rows: int) -> np.ndarray | None:

@@ -15,6 +15,7 @@ import pandas as pd
 from gsparc.data.errors import Caution, some
 from gsparc.data.tables.heads import (
     AXES,
+    BESIDE,
     END_WORDS,
     ENDS,
     KINDS,
@@ -114,7 +115,9 @@ def choose(
         if head not in used_heads and head in labelled:
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
-        if not role or (only is not None and role not in only) or _settled(role, chosen):
+        areas = TOGETHER[meaning.word] if meaning.word in BESIDE else set()
+        alone = bool(areas) and not any(areas & set(words_of(other)) for other in sheet.heads)
+        if not role or alone or (only is not None and role not in only) or _settled(role, chosen):
             continue
         if meaning.strange:
             expected = known(KINDS[role])

@@ -40,15 +40,16 @@ def _by_word(table: dict[str, str]) -> dict[str, str]:
 
 STATION_WORDS = _words(
     "station site tower mast sensor gateway gw gtw bs cell enb enodeb gnb ap wap anchor pci psc bsic bssid "
-    "netid cid eci nci cgi sector beacon"
+    "netid cid ci eci nci cgi sector beacon"
 )
+BESIDE = ("ci",)  # of a station only beside a word of its area: it may be a confidence interval
 LESS = ("mac", "eui")  # of a station where nothing else names it
 # Columns whose values together name a station: the first is unique only beside one of the second.
 TOGETHER = {
     word: set(parts.split())
     for words, parts in (
         ("pci psc bsic", "earfcn arfcn uarfcn nrarfcn dlarfcn channel freq frequency"),
-        ("cell cid sector", "lac tac area enb enodeb gnb site"),
+        ("cell cid ci sector", "lac tac area enb enodeb gnb site"),
         ("bssid mac ap netid", "band"),
     )
     for word in words.split()

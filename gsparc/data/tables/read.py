@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
 
 from gsparc.data.checks.outliers import two_groups
 from gsparc.data.errors import Caution, nearest, some
@@ -30,7 +29,7 @@ from gsparc.data.tables.columns import (
     schema_unit,
     station_names,
 )
-from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, PERCENT, about, words_of
+from gsparc.data.tables.heads import PERCENT, words_of
 from gsparc.data.tables.places import (
     PER_STATION,
     UNKNOWN_HEIGHT,
@@ -42,6 +41,7 @@ from gsparc.data.tables.places import (
 )
 from gsparc.data.tables.sheet import Sheet, read_parquet, sheet_of
 from gsparc.data.tables.slots import unfolded
+from gsparc.data.tables.splitting import splitting
 
 NOTHING: Mapping[str, object] = {}
 
@@ -87,22 +87,8 @@ def understand_table(
         about |= {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
         if not power.unit.name.startswith("x "):  # a column that is scaled has the schema's unit
             about["unit"] = power.unit.name
+    about |= {"zones": builder.zones} if builder.zones else {}
     return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
-
-
-MOST_GROUPS = 12  # values of a column that may tell stations apart
-LEAST_APART_DB = 6.0  # beyond what levels of one group differ by between neighbours
-NEAR, LEAST_ROWS = 4, 10  # neighbours looked at; rows of pairs within and between groups
-
-
-def groups_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> float:
-    """How much more levels (n,) [dB] differ between neighbours (n, 2) of two groups than of one, median."""
-    if len(level) <= NEAR:
-        return 0.0
-    near = cKDTree(places).query(places, k=NEAR + 1)[1][:, 1:]
-    apart, same = np.abs(level[near] - level[:, None]), group[near] == group[:, None]
-    few = min(same.sum(), (~same).sum()) < NEAR * LEAST_ROWS
-    return 0.0 if few else float(np.median(apart[~same]) - np.median(apart[same]))
 
 
 TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
@@ -117,7 +103,7 @@ class Builder:
         self.refuse = sheet.refuse
         self.notes: list[str] = []
         self.arrays: dict[str, np.ndarray] = {}
-        self.tones = np.zeros(1, int)
+        self.tones, self.zones = np.zeros(1, int), ""
 
     def build(self) -> dict[str, np.ndarray]:
         """All arrays; what is wrong is in `sheet.problems`."""
@@ -138,7 +124,7 @@ class Builder:
         if role is None:
             fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
             for head in self.sheet.heads:
-                if {"loss", "pathloss"} & set(words_of(head)):
+                if {"loss", "pathloss", "pl"} & set(words_of(head)):
                     return self.refuse(f"{fault}; dataset.columns.rssi_db={head}*-1 takes losses for levels")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
@@ -227,7 +213,7 @@ class Builder:
             return
         stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
-        self._groups(where)
+        self.zones = self._zones(where)
         if stations is not None:
             self._add_stations(stations, where.degrees)
         self._splitting(measured, where, None if stations is None else stations.index)
@@ -241,36 +227,28 @@ class Builder:
         words = {head: self.sheet.words(head) for head in self.sheet.heads if head and head not in used}
         return {head: text for head, text in words.items() if (text != text[0]).any()}
 
-    def _groups(self, where: Places) -> None:
-        """Warn of two groups of places far apart, and say which column tells them apart."""
+    def _zones(self, where: Places) -> str:
+        """Head of a column that tells two groups of places far apart from each other; empty without."""
         groups = None if where.degrees else two_groups(where.across)
         if groups is None:
-            return
+            return ""
         for head, words in self._unused().items():
             values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
             if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
-                said = f"two groups of places {groups[1] / 1e3:.4g} km apart, as column {head!r} says"
-                self.notes.append(Caution(f"{said}: zones of a projection? give degrees, or a file for each"))
+                return head
+        return ""
 
     def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
-        """Warn of unused columns whose groups have levels of their own at the places of one station."""
+        """Warn of unused columns whose groups have levels or places of their own within one station."""
         if measured not in LEVELS or self.arrays[measured].ndim > 1:
             return
         level = self.arrays[measured]
         station = np.zeros(len(level), int) if station is None else station
         stretch = np.cos(np.radians(np.nanmedian(where.across[:, 0]))) if where.degrees else 1.0
         names = [column.head or "" for column in self.chosen.get("station", ())]
-        for head, words in self._unused().items():
-            values, group = np.unique(words, return_inverse=True)
-            if about(head) or (NO_LEVEL | LEVEL_WORDS) & set(words_of(head)) or len(values) > MOST_GROUPS:
-                continue
-            known = np.isfinite(level) & (words != "")
-            of = [known & (station == t) for t in np.unique(station)]
-            apart = [groups_apart(where.across[t] * [1, stretch], level[t], group.reshape(-1)[t]) for t in of]
-            if max(apart) > LEAST_APART_DB:
-                said = f"levels at equal places differ by {max(apart):.0f} dB between values of column"
-                how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
-                self.notes.append(Caution(f"{said} {head!r}: {how}"))
+        for head, said in splitting(where.across * [1, stretch], level, station, self._unused()):
+            how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
+            self.notes.append(Caution(f"{said}: {how}"))
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
@@ -404,10 +382,7 @@ class Builder:
 
     def _note_silent(self, where: str, names: list[str]) -> None:
         if names:
-            many = f"{len(names)} " * (len(names) > 8)
-            self.notes.append(
-                f"{many}listed, but {where}: {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
-            )
+            self.notes.append(f"listed, but {where}: {some(names, 8)}")
 
     def _second_in_degrees(self, ends: dict[str, Places]) -> Places | None:
         """Of two ends in degrees, the one with fewer places, which are then stations."""

@@ -313,15 +313,28 @@ def _decoded(path: Path) -> tuple[str, str]:
 def _lines(text: str, source: str) -> tuple[Lines, str]:
     """The lines, and the last comment before the first of them."""
     lines: Lines = {}
-    comment = ""
+    comment, number = "", 1
+    text = QUOTED.sub(_in_one_line, text) if '"' in text else text
     # Not str.splitlines, which also ends lines at characters that may stand in a cell.
-    for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
+    for line in re.split(BREAK, text):
         stripped = checked_line(source, number, line).strip()
         if stripped.startswith(COMMENTS) and not lines:
             comment = stripped.lstrip("#%/ ")
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
-            lines[number] = line
+            lines[number] = line.replace(BROKEN, " ")
+        number += 1 + line.count(BROKEN)
     return lines, comment
+
+
+BREAK, BROKEN = r"\r\n|\n|\r", "\x1f"
+QUOTED = re.compile(r'(?m)(?:^|(?<=[,;\t|])) *"[^"]*(?:""[^"]*)*"(?= *(?:[,;\t|\r\n]|\Z))')
+MOST_BROKEN = 20  # lines of a cell: of more, a quotation mark was not closed
+
+
+def _in_one_line(cell: re.Match[str]) -> str:
+    """A quoted cell with `BROKEN` for breaks of lines; as it is where they are too many."""
+    one, count = re.subn(BREAK, BROKEN, cell[0])
+    return one if count < MOST_BROKEN else cell[0]
 
 
 MINUS = re.compile(r"(?<![^\s,;|\"'])[\u2212\u2013\u2010\u2011\ufe63\uff0d](?=\s?[\d.,])")
@@ -434,8 +447,7 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
     """All cells; quotes that stay open, and lines with more or fewer cells than heads, are refused."""
     for n, line in lines.items():
         if line.count('"') % 2:
-            fault = "a quotation mark is not closed on this line; close it, or remove the line break in"
-            raise DataError(f"{source}, line {n}: {fault} the cell")
+            raise DataError(f"{source}, line {n}: a quotation mark is not closed; close it, or double it")
     cells = [_cells(line, delimiter) for line in lines.values()]
     count, *counts = map(len, cells)
     if counts and len(set(counts)) == 1 and counts[0] != count:

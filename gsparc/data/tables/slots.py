@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from gsparc.data.errors import some
 from gsparc.data.tables.heads import unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 
@@ -69,5 +70,4 @@ def unfolded(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
         sheet, heads=(*kept, *whole.columns), columns=tuple(series),
         rows=tuple(sheet.rows[i] for i in row[order]),
     )  # fmt: skip
-    shown = ", ".join(repr(name) for name in list(slots)[:3])
-    return result, [f"slots {shown}{', ...' * (len(slots) > 3)}: {len(row)} rows of {len(sheet)} moments"]
+    return result, [f"slots {some([*map(repr, slots)], 3)}: {len(row)} rows of {len(sheet)} moments"]

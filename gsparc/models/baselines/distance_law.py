@@ -3,9 +3,9 @@
 The log-distance law of path loss, T. S. Rappaport, "Wireless Communications", 2nd ed. (2002), section 4.9,
 with residuals of Huber's density, Gaussian within `CORNER` scales and exponential beyond: an outlier bends
 little, and skewed shadowing is not cut off as Student's t cuts it (P. J. Huber, "Robust estimation of a
-location parameter", Ann. Math. Stat. 35 (1964)). Where nothing was heard the likelihood is that of a power
-below the level (J. Tobin, "Estimation of relationships for limited dependent variables", Econometrica 26
-(1958)).
+location parameter", Ann. Math. Stat. 35 (1964)). Where nothing was heard, or a receiver was saturated, the
+likelihood is that of a power below or above the level (J. Tobin, "Estimation of relationships for limited
+dependent variables", Econometrica 26 (1958)).
 """
 
 from __future__ import annotations
@@ -65,21 +65,24 @@ def log_below(z: np.ndarray) -> np.ndarray:
     return np.where(z < -CORNER, far, np.log(near)) - math.log(MASS)
 
 
-def misfit(residual: np.ndarray, silent: np.ndarray, scale: float) -> tuple[float, np.ndarray, float]:
-    """Negative log likelihood of residuals (n,) [dB], its slopes by each residual (n,) and by log(scale)."""
+def misfit(residual: np.ndarray, side: np.ndarray, scale: float) -> tuple[float, np.ndarray, float]:
+    """Negative log likelihood of residuals (n,) [dB], its slopes by each residual (n,) and by log(scale).
+
+    Where `side` (n,) is 1 or -1 the residual is of a level that the power lies below or above.
+    """
     z = residual / scale
     influence = np.clip(z, -CORNER, CORNER)
     density = influence * (influence / 2 - z) - math.log(MASS)
-    below = log_below(z)
-    value = -float(np.where(silent, below, density - math.log(scale)).sum())
-    slope = np.where(silent, -np.exp(density - below), influence)
-    return value, slope / scale, float((~silent).sum() - (slope * z).sum())
+    beyond = log_below(np.where(side < 0, -z, z))  # the density is symmetric
+    value = -float(np.where(side, beyond, density - math.log(scale)).sum())
+    slope = np.where(side, side * -np.exp(density - beyond), influence)
+    return value, slope / scale, float((side == 0).sum() - (slope * z).sum())
 
 
 def _posterior(p: np.ndarray, decades: np.ndarray, rows: Rows) -> tuple[float, list[float], np.ndarray]:
     """Negative log posterior of level, exponent and log scale, its slopes by these and by residuals (n,)."""
     residual = rows.decibels - p[0] + 10 * p[1] * decades
-    value, slope, by_scale = misfit(residual, rows.silent, math.exp(p[2]))
+    value, slope, by_scale = misfit(residual, rows.side, math.exp(p[2]))
     away = (p[1] - USUAL) / SPREAD
     slopes = [-slope.sum(), 10 * (slope * decades).sum() + away / SPREAD, by_scale]
     return value + 0.5 * away**2, slopes, slope
@@ -142,7 +145,7 @@ def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
     low, high = rows.places.min(0), rows.places.max(0)
     size = max(float(np.linalg.norm(high - low)), TINY_M)
     bounds = np.stack([low - size, high + size], 1)
-    loud = np.argsort(np.where(rows.silent, -np.inf, rows.decibels))[::-1]
+    loud = np.argsort(np.where(rows.side > 0, -np.inf, rows.decibels))[::-1]
     starts = [rows.places[loud[0]], rows.places[loud[: max(1, len(loud) // 20)]].mean(0)]
     starts += list(rng.uniform(low - size / 2, high + size / 2, (STARTS, 3)))
     tiny = (1e-3 * size) ** 2  # a row on the very place must not decide alone
@@ -186,17 +189,17 @@ class DistanceLaw(Differentiable):
     uses_censored = True
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
+        return self._learn_censored(positions, targets, np.zeros(len(targets), np.int8))
 
     def _learn_censored(
-        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+        self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
     ) -> tuple[str, ...]:
         assert self.site is not None
         if self.kind != "rssi":
             raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
         started = TimeBudget()
         decibels = to_real(targets, "rssi")[:, 0].astype(np.float64)
-        self.law, notes = law_of(Rows(positions, decibels, silent), self.site)
+        self.law, notes = law_of(Rows(positions, decibels, side), self.site)
         law = self.law
         summary = (
             f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "

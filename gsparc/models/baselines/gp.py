@@ -163,10 +163,10 @@ class GaussianProcess(Differentiable):
         return tuple(f"gp: {note}" for note in (settings, fit_note, scheme, basis))
 
     def _learn_censored(
-        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+        self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
     ) -> tuple[str, ...]:
         assert self.site is not None
-        rows = Rows(positions, to_real(targets, self.kind)[:, 0].astype(np.float64), silent)
+        rows = Rows(positions, to_real(targets, self.kind)[:, 0].astype(np.float64), side)
         self.powers, notes = fit_powers(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 

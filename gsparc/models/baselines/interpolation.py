@@ -13,7 +13,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import from_real, heard, left_out_note, silent, training_targets
+from gsparc.models.target_rows import from_real, heard, left_out_note, training_targets
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -46,10 +46,10 @@ class Interpolator(Method):
             raise ValueError(f"{self.name}: the training set is empty")
         start = TimeBudget()
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
-        places, targets, unheard = data.moving[rows], training_targets(data, rows), silent(data, rows)
+        places, targets, side = data.moving[rows], training_targets(data, rows), data.side(rows)
         before = set(vars(self))
-        if unheard.any():
-            notes = self._learn_censored(places, targets, unheard)
+        if self.uses_censored and side.any():
+            notes = self._learn_censored(places, targets, side)
         else:
             notes = (*self._learn(places, targets), *left_out_note(data, known))
         lost = sorted(set(vars(self)) - before - set(self.stored))
@@ -97,9 +97,9 @@ class Interpolator(Method):
         """From positions (n, 3) float64 [m] and stored targets (n, ...); returns notes for the report."""
 
     def _learn_censored(
-        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+        self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
     ) -> tuple[str, ...]:
-        """The same where nothing was heard in the rows `silent` (n,), whose targets are levels."""
+        """The same where targets are levels of rows `side` (n,), see `Measurements.censored`."""
         raise NotImplementedError(f"{self.name}: learns nothing from rows where nothing was heard")
 
     @abstractmethod

@@ -236,14 +236,14 @@ def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
 def _weighed(rows: Rows, one: Candidate) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest."""
     distance, terms, values = _views(rows, one.trend)
-    silent = torch.from_numpy(rows.silent)
-    most = max(AMPLITUDES_DB2[1], 4 * float(values[~silent].square().mean()))
+    side = torch.from_numpy(rows.side)
+    most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = bounds_of(len(one.kernel.lengths), distance.numpy())
     bounds.append((math.log(AMPLITUDES_DB2[0]), math.log(most)))
 
     def objective(at: Tensor) -> Tensor:
         gram = at[-1].exp() * gram_of(at[:-1], distance, terms)
-        return Evidence.apply(gram, values[:, 0], silent) / len(values)  # type: ignore[no-untyped-call]
+        return Evidence.apply(gram, values[:, 0], side) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(one.kernel.parameters(), math.log(one.kernel.amplitude))
     best, value = walked(objective, [start], bounds, EVIDENCE_LOOKS, EVIDENCE_SETTLED)

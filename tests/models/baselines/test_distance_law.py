@@ -96,12 +96,12 @@ def test_the_density_has_mass_one_and_its_variance():
 
 def test_slopes_of_the_misfit():
     rng = np.random.default_rng(1)
-    residual, silent = 6 * rng.standard_normal(40), rng.random(40) < 0.5
-    _, slope, by_scale = misfit(residual, silent, 2.0)
+    residual, side = 6 * rng.standard_normal(40), rng.integers(-1, 2, 40)
+    _, slope, by_scale = misfit(residual, side, 2.0)
     step = 1e-5 * rng.standard_normal(40)
-    ends = [misfit(residual + sign * step, silent, 2.0)[0] for sign in (-0.5, 0.5)]
+    ends = [misfit(residual + sign * step, side, 2.0)[0] for sign in (-0.5, 0.5)]
     assert slope @ step == pytest.approx(ends[1] - ends[0], rel=1e-4)
-    ends = [misfit(residual, silent, 2.0 * np.exp(sign * 1e-5))[0] for sign in (-0.5, 0.5)]
+    ends = [misfit(residual, side, 2.0 * np.exp(sign * 1e-5))[0] for sign in (-0.5, 0.5)]
     assert by_scale == pytest.approx((ends[1] - ends[0]) / 1e-5, rel=1e-4)
 
 

@@ -81,7 +81,7 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Network 
     near = (apart <= SAME_SITE_M) | ((apart <= SAME_NAME_M) & (stem[:, None] == stem))
     near |= sector[:, None, 5] == sector[:, 5]  # as a column of the list says
     site = connected_components(near)[1].astype(np.int64)
-    levels = () if data.censored is None else np.unique(data.target[data.censored])
+    levels = () if data.censored is None else np.unique(data.target[data.censored > 0])
     several = 2 * (np.bincount(site)[site] > 1).sum() >= len(site) and len(levels) > len(site)
     if not several and not np.isfinite(sector[:, 0]).any():
         return None  # levels of rows are of lists: a receiver has one for each station
@@ -156,8 +156,9 @@ def learn_network(
 def _misfit(mean: Tensor, rows: LinkRows, scale: Tensor) -> Tensor:
     """Negative log likelihood of each row (..., n), independent of the others."""
     z = (torch.from_numpy(rows.decibels) - mean) / scale
-    below = -torch.special.log_ndtr(z)
-    return torch.where(torch.from_numpy(rows.silent), below, 0.5 * z.square() + torch.log(scale))
+    side = torch.from_numpy(rows.side)
+    beyond = -torch.special.log_ndtr(side * z)
+    return torch.where(side != 0, beyond, 0.5 * z.square() + torch.log(scale))
 
 
 def _off(shared: Tensor) -> Tensor:
@@ -220,7 +221,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
     places = [torch.from_numpy(part.places) for part in parts]
     pairs = [Pairs.of(at, at) for at in places]
     values = [torch.from_numpy(part.decibels) for part in parts]
-    silent = [torch.from_numpy(part.silent) for part in parts]
+    side = [torch.from_numpy(part.side) for part in parts]
     rough = replace(rough, doubt=torch.zeros(len(SHARED) + len(rough.levels), 0, dtype=torch.float64))
     own = [rough.terms(at) * rough.unit for at in places]
     bands, count = len(rough.levels), sum(len(part.index) for part in parts)
@@ -241,7 +242,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
         total = _off(shared) + 0.5 * ((at[-7:] - usual[-7:]) / loose[-7:]).square().sum()
         for i, at_ in enumerate(places):
             rest = values[i] - rough.at(at_, shared, levels)
-            total = total + Evidence.apply(covariance(i, at), rest, silent[i])  # type: ignore[no-untyped-call]
+            total = total + Evidence.apply(covariance(i, at), rest, side[i])  # type: ignore[no-untyped-call]
         return total / count
 
     middle = float(np.median(pairs[0].distance.numpy())) or 1.0
@@ -263,10 +264,10 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
     learned = replace(rough, shared=shared.clone(), levels=levels.clone())
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
     for i, at_ in enumerate(places):
-        gram, rest, quiet = covariance(i, at), values[i] - learned.mean(at_), silent[i]
+        gram, rest, quiet = covariance(i, at), values[i] - learned.mean(at_), side[i] != 0
         if quiet.any():
             known = ConditionalGaussian.of(gram, rest, quiet)
-            gram.diagonal()[quiet] += propagate(known, rest[quiet]).variance
+            gram.diagonal()[quiet] += propagate(known, rest[quiet], side[i][quiet]).variance
         columns = Factor.of(gram, "raise").whitened(learned.columns(at_))
         precision += columns.T @ columns
     doubt = Factor.of(precision, "raise").root.T

@@ -90,7 +90,7 @@ def link_rows(data: Measurements, rows: np.ndarray, places: np.ndarray) -> LinkR
     station = data.station[rows].astype(np.int64)
     seen = rows_of(data, rows)
     ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
-    return LinkRows(ends, seen.decibels, seen.silent, station, np.asarray(rows, np.int64))
+    return LinkRows(ends, seen.decibels, seen.side, station, np.asarray(rows, np.int64))
 
 
 @dataclass(frozen=True)
