@@ -206,6 +206,15 @@ class HasProcess(Protocol):
 
 
 @runtime_checkable
+class HasJoint(Protocol):
+    """Levels of several stations, or at several places, with their covariance."""
+
+    def joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `gsparc.models.powers.together.field.JointPowerField.joint`."""
+        ...
+
+
+@runtime_checkable
 class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 
