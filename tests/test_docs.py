@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_module
 from pages import FOLDERS, PAGES, PRESENT, ROOT, commands, said
 
 from gsparc.commands.shared.plugins import offer_scenes
-from gsparc.models.registry import METHODS
+from gsparc.models.registry import methods
 from gsparc.simulate.scenes.shipped import shipped
 
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
@@ -33,6 +33,16 @@ def test_every_package_is_on_the_map():
     assert not {name for name in named if not (ROOT / name).exists()}
     groups = {folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()} - {"__pycache__"}
     assert not groups - set(re.findall(r"(\w+)/", MAP))
+
+
+def test_the_walk_is_through_functions_that_are_there():
+    """At most 12 steps of a spectrum and of a power, each a file and what it defines."""
+    for walk in MAP.partition("## The walk")[2].partition("\n## ")[0].split("**A ")[1:]:
+        steps = re.findall(r"(?:^|\s)(\d+) `([\w/]+\.py) ([\w.]+)`", walk)
+        assert len(steps) > 5 and int(steps[-1][0]) == 12
+        for _, file, name in steps:
+            text = (ROOT / "gsparc" / file).read_text(encoding="utf-8")
+            assert all(re.search(rf"(?:def|class) {part}\b", text) for part in name.split(".")), (file, name)
 
 
 @PER_PAGE
@@ -92,7 +102,7 @@ def test_choices_and_names_are_of_today(page):
     code = "\n".join(said(page))
     for group in ("model", "dataset", "split", "trainer", "callbacks", "experiment", "scene"):
         chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", code)
-        offered = {"scene": ("help", *shipped()), "model": METHODS}.get(group, ())
+        offered = ("help", *shipped()) if group == "scene" else ()
         written = [name for name in chosen if name not in offered]
         assert not [name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()], group
     assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]
@@ -114,7 +124,7 @@ def test_the_readme_is_short():
 def test_every_method_is_listed():
     """Each name of the registry is a row or an entry of the page of methods, or of the page of training."""
     text = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("peers.md", "train.md"))
-    assert not {name for name in METHODS if f"`{name}`" not in text}
+    assert not {name for name in methods() if f"`{name}`" not in text}
 
 
 def test_every_regression_test_of_the_hard_cases_is_there():

@@ -29,7 +29,7 @@ ARROWS = {
     "simulate": "data ops physics",
     "field": "data ops physics processes",
     "training": "data field ops",
-    "models": "data field ops physics processes simulate training",
+    "models": "conf data field ops physics processes simulate training",
     "prediction": "data field locate models ops physics processes training",
     "locate": "data models processes training",
     "evaluation": "conf data locate models prediction simulate training",

@@ -46,7 +46,8 @@ class Command:
         if {"--help", "-h"} & {*sys.argv[1:]}:  # before torch is imported
             sys.stdout.write(cli.overview(self.answers, self.name))
         else:
-            cli.run(import_module(path).task, self.name)
+            # Imported, with torch, once the words are understood.
+            cli.run(lambda config: import_module(path).task(config), self.name)
 
 
 COMMANDS = {

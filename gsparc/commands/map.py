@@ -63,9 +63,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    for layer in sheets if config.pictures else ():
-        draw_layer(field, layer, run_dir / file_name(layer), title, floor)
     origin = predictor.site.georeference
+    if config.degrees and origin is None:
+        raise DataError("degrees=true: positions were in metres about an unknown origin, not in degrees")
+    for layer in sheets if config.pictures else ():
+        draw_layer(field, layer, run_dir / file_name(layer), title, floor, origin if config.degrees else None)
     if origin is not None and geotiff_wanted(config.geotiff, origin):
         write_geotiff(run_dir / "map.tif", field, origin)
     write_page(run_dir / "map.html", field, sheets, title, lines, floor)
@@ -76,7 +78,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     if coverage is not None and promise is not None:
         reach = promise.calibration(how.share).reach
-        facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items()}
+        facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
     before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map "
     return finish(run_dir, facts, lines=lines, before=before)

@@ -40,6 +40,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     level, unit = float(config.threshold_db), predictor.site.level_unit
     draw_placing(placing, run_dir / "place.png", level, unit)
     x, y, z = placing.places[0]
+    where = f"({x:.2f}, {y:.2f}, {z:.2f})"
+    if predictor.site.georeference is not None:
+        latitude, longitude, _ = predictor.degrees(placing.places[0])
+        where = f"{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
     facts = {
         "place/x": x, "place/y": y, "place/z": z, "place/goal": placing.what, "place/before": placing.before,
         "place/after": placing.goal[0], "place/low": placing.low[0], "place/high": placing.high[0],
@@ -49,7 +53,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     low, high = (number(placing.what, ends[0], unit) for ends in (placing.low, placing.high))
     lines = [
         f"now {in_words(placing.what, placing.before, level, unit)}",
-        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): "
+        f"with a station at {where}: "
         f"{in_words(placing.what, placing.goal[0], level, unit)} (90 % interval {low} to {high})",
     ]
     if not error.stations:

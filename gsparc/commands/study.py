@@ -53,6 +53,7 @@ def study_of(config: DictConfig) -> Study:
 def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
     settings = RunSettings.of(config)
+    build(config.model)  # its parts check themselves
     run_dir = run_directory()
     study = study_of(config)
     data = load(plain(config.dataset))

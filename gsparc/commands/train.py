@@ -1,50 +1,301 @@
-"""Compose, fit, test, write: what `train.py` and `gsparc train` do."""
+"""Read data, split them, fit a method, test it, write: what `train.py` and `gsparc train` do."""
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared import cli
 from gsparc.commands.shared.continued import once
 from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings
-from gsparc.data.files import set_aside
-from gsparc.evaluation.experiment.run import Objects, objective_of, run
-from gsparc.evaluation.metric_formats import score_of
-from gsparc.evaluation.summary import remarks, results_table
+from gsparc.data import heeded
+from gsparc.data.checks.describe import in_short
+from gsparc.data.datamodule import DataModule
+from gsparc.data.files import is_address, set_aside
+from gsparc.data.instantiate import find, node_of, suggest
+from gsparc.data.load import datamodule, split_for
+from gsparc.data.schema import Measurements, Scored
+from gsparc.data.splits import Split, write_split
+from gsparc.data.walls import read_walls
+from gsparc.evaluation import summary
+from gsparc.evaluation.console import plain
+from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.experiment import options
+from gsparc.evaluation.experiment.fit import Outcome, context_of, fit_folds, in_folders
+from gsparc.evaluation.found_plan import draw_found
+from gsparc.evaluation.metric_formats import DECIDING, score_of
+from gsparc.evaluation.metrics import figure_names
+from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.pictures import draw_predictions
+from gsparc.evaluation.scores import rows_of
+from gsparc.models import checkpoint, parts
+from gsparc.models.method import Method, TrainsByGradient
+from gsparc.models.registry import build, complete, known
+from gsparc.training import curve, tracking
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
+log_of_models = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
 
+LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 # What a run leaves; of another one, all of it would be read beside this one's.
 LEFT = (
     *("summary.json", "split.json", "per_sample.csv", "render_ms.csv", "test.png", "found.png"),
-    *(f"{fold}{name}" for fold in ("", "fold*/") for name in ("model.ckpt", "learning_curve.csv")),
+    *(f"{fold}{name}" for fold in ("", "fold*/") for name in (checkpoint.MODEL, "learning_curve.csv")),
 )
 
 
-def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
-    """Fit a method on every fold of a split and test it, as `run` does; the folder is locked meanwhile.
+@dataclass(frozen=True)
+class Objects:
+    """What a run made, for callers from Python.
 
-    What an earlier run left there is set aside first, but for what this one goes on, or starts, from.
+    Attributes:
+        methods: one fitted method per fold.
+        checkpoints: their files.
+        data, split: what they learned from.
+        evaluation: figures and per-sample columns.
+    """
+
+    methods: tuple[Method, ...]
+    checkpoints: tuple[Path, ...]
+    data: Measurements
+    split: Split
+    evaluation: Evaluation
+
+
+def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
+    """Fit a method on every fold of a split, test it beside baselines, and write it all down.
+
+    The folder is locked meanwhile. What an earlier run left there is set aside first, but for what this one
+    goes on, or starts, from.
+
+    Args:
+        config: as composed from conf/train.yaml.
+        run_dir: where checkpoints, curves, pictures and `summary.json` go.
+
+    Returns:
+        The facts of `summary.json`, and the objects they were computed from.
 
     Raises:
-        ValueError: as `run`; or another run writes there.
+        ValueError: bad data, settings or checkpoint, one line each; or another run writes there.
     """
     with locked(run_dir):
-        taken = [Path(config[name]).resolve() for name in ("ckpt_path", "init_from") if config.get(name)]
-        goes_on = any(run_dir.resolve() in (path, *path.parents) for path in taken)
-        if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
-            log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
+        method = build(complete(config.model))  # once: each fold, and each station, fits a copy of it
         RunSettings.of(config)
-        return run(config, run_dir)
+        _set_earlier_aside(config, run_dir)
+        run_id, watch = summary.new_run_id(), TimeBudget(clock=config.budget_clock)
+        reads = options.noting(config, method)
+
+        with heeded.recording(reads):
+            module = _data(config)
+            data = module.measurements
+            split = split_for(plain(config.split), data)
+        resumes = _resumes(config, len(split.folds))
+        _check(config, method, data, split, resumes)
+        write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
+
+        with tracking.opened(config) as loggers:
+            whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=module)
+            contexts = _of_folds(whole, split, resumes, watch.spent)
+            with heeded.recording(reads), _advising(contexts):
+                # `Method.fit` of every fold. For gradient steps training/fit.py `run_stage` makes the Trainer
+                # of `config.trainer` and calls `trainer.fit(module, datamodule)`.
+                keep = partial(_keep, data, split, contexts, run_id)
+                fits = fit_folds(partial(deepcopy, method), data, split, contexts, keep=keep)
+                fits.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
+
+            unused = options.unheeded(reads, fits.methods[0], data)
+            evaluation = evaluate(
+                fits.methods, fits.train_s, data, split, eval_on=config.eval_on, baselines=config.baselines,
+                shared=_as_baseline(config, method),
+            )  # fmt: skip
+
+            facts = {**evaluation.facts, **summary.provenance(), **_of_fits(fits)}
+            facts |= {"run_id": run_id, "seed": int(config.seed), "options/unused": unused}
+            files = tuple(context.run_dir / checkpoint.MODEL for context in contexts)
+            objects = Objects(fits.methods, files, data, split, evaluation)
+            _draw(loggers, config, facts, objects, run_dir)
+        samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
+        summary.write_samples(run_dir / "per_sample.csv", samples)
+        summary.write_summary(run_dir / "summary.json", facts)
+        return facts, objects
+
+
+def _set_earlier_aside(config: DictConfig, run_dir: Path) -> None:
+    taken = [Path(config[name]).resolve() for name in ("ckpt_path", "init_from") if config.get(name)]
+    goes_on = any(run_dir.resolve() in (path, *path.parents) for path in taken)
+    if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
+        log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
+
+
+def _data(config: DictConfig) -> DataModule:
+    """The data, in the coordinates and units of the model that training starts from, if there is one."""
+    path, start = config.ckpt_path, config.get("init_from")
+    if path is not None and not Path(path).exists():  # before anything is read or simulated
+        raise ValueError(f"ckpt_path={path}: no such file")
+    module = datamodule(config.dataset)
+    module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
+    for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
+        given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
+        if given and not is_address(given):
+            config.dataset[key] = str(Path(config.dataset[key]).resolve())
+    if start is not None:
+        try:
+            module.measurements = aligned(module.measurements, checkpoint.read(start).site)
+        except ValueError as error:
+            raise ValueError(f"init_from={start}: {error}") from None
+    return module
+
+
+def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
+    """What each fold goes on from, a file or a folder; each of several has its own in the run's."""
+    path = None if config.ckpt_path is None else Path(config.ckpt_path)
+    if path is None or folds == 1:
+        return [path] * folds
+    run = parts.folder_of(path, parts.FOLDS)
+    every = [run / f"fold{number}" for number in range(folds)]
+    if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
+        raise ValueError(
+            f"ckpt_path={path}: split={config.split.name} has {folds} folds, give the run's folder"
+        )
+    return [own if own.is_dir() else None for own in every]
+
+
+def _check(
+    config: DictConfig, method: Method, data: Measurements, split: Split, resumes: Sequence[Path | None]
+) -> None:
+    """Refuse now what would be found after the training; say what is learned from, and what is guessed.
+
+    Raises:
+        ValueError: an objective, a file of walls, a split, weights to start from or a resume that cannot be.
+    """
+    objective_of(config, data.site.scored)
+    _known_walls(config)
+    split.check()  # none without rows to learn from or to test on
+    for topic, sentence in in_short(data, split):
+        log.info("%-10s%s", topic, sentence)
+    if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
+        raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
+    if any(resumes) and not method.resumable and not Path(config.ckpt_path).is_dir():  # of finished parts
+        raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
+    for guess in method.guesses:
+        log_of_models.info("guess: %s", guess)
+    guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
+    within = "" if config.budget_s is None else f", within {config.budget_s:g} s"
+    log.info("%-10s%s%s%s", "fitting", method.name, within, guessed)
+
+
+def _known_walls(config: DictConfig) -> Any:
+    walls = config.get("known_walls") or OmegaConf.select(config, "init.file")
+    return None if walls is None else read_walls(walls)
+
+
+def _of_folds(
+    whole: FitContext, split: Split, resumes: Sequence[Path | None], read_s: float
+) -> list[FitContext]:
+    """What the fit of each fold is given.
+
+    Args:
+        read_s: that reading took [s]: the seconds that are given begin with the first read.
+    """
+    contexts = in_folders(whole, split) if len(resumes) > 1 else [whole]
+    contexts = [replace(one, resume=resume) for one, resume in zip(contexts, resumes, strict=True)]
+    if whole.budget_s is not None:
+        left_s = max(whole.budget_s - read_s, LEAST_SHARE * whole.budget_s)
+        contexts[0] = replace(contexts[0], budget_s=left_s)
+    return contexts
+
+
+@contextmanager
+def _advising(contexts: Sequence[FitContext]) -> Iterator[None]:
+    """Say of an interrupt among several folds that the run's folder is what to go on from."""
+    try:
+        yield
+    except KeyboardInterrupt as stopped:
+        if len(contexts) == 1:
+            raise
+        cause = str(stopped).partition("; ")[0] or "interrupted"
+        raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={contexts[0].run_dir.parent}") from None
+
+
+def _keep(
+    data: Measurements, split: Split, contexts: Sequence[FitContext], run_id: str,
+    number: int, fitted: Method, report: FitReport,
+) -> None:  # fmt: skip
+    """Write the checkpoint of a fold as soon as it is fitted."""
+    context = contexts[number]
+    for note in report.notes:
+        log_of_models.info("%s", note)
+    if not curve.read(context.run_dir):  # a method that trains in one piece
+        context.curve(report.seconds, fitted.name, report.error)
+    marks = parts.marks(report, data, split.folds[number], context)
+    extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
+    checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
+
+
+def _as_baseline(config: DictConfig, method: Method) -> str | None:
+    """Its name where a baseline of that name would be fitted in the same way."""
+    plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
+    kind = known().get(method.name)
+    return method.name if plainly and kind and plain(config.model) == node_of(find(kind)) else None
+
+
+def _of_fits(fits: Outcome) -> dict[str, Any]:
+    facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by}
+    if fits.cost.stages:
+        facts |= {"time/cost": fits.cost.described(fits.limited_by), "time/unused_s": fits.cost.unused_s}
+    return facts
+
+
+def _draw(
+    loggers: list[Any], config: DictConfig, facts: dict[str, Any], objects: Objects, run_dir: Path
+) -> None:
+    """Draw predictions and what was found; give loggers the pictures, figures and the table."""
+    # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
+    own = {
+        f"final/{name}": value
+        for name, value in facts.items()
+        if isinstance(value, (int, float)) and not name.startswith(("baseline/", "paired/"))
+    }
+    tracking.final(loggers, own)
+    method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
+    draw_predictions(
+        method, data, fold, f"{data.site.name}: test rows of {method.label}", run_dir / "test.png"
+    )
+    tracking.picture(loggers, "test rows", run_dir / "test.png")
+    tracking.table(loggers, "results", *summary.result_rows(facts, str(facts["model/label"]), config.eval_on))
+    found = method.objects()
+    if len(found):
+        draw_found(data, found, run_dir / "found.png", _known_walls(config))
+        tracking.picture(loggers, "found", run_dir / "found.png")
+
+
+def objective_of(config: DictConfig, kind: Scored) -> str:
+    """The figure that a search improves, of rows `eval_on`; `objective: null` takes the deciding one.
+
+    Raises:
+        ValueError: there is no such figure.
+    """
+    figures = [DECIDING[kind], *figure_names(kind), "skill"]
+    known = {f"{config.eval_on}/{figure}": figure for figure in figures}
+    objective = config.get("objective")
+    if objective is not None and objective not in known:
+        raise ValueError(f"objective={objective}: no such figure{suggest(str(objective), known)}")
+    return DECIDING[kind] if objective is None else known[objective]
 
 
 def task(config: DictConfig) -> float:
@@ -66,8 +317,8 @@ def _train_and_show(config: DictConfig) -> float:
     facts, objects = train(config, run_dir)
     figure = objective_of(config, objects.data.site.scored)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    results = results_table(facts, facts["model/label"], title, config.eval_on)
-    show(run_dir, results, lines=remarks(facts, config.eval_on))
+    results = summary.results_table(facts, facts["model/label"], title, config.eval_on)
+    show(run_dir, results, lines=summary.remarks(facts, config.eval_on))
     value = facts[f"{config.eval_on}/{figure}"]
     if value is not None:
         return score_of(figure, value)

@@ -98,7 +98,9 @@ def each(
     total, ended = sum(map(cost, pieces)), 0.0
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
     began = logged = time.monotonic()
-    if not elsewhere():
+    if not elsewhere() and threads == 1:
+        results: Results = ((number, work(pieces[number])) for number in numbers)
+    elif not elsewhere():
         here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
         results = _jobs(here, threads, "threading")
     else:

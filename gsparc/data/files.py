@@ -8,7 +8,7 @@ import io
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import count
@@ -33,6 +33,19 @@ def platform_cache() -> Path:
 def is_address(path: object) -> bool:
     """Whether a file is named by a URL, which reading asks somebody for."""
     return "://" in str(path)
+
+
+class Several(str):
+    """Names of files that are read as one, and of messages the text that names them all."""
+
+    paths: tuple[str, ...]
+
+    def __new__(cls, paths: Iterable[str | Path]) -> Several:
+        """Of at least one path."""
+        every = tuple(map(str, paths))
+        result = super().__new__(cls, ", ".join(every))
+        result.paths = every
+        return result
 
 
 def read_text(path: Path, missing: str, kind: str = "text") -> str:

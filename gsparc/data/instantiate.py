@@ -84,29 +84,24 @@ def plugins(group: str) -> dict[str, str]:
     return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=GROUPS[group])}
 
 
-def node_of(kind: type, linked: Mapping[str, str] = {}) -> dict[str, Any]:
+def node_of(kind: type) -> dict[str, Any]:
     """The node of a configuration that builds a class: what it takes with defaults; `???` without one.
 
-    Dataclasses of settings are nodes of their own; `**names` stands for what the base class takes. Left
-    out are defaults that no configuration can hold.
-
-    Args:
-        kind: a class.
-        linked: settings, where the class has them, that follow others: `{"seed": "${seed}"}`.
+    Dataclasses of settings are nodes of their own. Left out are defaults that no configuration can hold.
     """
-    defaults = {name: v for name, default in _defaults(kind).items() if (v := _plain(default)) is not _OTHER}
-    links = {name: link for name, link in linked.items() if name in defaults}
-    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **defaults, **links}
+    defaults = {name: v for name, default in arguments(kind).items() if (v := _plain(default)) is not _OTHER}
+    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **defaults}
 
 
 _OTHER = object()
 
 
-def _defaults(kind: type) -> dict[str, Any]:
+def arguments(kind: type) -> dict[str, Any]:
+    """What a class takes, with defaults; `**names` stands for what its base class takes."""
     if kind is object:
         return {}
     own = list(inspect.signature(kind.__init__).parameters.values())[1:]  # type: ignore[misc]
-    base = _defaults(kind.__mro__[1]) if any(p.kind is p.VAR_KEYWORD for p in own) else {}
+    base = arguments(kind.__mro__[1]) if any(p.kind is p.VAR_KEYWORD for p in own) else {}
     named = {p.name: p.default for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
     return {**named, **{name: default for name, default in base.items() if name not in named}}
 

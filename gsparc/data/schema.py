@@ -36,7 +36,7 @@ class Stations:
         name: (T,) what a user calls them.
         rotation: (T, 3, 3) float64, local to world; None where receivers are not turned, or transmit.
         carrier_hz: (T,) [Hz]; None where all have the site's.
-        sector: (T, 5) azimuth from north, tilt below the horizon, widths of the beam across and in height
+        sector: (T, 6) azimuth from north, tilt below the horizon, widths of the beam across and in height
             [deg], and power [dB], NaN where unknown; None where nothing of it is known.
     """
 
@@ -154,7 +154,7 @@ class Site:
         """`ValueError` where rows have phases of their own, so that `what` cannot be told."""
         if self.freedom != "none":
             free = self.freedom.replace("+", ", ")
-            raise ValueError(f"{what}: channels are known up to {free} of each row; levels and shapes are told")
+            raise ValueError(f"{what}: channels are known up to {free} of each row, levels and shapes are")
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:
@@ -359,6 +359,7 @@ FIELDS: dict[str, Field] = {
         Field("station_longitude", "(T,)", "deg", "no", "together with station_latitude"),
         Field("station_name", "(T,)", "1", "no", "what you call each station"),
         Field("station_orientation", "(T, 4)", "1", "no", "quaternions (w, x, y, z) of receiving stations"),
+        Field("station_site", "(T,)", "1", "no", "a number that sectors of one site have alike"),
         Field("station_azimuth", "(T,)", "deg", "no", "of a sector's beam, from north (y) to east (x)"),
         Field("station_tilt", "(T,)", "deg", "no", "of a sector's beam below the horizon"),
         Field("station_width", "(T,)", "deg", "no", "of a sector's beam across, between half powers"),

@@ -115,10 +115,12 @@ class PowerUnit:
     def variance(self, stored: Tensor, variance: Tensor) -> Tensor:
         """Of `values` (B,) float64, from stored powers (B, 1) or other targets, and their variance (B,).
 
+        Powers (B, T) of several stations have variances (B, T).
+
         In float64: squares of powers in watts are beyond float32.
         """
         if self.decibels:
-            return variance.double() * (DB / stored.double()[:, 0]).square()
+            return variance.double() * (DB / stored.double().reshape(variance.shape)).square()
         return variance.double() * self.scale**2
 
     def stored(self, values: Tensor) -> Tensor:

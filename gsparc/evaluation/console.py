@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 import os
 import re
@@ -104,7 +103,7 @@ def one_line(error: BaseException) -> str:
         where = re.search(r"full_key: (\S+)", str(error))
         if isinstance(error.__cause__, SettingError) and where:
             return f"{where[1]}.{error.__cause__}"
-        return _argument(str(error)) or one_line(error.__cause__)
+        return one_line(error.__cause__)
     if isinstance(error, errors.HydraException):
         return " ".join(str(error).split())
     if isinstance(error, OmegaConfBaseException) and error.full_key:
@@ -129,18 +128,6 @@ def choices(group: str) -> list[str]:
     own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
     stored = ConfigStore.instance().repo.get(group, {})
     return sorted(own.union(name.removesuffix(".yaml") for name in stored))
-
-
-def _argument(text: str) -> str | None:
-    """The line for a setting that a class does not take (added with +); None for other errors."""
-    named = re.search(r"target '(gsparc\.[\w.]+)'[\s\S]*unexpected keyword argument '(\w+)'", text)
-    if named is None:
-        return None
-    where = re.search(r"full_key: (\S+)", text)
-    module, _, name = named[1].rpartition(".")
-    known = list(inspect.signature(getattr(import_module(module), name)).parameters)
-    place = f"{where[1]}." if where else ""
-    return f"{place}{named[2]}: no such setting of {name}{suggest(named[2], known)}"
 
 
 def _override(error: Exception, cause: OmegaConfBaseException) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,7 +51,6 @@ def evaluate(
     *,
     eval_on: str = "test",
     baselines: Sequence[str] | None = None,
-    cache: Path | None = None,
     clock: ClockSettings | None = None,
     learned: tuple[Measurements, Split] | None = None,
     shared: str | None = None,
@@ -65,8 +63,7 @@ def evaluate(
         data: the dataset.
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
-        baselines: names in `gsparc.models.registry.METHODS`; None: all plain ones that serve these rows.
-        cache: unused.
+        baselines: names in `gsparc.models.registry.known()`; None: all plain ones that serve these rows.
         clock: how long to measure latencies.
         learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
         shared: the baseline that the methods are, which is then not fitted again.

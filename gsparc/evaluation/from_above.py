@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
+
+from gsparc.data.links.georeference import Georeference
 
 MOST_POINTS = 1500  # measured places that are drawn
 MOST_WALLS = 50_000
+DART = Path([(-0.22, 0.75), (0.0, 0.0), (0.22, 0.75), (0.0, 1.0), (-0.22, 0.75)], closed=True)
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -21,6 +28,25 @@ def bounded(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
     axis.set(xlim=across, ylim=up, aspect="equal", **labels)
     axis.ticklabel_format(useOffset=False, style="plain")
     axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share
+
+
+def in_degrees(axis: Any, origin: Georeference) -> None:
+    """Write longitudes and latitudes at the ticks of an axis in metres about `origin`."""
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    middle = np.array([[(left + right) / 2, (low + high) / 2]])
+
+    def written(number: int) -> Callable[[float, int], str]:
+        def at(value: float, _: int) -> str:
+            place = middle.copy()
+            place[0, number] = value
+            return f"{float(origin.to_degrees(place)[1 - number][0]):.4f}"
+
+        return at
+
+    axis.xaxis.set_major_formatter(written(0))
+    axis.yaxis.set_major_formatter(written(1))
+    axis.tick_params(axis="x", labelrotation=30)
+    axis.set(xlabel="longitude [deg]", ylabel="latitude [deg]")
 
 
 def framed(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
@@ -35,6 +61,20 @@ def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", 
     """Marks at places (n, 2) [m], black unless `how` says another colour."""
     marks = {"marker": "^", "color": "k", "markersize": 9, "markeredgecolor": "white", "linestyle": ""}
     axis.plot(*places.T, label=label, **{**marks, "zorder": 4, **how})
+
+
+def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
+    """A dart at each of places (n, 2) [m] towards its azimuth (n,) [deg from north]."""
+    how: dict[str, Any] = {
+        "linestyle": "",
+        "color": "k",
+        "markeredgecolor": "white",
+        "markersize": 17,
+        "zorder": 4,
+    }
+    for where, turn in zip(places, azimuth, strict=True):
+        axis.plot(*where, marker=MarkerStyle(DART, transform=Affine2D().rotate_deg(-turn)), **how)
+    axis.plot([], [], marker="d", label="sector", **how | {"markersize": 7})
 
 
 def draw_measured(axis: Any, places: np.ndarray) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
+from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models.method import Method
 
 SPECTRA = 4  # test rows drawn
@@ -26,6 +27,7 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
+        draw_sector_levels(method, data, np.sort(np.r_[fold.train, fold.val]), path.with_name("sectors.png"))
         return draw_points(true * scale, predicted * scale, title, path, unit)
     assert data.site.grid is not None
     confidence = None if prediction.confidence is None else prediction.confidence.numpy()

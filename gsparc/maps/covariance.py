@@ -10,9 +10,10 @@ import torch
 
 from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
+from gsparc.maps.levels import joint_of
 from gsparc.maps.making import levels_at, local_of
 from gsparc.maps.promise import Promise
-from gsparc.models.method import HasProcess
+from gsparc.models.method import HasJoint, HasProcess
 from gsparc.models.powers.settings import fit_powers
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.kernel import Kernel
@@ -69,16 +70,20 @@ def unknown_of(
         DataError: the model has neither a process nor known places.
     """
     covariances = []
+    joint = joint_of(predictor.method)
     for name in stations:
         asking = predictor if predictor.site.stations is None else predictor.at(name)
         number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
-        process = asking.method.process() if isinstance(asking.method, HasProcess) else None
-        if process is None:
-            process = _stand_in(asking, promise, number)
-        local = local_of(asking.site, places, other_end, process.places.shape[1] == 6)
-        assert isinstance(process.posterior, Exact)
-        covariance = process.posterior.covariance(torch.from_numpy(local)).numpy()
-        noise = process.kernel.amplitude * process.kernel.noise
+        if joint is not None:
+            local = places - asking.site.origin
+            covariance, noise = _of_cell(joint, local, number)
+        else:
+            process = asking.method.process() if isinstance(asking.method, HasProcess) else None
+            process = _stand_in(asking, promise, number) if process is None else process
+            local = local_of(asking.site, places, other_end, process.places.shape[1] == 6)
+            assert isinstance(process.posterior, Exact)
+            covariance = process.posterior.covariance(torch.from_numpy(local)).numpy()
+            noise = process.kernel.amplitude * process.kernel.noise
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
             calibration = promise.calibration()
@@ -90,6 +95,13 @@ def unknown_of(
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
         covariances.append(ErrorCovariance(covariance, noise, weight))
     return covariances
+
+
+def _of_cell(joint: HasJoint, local: np.ndarray, number: int) -> tuple[np.ndarray, float]:
+    """Covariance (S, S) of a station's levels at places (S, 3), and the noise of one measurement [dB^2]."""
+    stations = torch.full((len(local),), number)
+    _, covariance, noise = joint.joint(torch.from_numpy(local)[None], stations)
+    return (covariance[0] - noise.diag()).numpy(), float(noise[0])
 
 
 def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:

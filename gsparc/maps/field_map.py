@@ -18,6 +18,7 @@ from gsparc.data.links.georeference import Georeference
 from gsparc.maps.area import Grid
 
 REFUSED = -1  # of `best_server`
+OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
 OF_STATIONS = ("power_db", "lower_db", "upper_db", "expected_error_db")
 ARRAYS = (*OF_STATIONS, "sinr_db", "outage", "best_server", "server_chance")
 
@@ -39,11 +40,13 @@ class FieldMap:
         share: of measurements that the intervals hold; the field alone lies in them more often.
         calibrated: whether arrays-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
-        extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`.
+        extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`, `overlap`.
         places: (n, 2) where was measured, world [m].
         station_place: (T, 2) world [m], NaN where unknown.
         notes: what a reader must know, one line each.
         unit: of all levels.
+        azimuth: (T,) that sectors face [deg from north], NaN of others.
+        bands: (T,) carriers of the stations; () of one.
     """
 
     grid: Grid
@@ -64,6 +67,8 @@ class FieldMap:
     station_place: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     notes: tuple[str, ...] = ()
     unit: str = "dB"
+    azimuth: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    bands: tuple[str, ...] = ()
 
     @property
     def refused(self) -> np.ndarray:
@@ -99,7 +104,8 @@ class FieldMap:
             "x": self.grid.x, "y": self.grid.y, "height": np.array(self.grid.height),
             "inside": self.grid.inside, "stations": np.array(self.stations), "share": np.array(self.share),
             "calibrated": np.array(self.calibrated), "threshold_db": np.array(self.threshold_db),
-            "unit": np.array(self.unit), **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
+            "unit": np.array(self.unit), "bands": np.array(self.bands, str),
+            **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
         }  # fmt: skip
         with whole_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -119,7 +125,7 @@ class FieldMap:
             grid = Grid(x, y, float(arrays.pop("height")), step, inside)
             names = tuple(str(name) for name in arrays.pop("stations"))
             facts: dict[str, Any] = {name: arrays.pop(name) for name in ARRAYS}
-            facts["unit"] = str(arrays.pop("unit", "dB"))
+            facts["unit"], facts["bands"] = str(arrays.pop("unit", "dB")), tuple(arrays.pop("bands", ()))
             for name, kind in (("share", float), ("calibrated", bool), ("threshold_db", float)):
                 facts[name] = kind(arrays.pop(name))
         except FileNotFoundError:
@@ -163,17 +169,19 @@ def best_server(power_db: np.ndarray) -> np.ndarray:
 
 
 def server_chance(
-    power_db: np.ndarray, error_db: np.ndarray, usual_db: np.ndarray, floor_db: np.ndarray
-) -> np.ndarray:
+    power_db: np.ndarray, error_db: np.ndarray, usual_db: np.ndarray, floor_db: np.ndarray,
+    alike: np.ndarray | float = 0.0,
+) -> np.ndarray:  # fmt: skip
     """Least probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
 
-    Errors are taken for normal and independent; who beats one station is likelier to beat another, so that
+    Errors are taken for normal; who beats one station is likelier to beat another, so that
     the product of all is a lower bound (D. Slepian, Bell Syst. Tech. J. 41 (1962)).
 
     Args:
         power_db, error_db: predicted, and expected errors; NaN where unknown.
         usual_db: (T, 2) mean and deviation that a station has where it is unknown; NaN: it is left out there.
         floor_db: (T,) power below which a station is not told from noise; -inf: any is.
+        alike: (T, n) correlations of errors with the strongest's: sectors of a site share its shadowing.
 
     Returns:
         NaN where no power is known.
@@ -182,32 +190,49 @@ def server_chance(
     first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
     mean, spread = power_db[first, cell], error_db[first, cell]
     rival, wrong = (np.where(known, one, usual_db[:, k, None]) for k, one in enumerate((power_db, error_db)))
-    beats = np.nan_to_num(norm.cdf((mean - rival) / np.hypot(spread, wrong)), nan=1.0)
+    apart = np.sqrt(np.maximum(spread**2 + wrong**2 - 2 * alike * spread * wrong, 1e-12))
+    beats = np.nan_to_num(norm.cdf((mean - rival) / apart), nan=1.0)
     beats[first, cell] = norm.cdf((mean - floor_db[first]) / spread)
     return np.where(number == REFUSED, np.nan, beats.prod(axis=0)).astype(np.float32)
 
 
-def sinr(power_db: np.ndarray, load: np.ndarray, noise_db: float | None) -> np.ndarray:
-    """Signal over interference and noise (n,) [dB] of the strongest of (T, n) powers.
+def sinr(
+    power_db: np.ndarray, load: np.ndarray, noise_db: float | None, carrier: np.ndarray | None = None
+) -> np.ndarray:
+    """Signal over interference and noise (n,) [dB] of the strongest of (T, n) powers, within its carrier.
 
     Args:
         power_db: NaN where unknown: such a station is taken for silent.
         load: (T,) share of the time that each transmits while another serves.
         noise_db: power of the noise, in the unit of the powers; None: interference alone.
+        carrier: (T,) int64; None: all transmit on one.
 
     Returns:
         NaN where no power is known, or where there is neither noise nor interference.
     """
     linear = np.where(np.isfinite(power_db), 10 ** (power_db.astype(np.float64) / 10), 0.0)
     number = best_server(power_db)
-    cell = np.arange(linear.shape[1])
-    signal = linear[np.maximum(number, 0), cell]
-    every = load @ linear - load[np.maximum(number, 0)] * signal
+    first, cell = np.maximum(number, 0), np.arange(linear.shape[1])
+    signal = linear[first, cell]
+    same = True if carrier is None else carrier[:, None] == carrier[first]
+    every = load @ (linear * same) - load[first] * signal
     noise = 0.0 if noise_db is None else 10 ** (noise_db / 10)
     rest = np.maximum(every, 0.0) + noise
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 10 * np.log10(signal / rest)
     return np.where((number == REFUSED) | ~(rest > 0), np.nan, ratio)
+
+
+def overlapping(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
+    """Stations (n,) within `OVERLAP_DB` of the strongest of (T, n) powers [dB], itself too, on its carrier.
+
+    Returns:
+        NaN where no power is known.
+    """
+    number = best_server(power_db)
+    first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
+    near = (power_db >= power_db[first, cell] - OVERLAP_DB) & (carrier[:, None] == carrier[first])
+    return np.where(number == REFUSED, np.nan, near.sum(0)).astype(np.float32)
 
 
 def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:

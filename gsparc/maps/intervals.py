@@ -198,6 +198,7 @@ class Coverage:
         reached: share of all rows that lay in reach.
         rows, blocks: tried.
         own_share, own_width_db: of the intervals that the model states by itself.
+        heard_share, silent_share: of the rows with a level, and of those beyond one; NaN of none.
     """
 
     share: float
@@ -207,6 +208,8 @@ class Coverage:
     blocks: int
     own_share: float
     own_width_db: float
+    heard_share: float
+    silent_share: float
 
 
 def cross_validated(evidence: Evidence, share: float) -> Coverage:
@@ -223,6 +226,8 @@ def cross_validated(evidence: Evidence, share: float) -> Coverage:
     return Coverage(
         float(inside[known].mean()), float(width[known].mean()), float(known.mean()), int(known.sum()),
         len(blocks), float(own[known].mean()), float(2 * half * evidence.spread_db[known].mean()),
+        *(float(inside[part].mean()) if part.any() else np.nan
+          for part in (known & (evidence.side == 0), known & (evidence.side != 0))),
     )  # fmt: skip
 
 

@@ -19,13 +19,13 @@ from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
 from gsparc.maps.area import Grid, grid_of
-from gsparc.maps.field_map import FieldMap, best_server, empty, loads, server_chance, sinr
+from gsparc.maps.field_map import FieldMap, best_server, empty, loads, overlapping, server_chance, sinr
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.intervals import Calibration
-from gsparc.maps.levels import MAPPED, predicted
+from gsparc.maps.levels import MAPPED, cells_of, joint_of, predicted
 from gsparc.maps.promise import Promise, stored_promise
 from gsparc.maps.refining import refined
-from gsparc.models.method import HasPaths
+from gsparc.models.method import HasJoint, HasPaths
 from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
@@ -86,19 +86,27 @@ def map_of(
     stride = _stride(grid, promise, tolerance_db)
     numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     every, computed = np.flatnonzero(grid.inside), 0
-    for row, name in enumerate(names):  # the model's own deviations, until the promise scales them
-        own = predictor if site.stations is None else predictor.at(name)
-        ask = _asker(own, grid, other_end, f" of {name}" if name else "")
-        both, count = refined(ask, grid.inside, stride, tolerance_db)
-        values["power_db"][row], values["expected_error_db"][row] = both
-        computed += count
+    joint = joint_of(predictor.method)
+    alike = np.zeros_like(values["power_db"])
+    size = len(names) if joint is not None else 1  # stations that are asked about at once
+    for row in range(0, len(names), size):
+        chosen = slice(row, row + size)  # the model's own deviations, until the promise scales them
+        ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
+        parts, count = refined(ask, grid.inside, stride, tolerance_db)
+        parts = parts.reshape(-1, size, *grid.shape)
+        values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
+        alike[chosen] = parts[2] if joint is not None else 0.0
+        computed += count * size
     if computed < len(names) * len(every):
         notes.append(
             f"{computed} of {len(names) * len(every)} predictions were made, the others interpolated "
             f"within about {tolerance_db:g} dB"
         )
+    bands = bands_of(site, numbers)
+    carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
     usual, floor = _usual(promise, numbers, noise_db)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
+    overlap, errors_alike = np.full(grid.inside.size, np.nan, np.float32), alike.reshape(len(names), -1)
     for cells in _chunks(every, BANDS):
         mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
         far = np.zeros(mean.shape)
@@ -106,30 +114,36 @@ def map_of(
             local = local_of(site, grid.places(cells), other_end, site.static_end is None)
             far = np.stack([promise.distance(local, number) for number in numbers])
         half = calibration.interval(spread, far, numbers[:, None])
-        mean = np.where(np.isfinite(half), mean, np.nan)
+        first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
         error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
         power, error = mean.astype(np.float32), error.astype(np.float32)
         best = best_server(power)
         strongest = np.maximum(best, 0), np.arange(len(best))
         part = {
             "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
-            "best_server": best, "server_chance": server_chance(power, error, usual, floor),
-            "sinr_db": sinr(power, load_of, noise_db),
+            "best_server": best, "sinr_db": sinr(power, load_of, noise_db, carrier),
+            "server_chance": server_chance(
+                power, error, usual, floor, np.where(first == best, errors_alike[:, cells], 0.0)
+            ),
             "outage": calibration.below(threshold_db, power[strongest], error[strongest]),
         }  # fmt: skip
         for name, layer in part.items():
             flat[name][..., cells] = layer
+        overlap[cells] = overlapping(power, carrier)
     if promise is not None and not np.isfinite(values["power_db"]).any():
         raise DataError(
             f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
             "that held-out blocks tell anything of; map where was measured, or give a larger promise.block_m"
         )
+    extra = _path_layers(predictor, grid, values["best_server"])
+    if len(names) > 1:
+        extra["overlap"] = overlap.reshape(grid.shape)
     known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
         grid, tuple(names), **values, share=share, calibrated=promise is not None,
-        threshold_db=threshold_db, extra=_path_layers(predictor, grid, values["best_server"]),
+        threshold_db=threshold_db, extra=extra, bands=bands,
         places=np.unique(known, axis=0), station_place=_still(site, names), notes=tuple(notes),
-        unit=site.level_unit,
+        azimuth=azimuths_of(site, numbers), unit=site.level_unit,
     ).raised(level.raised_db, level.name)  # fmt: skip
 
 
@@ -200,15 +214,28 @@ def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
 
 
 def _asker(
-    predictor: Predictor, grid: Grid, other: Sequence[float] | None, name: str
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Level and deviation (n, 2) [dB] of cells (n,), in chunks, as many at once as torch has threads."""
+    predictor: Predictor, joint: HasJoint | None, grid: Grid, other: Sequence[float] | None,
+    names: Sequence[str], numbers: np.ndarray,
+) -> Callable[[np.ndarray], np.ndarray]:  # fmt: skip
+    """Levels and deviations [dB] of cells (n,), in chunks, as many at once as torch has threads.
+
+    Of one station (n, 2), or of those that `joint` knows together (n, 3 T), with the correlation of their
+    errors with the strongest's.
+    """
+    own = predictor if joint is not None or predictor.site.stations is None else predictor.at(names[0])
 
     def one(cells: np.ndarray) -> np.ndarray:
-        return np.column_stack(levels_at(predictor, grid.places(cells), other))
+        if joint is not None:
+            return cells_of(joint, own.site, grid.places(cells), numbers).reshape(len(cells), -1)
+        return np.column_stack(levels_at(own, grid.places(cells), other))
+
+    name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        levels, parts = np.zeros((len(cells), 2)), _chunks(cells, CHUNK)
+        levels, parts = (
+            np.zeros((len(cells), 2 if joint is None else 3 * len(numbers))),
+            _chunks(cells, CHUNK),
+        )
         for number, values in each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
             levels[number * CHUNK : number * CHUNK + len(values)] = values
         return levels
@@ -317,6 +344,20 @@ def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str
             azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
             layers["direction_deg"].reshape(-1)[cells] = azimuth
     return {name: layer for name, layer in layers.items() if np.isfinite(layer).any()}
+
+
+def bands_of(site: Site, numbers: np.ndarray) -> tuple[str, ...]:
+    """Carriers of stations (T,); () where all have one."""
+    carrier = None if site.stations is None else site.stations.carrier_hz
+    if carrier is None or len(np.unique(carrier[numbers])) == 1:
+        return ()
+    return tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier[numbers])
+
+
+def azimuths_of(site: Site, numbers: np.ndarray) -> np.ndarray:
+    """Directions (T,) that sectors face [deg from north], NaN of what is none."""
+    sector = None if site.stations is None else site.stations.sector
+    return np.full(len(numbers), np.nan) if sector is None else sector[numbers, 0]
 
 
 def _still(site: Site, names: Sequence[str]) -> np.ndarray:

@@ -9,31 +9,39 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import ListedColormap, hsv_to_rgb, to_rgba_array
+from matplotlib.colors import ListedColormap
 from matplotlib.transforms import Affine2D
+from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import label as areas_of
 
+from gsparc.data.links.georeference import Georeference
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import (
     OUTLINE,
     annotate,
     bounded,
     draw_measured,
+    draw_sectors,
     draw_stations,
+    in_degrees,
     legend_below,
     scale_bar,
 )
 from gsparc.maps.area import Grid
-from gsparc.maps.field_map import FieldMap
+from gsparc.maps.field_map import OVERLAP_DB, REFUSED, FieldMap, best_server
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.placing import Placing
 from gsparc.maps.planning import Plan
 from gsparc.maps.promise import Promise
 from gsparc.prediction.predictor import Predictor
 
+MOST_OVERLAP = 5.0  # stations that the colours end with
 GREY = (170, 170, 170)  # of values that are not known
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
-GOLDEN = 0.61803  # of the circle: no two numbers have one hue
+MOST_COLOURS = 10
+BESIDE = 2  # cells between areas that must not have one colour
+DEEP = 0.025  # of the map's longer side, from the edge of an area that its name is written on
 UNSURE = "hatched: more likely another station, or none that is heard"
 
 
@@ -75,7 +83,7 @@ class Layer:
         name: of its file and its button.
         values: (ny, nx) float, NaN where nothing is said.
         legend: what its colours mean, with the unit.
-        words: names of whole numbers, for a layer of classes.
+        words: names of whole numbers, for a layer of classes; "" of those that are nowhere on the map.
         unsure: (ny, nx) bool, cells that are hatched, and why; None: none.
     """
 
@@ -89,11 +97,36 @@ class Layer:
         """Colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
         if not self.words:
             return colormaps[self.legend.colours](np.linspace(0, 1, 256))
-        number = np.arange(len(self.words))
-        if len(number) <= 10:
-            return np.asarray(colormaps["tab10"](number))
-        shade = np.array([[0.9, 0.55], [0.65, 0.95], [0.45, 0.75]])[number % 3]  # saturation and value
-        return to_rgba_array(hsv_to_rgb(np.column_stack([number * GOLDEN % 1, shade])))
+        return np.asarray(colormaps["tab10"](shades(self.values, len(self.words))))
+
+
+def shades(classes: np.ndarray, count: int) -> np.ndarray:
+    """Numbers (count,) below `MOST_COLOURS`, different for classes (ny, nx) that lie beside each other."""
+    if count <= MOST_COLOURS:
+        return np.arange(count)
+    number = np.where(np.isfinite(classes), classes, count).astype(int)
+    beside = np.zeros((count + 1, count + 1), int)
+    for step in range(1, BESIDE + 1):
+        np.add.at(beside, (number[step:], number[:-step]), 1)
+        np.add.at(beside, (number[:, step:], number[:, :-step]), 1)
+    beside += beside.T
+    result = np.full(count, -1)
+    for one in np.argsort(-np.bincount(number.reshape(-1), minlength=count)[:count], kind="stable"):
+        used = result >= 0
+        near = np.bincount(result[used], beside[one, :count][used], MOST_COLOURS)
+        result[one] = np.lexsort((np.bincount(result[used], minlength=MOST_COLOURS), near))[0]
+    return result
+
+
+def named_areas(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[int, int, str]]:
+    """Row, column and name for each area of classes (ny, nx) that is wide enough to be written on."""
+    least = max(DEEP * max(classes.shape), 1.5)
+    for number in np.unique(classes[np.isfinite(classes)]).astype(int):
+        parts, count = areas_of(classes == number)
+        for part in range(1, count + 1):
+            deep = distance_transform_edt(np.pad(parts == part, 1))[1:-1, 1:-1]
+            if deep.max() >= least:
+                yield *(int(at) for at in np.unravel_index(deep.argmax(), deep.shape)), words[number]
 
 
 def layers(field: FieldMap) -> Iterator[Layer]:
@@ -104,8 +137,17 @@ def layers(field: FieldMap) -> Iterator[Layer]:
     yield Layer("power", layer, Legend.over(f"received power{of} [{unit}]", layer))
     if several:
         doubt = (field.unsure, UNSURE) if field.unsure.any() else None
-        legend = Legend("strongest station", -0.5, len(field.stations) - 0.5)
-        yield Layer("best_server", field.layer("best_server"), legend, field.stations, doubt)
+        yield _servers("best_server", field.layer("best_server"), field.stations, doubt)
+    for band in dict.fromkeys(field.bands):
+        own = field.power_db[np.array(field.bands) == band]
+        names = tuple(name for name, its in zip(field.stations, field.bands, strict=True) if its == band)
+        if not np.isfinite(own).any():
+            continue
+        strongest = best_server(own.reshape(len(own), -1)).reshape(field.grid.shape)
+        level = np.take_along_axis(own, np.maximum(strongest, 0).astype(np.int64)[None], 0)[0]
+        yield Layer(f"power {band}", level, Legend.over(f"received power at {band} [{unit}]", level))
+        where = np.where(strongest == REFUSED, np.nan, strongest)
+        yield _servers(f"best_server {band}", where, names, None)
     if np.isfinite(field.sinr_db).any():
         label = "signal over interference and noise [dB]"
         yield Layer("sinr", field.sinr_db, Legend.over(label, field.sinr_db))
@@ -115,6 +157,9 @@ def layers(field: FieldMap) -> Iterator[Layer]:
     yield Layer("expected_error", error, Legend.over("expected error [dB]", error, "cividis"))
     label = f"width of the {field.share:.0%} interval [dB]"
     yield Layer("width", width, Legend.over(label, width, "cividis"))
+    if "overlap" in field.extra:
+        label = f"stations within {OVERLAP_DB:g} dB of the strongest, on its carrier"
+        yield Layer("overlap", field.extra["overlap"], Legend(label, 1.0, MOST_OVERLAP, "YlOrRd"))
     if "delay_spread_ns" in field.extra:
         layer = field.extra["delay_spread_ns"]
         yield Layer("delay_spread_ns", layer, Legend.over("delay spread [ns]", layer, "plasma"))
@@ -126,13 +171,22 @@ def layers(field: FieldMap) -> Iterator[Layer]:
             yield Layer(f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer))
 
 
+def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], doubt: Any) -> Layer:
+    there = np.unique(number[np.isfinite(number)]).astype(int)
+    words = tuple(one if k in there else "" for k, one in enumerate(stations))
+    return Layer(name, number, Legend("strongest station", -0.5, len(words) - 0.5), words, doubt)
+
+
 def file_name(layer: Layer) -> str:
     """Of its PNG, without what a file system may not like."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
 
 
-def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
-    """Save one layer as PNG, over a floor plan."""
+def draw_layer(
+    field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None,
+    degrees: Georeference | None = None,
+) -> None:  # fmt: skip
+    """Save one layer as PNG, over a floor plan; with axes in degrees where `degrees` says how."""
     left, right, low, high = field.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
@@ -143,19 +197,33 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     legend, known = layer.legend, layer.values[np.isfinite(layer.values)]
     limits = {"vmin": legend.low, "vmax": legend.high}
     image = _cells(axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
-    ends = "both" if ((known < legend.low) | (known > legend.high)).any() else "neither"
-    bar = figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.words:
-        bar.set_ticks(list(range(len(layer.words))), labels=layer.words)
+        _name_areas(axis, field.grid, layer)
+    else:
+        beyond = bool((known < legend.low).any()), bool((known > legend.high).any())
+        ends = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+        figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
     bounded(axis, (left, low), (right, high), title=title)
     draw_places(axis, field)
     scale_bar(axis)
+    if degrees is not None:
+        in_degrees(axis, degrees)
     if field.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
     legend_below(figure)
     save(figure, path, 110)
+
+
+def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
+    """Names on their areas; of few stations also in the legend."""
+    for row, column, word in named_areas(layer.values, layer.words):
+        axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
+                  path_effects=OUTLINE)  # fmt: skip
+    shown = [(colour, word) for colour, word in zip(layer.table(), layer.words, strict=True) if word]
+    for colour, word in shown if len(shown) <= MOST_COLOURS else ():
+        axis.plot([], [], "s", color=colour, label=word)
 
 
 def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
@@ -189,9 +257,12 @@ def draw_places(axis: Any, field: FieldMap) -> None:
     draw_measured(axis, field.places)
     known = field.station_place
     inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
-    if inside.any():
-        draw_stations(axis, known[inside])
-    if 1 < len(known) <= NAMED:
+    faces = np.isfinite(field.azimuth) if len(field.azimuth) else np.zeros(len(known), bool)
+    if (inside & ~faces).any():
+        draw_stations(axis, known[inside & ~faces])
+    if (inside & faces).any():
+        draw_sectors(axis, known[inside & faces], field.azimuth[inside & faces])
+    if 1 < len(known) <= NAMED and not faces.any():
         for where, name in zip(known[inside], np.array(field.stations)[inside], strict=True):
             annotate(axis, name, where)
 

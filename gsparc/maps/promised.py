@@ -6,6 +6,8 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -78,7 +80,11 @@ def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
     if coverage is None:
         own = "intervals are the model's own deviations, and places far from data are not refused"
         return [*notes, f"no promise: {own}"]
-    ours = f"{coverage.share:.1%} did (mean width {coverage.width_db:.1f} dB"
+    apart = (
+        f"{coverage.heard_share:.1%} of those with a level, {coverage.silent_share:.1%} of those below one"
+    )
+    apart = "" if np.isnan(coverage.silent_share) else f", {apart}"
+    ours = f"{coverage.share:.1%} did{apart} (mean width {coverage.width_db:.1f} dB"
     own = f"the model's own deviations: {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB)"
     notes.append(
         f"in {field.share:.0%} of the cells a measurement is promised to lie in its interval: of "

@@ -7,10 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from hydra.utils import get_class
+
 from gsparc.models import checkpoint
 from gsparc.models.method import Method, TrainsByGradient
 from gsparc.models.per_station import PerStation
-from gsparc.models.registry import build, known, method_class
+from gsparc.models.registry import build, known
 from gsparc.training.module import GaussianModule
 
 
@@ -32,8 +34,12 @@ def restore(stored: checkpoint.Stored) -> Method:
     try:
         if isinstance(model, dict) and model.get("_target_") == stored.target:
             make: Callable[[], Method] = partial(build, model, trusted=False)
+        elif stored.target in known().values():
+            make = get_class(stored.target)
         else:
-            make = method_class(_registered(stored))
+            raise checkpoint.CheckpointError(
+                f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
+            )
         method = PerStation(make) if "per_station" in stored.state else make()
         method.restore(stored.site, stored.state)
     except checkpoint.CheckpointError:
@@ -66,12 +72,3 @@ def module_of(path: str | Path) -> GaussianModule:
     if not (isinstance(method, HasModule) and method.trainer_options()):
         raise checkpoint.CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
     return method.module()
-
-
-def _registered(stored: checkpoint.Stored) -> str:
-    names = [name for name, target in known().items() if target == stored.target]
-    if not names:
-        raise checkpoint.CheckpointError(
-            f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
-        )
-    return names[0]

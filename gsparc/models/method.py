@@ -67,7 +67,6 @@ class Method(ABC):
 
     name: str
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
-    linked: ClassVar[Mapping[str, str]] = {"seed": "${seed}"}  # settings that follow those of the run
     # Attributes that hold settings of other names, by setting; "": it tells `heeded.count` itself.
     stored_names: ClassVar[Mapping[str, str]] = {}
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
@@ -222,6 +221,15 @@ class HasProcess(Protocol):
 
     def process(self) -> PowerProcess | None:
         """The process; None where what was fitted has none."""
+
+
+@runtime_checkable
+class HasJoint(Protocol):
+    """Levels of several stations, or at several places, with their covariance."""
+
+    def joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `gsparc.models.powers.together.field.JointPowerField.joint`."""
+        ...
 
 
 @runtime_checkable

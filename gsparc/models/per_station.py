@@ -26,7 +26,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, parts
-from gsparc.models.method import Method, Prediction, Reconditions
+from gsparc.models.method import HasJoint, Method, Prediction, Reconditions
 from gsparc.models.parts import common_label
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
@@ -254,6 +254,11 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: station {name} had too few training rows")
         return OfStation(copy, number) if self._shared else copy
 
+    def every(self) -> OfStations | None:
+        """One that answers each place for all stations at once (B, T); None: each has a copy of its own."""
+        stations = None if self.site is None else self.site.stations
+        return OfStations(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
+
     def _site_of(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
         return site if number == UNHEARD and self.wrapped.shares(site) else of_station(site, number)
@@ -323,6 +328,27 @@ class OfStation(View):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
         return self.inner.predict(replace(query, station=torch.full((len(query),), self.number)))
+
+
+class OfStations(OfStation):
+    """A method that knows all stations of powers, asked about each of them at every place."""
+
+    def __init__(self, inner: Method, count: int) -> None:
+        super().__init__(inner, UNHEARD)
+        self.count = count
+
+    def joint(self) -> HasJoint | None:
+        """What knows how levels of stations go together; None where nothing does."""
+        field = getattr(self.inner, "field", None)
+        return field if isinstance(field, HasJoint) else None
+
+    def predict(self, query: Query) -> Prediction:
+        """Mean and variance (B, T); the ends that stand are not read."""
+        rows = torch.arange(len(query)).repeat_interleave(self.count)
+        station = torch.arange(self.count).repeat(len(query))
+        said = self.inner.predict(replace(query.rows(rows), station=station))
+        variance = None if said.variance is None else said.variance.view(-1, self.count)
+        return Prediction(said.mean.view(-1, self.count), variance)
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:

@@ -11,7 +11,7 @@ import logging
 from abc import abstractmethod
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -59,7 +59,6 @@ class PlannedField(LearnedField):
     """
 
     both_ends = True
-    linked: ClassVar[dict[str, str]] = {"init": "${oc.select:init,null}"}  # the group `init`
 
     @abstractmethod
     def planned(self, data: Measurements) -> Plan:

@@ -1,83 +1,42 @@
-"""Methods by name: choices of `model=` with the settings of their classes, which are imported when chosen."""
+"""Methods by name: `conf/model` says which class each is; types and defaults of settings are the class's."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
+from functools import cache
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from hydra.core.config_store import ConfigNode, ConfigStore
+import yaml
 from hydra.utils import get_class, instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsparc.data import heeded
-from gsparc.data.instantiate import find, node_of, plugins, refuse_foreign, suggest, targets
+from gsparc.data.instantiate import arguments, find, node_of, plugins, refuse_foreign, suggest, targets
 from gsparc.data.limits import SettingError
 
 if TYPE_CHECKING:  # brings torch, which a list of choices does not need
     from gsparc.models.method import Method
 
-METHODS = {
-    "zero": "gsparc.models.baselines.zero.Zero",
-    "mean": "gsparc.models.baselines.mean.Mean",
-    "nearest": "gsparc.models.baselines.nearest.Nearest",
-    "idw": "gsparc.models.baselines.idw.InverseDistance",
-    "distance_law": "gsparc.models.baselines.distance_law.DistanceLaw",
-    "gp": "gsparc.models.baselines.gp.GaussianProcess",
-    "kriging": "gsparc.models.baselines.kriging.Kriging",
-    "gsrf": "gsparc.models.peers.gsrf.GSRF",
-    "wrfgs": "gsparc.models.peers.wrfgs.WRFGSPlus",
-    "swiftwrf": "gsparc.models.peers.swiftwrf.SwiftWRF",
-    "nerf2": "gsparc.models.peers.nerf2.NeRF2",
-    "ngrf": "gsparc.models.peers.ngrf.NGRF",
-    "newrf": "gsparc.models.peers.newrf.NeWRF",
-    "calibrated_raytracer": "gsparc.models.peers.calibrated_raytracer.CalibratedRayTracer",
-    "ridge": "gsparc.models.baselines.ridge.Ridge",
-    "fire": "gsparc.models.peers.fire.Fire",
-    "uplink": "gsparc.models.uplink.method.UplinkField",
-    "complex_gp": "gsparc.models.channels.complex_gp.ComplexGP",
-    "image_source_gp": "gsparc.models.image_sources.method.ImageSourceGP",
-    "directional_gp": "gsparc.models.directional.method.DirectionalGP",
-    "splat": "gsparc.models.splat.alone.Splat",
-    "array": "gsparc.models.splat.array.ArrayField",
-    "moving_array": "gsparc.models.moving_array.method.MovingArrayField",
-    "gsparc": "gsparc.models.gsparc.Gsparc",
-}
 
-
-class _Chosen(ConfigNode):
-    """A choice of `model=` that reads its class when it is chosen: to import all of them takes a second."""
-
-    def __init__(self, name: str, path: str) -> None:
-        self.name, self.path = f"{name}.yaml", path
-        self.group, self.package, self.provider = "model", None, "gsparc"
-
-    def __getattr__(self, attribute: str) -> DictConfig:
-        if attribute != "node":
-            raise AttributeError(attribute)
-        return OmegaConf.create(method_node(self.path))
-
-
-def method_node(path: str) -> dict[str, Any]:
-    """What `model=` holds of the class that an import path names; some of it follows the run's settings."""
-    kind: type[Method] = get_class(path)
-    return node_of(kind, kind.linked)
-
-
-def offer() -> None:
-    """Make every method a choice of Hydra's group `model`."""
-    models = ConfigStore.instance().repo.setdefault("model", {})
-    models |= {f"{name}.yaml": _Chosen(name, path) for name, path in METHODS.items()}
+@cache
+def methods() -> dict[str, str]:
+    """Import paths of the methods of `conf/model`, by name."""
+    files = (file for file in resources.files("gsparc.conf").joinpath("model").iterdir() if file.is_file())
+    nodes = {file.name: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
+    return {name.removesuffix(".yaml"): nodes[name]["_target_"] for name in sorted(nodes)}
 
 
 def known() -> dict[str, str]:
-    """Import paths of all methods by name: `METHODS` and what plugins bring."""
-    return plugins("model") | METHODS
+    """Import paths of all methods by name: `methods()` and what plugins bring."""
+    return plugins("model") | methods()
 
 
 def method_class(name: str) -> type[Method]:
     """The class called `name`; `ValueError` with the nearest right name when there is none."""
-    if name in METHODS:  # before plugins, whose entry points take milliseconds to read
-        return get_class(METHODS[name])
+    if name in methods():  # before plugins, whose entry points take milliseconds to read
+        return get_class(methods()[name])
     there = known()
     if name not in there:
         raise ValueError(f"no method is called {name!r}{suggest(name, there)}")
@@ -92,7 +51,7 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
         trusted: False for text out of a file: then every `_target_` must be a class of gsparc.
 
     Raises:
-        ValueError: no or wrong `_target_`, or arguments it does not take.
+        ValueError: no or wrong `_target_`, or settings it does not take.
     """
     node = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
     target = node.get("_target_")
@@ -103,27 +62,44 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
             refuse_foreign(path)
     from gsparc.models.method import Method
 
-    kind = find(str(target))
-    if isinstance(kind, type):
-        _refuse_words("model", node, node_of(kind))
     with heeded.apart():  # what is handed on is not used yet
-        method = instantiate(node)
+        method = instantiate(complete(deepcopy(node)))
     if not isinstance(method, Method):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method
 
 
-def _refuse_words(group: str, node: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
-    """`SettingError` where a group of settings, at any depth, is given as one value."""
-    for name, own in defaults.items():
-        value = node.get(name, own)
+def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model") -> DictConfig:
+    """Return a node, completed in place at any depth by what its class takes with defaults.
+
+    Args:
+        node: `_target_` and some of its arguments.
+        own: all of them with defaults; None: those of `_target_`.
+        group: name of the node, for errors.
+
+    Raises:
+        SettingError: a setting that the class does not have, or a group of settings given as one value.
+    """
+    kind = find(str(node.get("_target_", (own or {}).get("_target_"))))
+    if not isinstance(kind, type):  # refused where it is built
+        return node
+    own = node_of(kind) if own is None else own
+    given, taken = set(node), {*own, *arguments(kind)} - {"_target_"}
+    for name in (name for name in given - taken if not name.startswith("_")):
+        hint = suggest(name, taken).replace("mean '", f"mean '{group}.") if taken else ", which has none"
+        raise SettingError(f"{group}.{name}: no such setting of {kind.__name__}{hint}")
+    with open_dict(node):
+        node.update({name: default for name, default in own.items() if name not in given})
+    for name in given & own.keys():
+        if OmegaConf.is_interpolation(node, name):
+            continue
+        value, default = node.get(name), own[name]
         if name == "init" and isinstance(value, str):  # a group of the run, which the method's follows
             raise SettingError(f"{group}.{name}={value}: say {name}={value}")
-        if not isinstance(own, Mapping):
-            continue
-        if not isinstance(value, Mapping):
-            some = "=..., ".join(f"{group}.{name}.{key}" for key in list(own)[1:3])  # after `_target_`
-            raise SettingError(
-                f"{group}.{name}={value}: is a group of settings, given one by one: {some}=..."
-            )
-        _refuse_words(f"{group}.{name}", value, own)
+        if isinstance(default, Mapping) and not isinstance(value, DictConfig):
+            some = "=..., ".join(f"{group}.{name}.{key}" for key in list(default)[1:3])  # after `_target_`
+            said = f"{group}.{name}={value}: is a group of settings"
+            raise SettingError(f"{said}, given one by one: {some}=...")
+        if isinstance(default, Mapping):
+            complete(value, default, f"{group}.{name}")
+    return node

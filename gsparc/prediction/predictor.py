@@ -208,7 +208,8 @@ class Predictor:
             said = _in_unit(_predicted(asked._whole, query), asked._in(unit))
             if said.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
-            spread = said.variance.sqrt().float().reshape(-1, *[1] * (said.mean.ndim - 1))
+            spread = said.variance.sqrt().float()
+            spread = spread.reshape(len(spread), -1, *[1] * (said.mean.ndim - 2))
             return _returned(spread, single, as_torch)
 
         return self._of_stations(ask, tx, rx)
@@ -219,9 +220,15 @@ class Predictor:
         Stations that the model has no answer for, as they had too few training rows, are NaN.
         """
         said = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0) is not None
-        stations = [] if said or self.site.kind != "rssi" else self._stations()
-        if not any(stations):
+        if said or self.site.kind != "rssi" or self.site.stations is None:
             return ask(self)
+        every = self.method.every() if isinstance(self.method, PerStation) else None
+        if every is not None:
+            site = of_station(self.site, 0)
+            return ask(
+                Predictor(every, site, None, self.point, self.trusted, self.kind, self.extra, self._unit)
+            )
+        stations = self._stations()
         answers = [None if asked is None else ask(asked) for asked in stations]
         known = next(one for one in answers if one is not None)
         columns = [known * np.nan if one is None else one for one in answers]

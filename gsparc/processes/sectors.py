@@ -62,10 +62,16 @@ class Sectors(Trend):
         """Powers (..., n) [dB] for shared parameters (..., 6), levels, azimuth, tilt and width (..., 3)."""
         assert self.law is not None
         number = places[:, 6].long()
-        azimuth, tilt, width, height, power = self.table[number].T
         decades = self.law.decades(places) - self.middle
-        exponent, bend, wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)
-        level = levels[self.band[number]] + power - 10 * exponent * decades - bend * decades.square()
+        exponent, bend = shared.unsqueeze(-1).unbind(-2)[:2]
+        level = levels[self.band[number]] + self.table[number, 4] - 10 * exponent * decades
+        return level - bend * decades.square() - self.loss(places, shared, own)
+
+    def loss(self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None) -> Tensor:
+        """What patterns take off (..., n) [dB]; see `at`."""
+        azimuth, tilt, width, height, _ = self.table[places[:, 6].long()].T
+        shared = self.shared if shared is None else shared
+        wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]
         away = places[:, :3] - places[:, 3:6]
         flat = away[:, :2].norm(dim=1).clamp_min(1e-3)
         bearing = torch.rad2deg(torch.atan2(away[:, 0], away[:, 1]))
@@ -75,7 +81,7 @@ class Sectors(Trend):
         across = 12 * (across / (width * torch.exp(wider + wide))).square()
         over = 12 * ((down - tilt - tilted - lean) / (height * torch.exp(higher))).square()
         loss = across.minimum(floor) + over.clamp_max(ELEVATION_FLOOR_DB)
-        return level - torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
+        return torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
     def columns(self, places: Tensor) -> Tensor:
         """(n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
@@ -151,10 +157,10 @@ class Pairs:
 
     @classmethod
     def of(cls, a: Tensor, b: Tensor) -> Pairs:
-        """Of places (n, 7) and (m, 7)."""
-        towards = [torch.nn.functional.normalize(at[:, :2] - at[:, 3:5], dim=1) for at in (a, b)]
-        alike = ((towards[0] @ towards[1].T - 1) / BEARING**2).exp()
-        return cls(apart(a[:, :3], b[:, :3]), (a[:, 6:] == b[:, 6:].T).to(a), alike)
+        """Of places (..., n, 7) and (..., m, 7)."""
+        towards = [torch.nn.functional.normalize(at[..., :2] - at[..., 3:5], dim=-1) for at in (a, b)]
+        alike = ((towards[0] @ towards[1].mT - 1) / BEARING**2).exp()
+        return cls(apart(a[..., :3], b[..., :3]), (a[..., 6:] == b[..., 6:].mT).to(a), alike)
 
 
 def with_sectors(trend: Trend, state: Mapping[str, Any]) -> Sectors:

@@ -19,6 +19,8 @@ from gsparc.processes.left_out import left_out
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 
+QUERIES = 512  # at a time: memory
+
 
 @dataclass(frozen=True)
 class Block:
@@ -47,12 +49,29 @@ class Block:
         return self.columns.T @ self.columns
 
 
+@dataclass(frozen=True)
+class _Said:
+    """What is said of B queries of one process.
+
+    Attributes:
+        prior: of the process.
+        more: (B,) mean beyond the prior's.
+        white: (B, n) root of the variance that its rows take away; None without rows.
+        shared: (B, P) root of the variance that the shared weights leave.
+    """
+
+    prior: Prior
+    more: Tensor
+    white: Tensor | None
+    shared: Tensor
+
+
 class Shared:
     """What the rows of several processes say of shared terms, and so of each other.
 
     Args:
         processes: by number, of one value each; possibly none, of which rows were heard before.
-        never: prior of a process without rows.
+        never: prior of a process without rows, whose trend all have.
         columns: of places (n, D), (n, P) of the shared terms for unit normal weights, P at least 1.
         weights: factor of the precision (P, P) of the weights, and their mean (P,); None: of all processes.
     """
@@ -75,26 +94,49 @@ class Shared:
             self._blocks[number] = Block.of(process, self.columns(process.rows))
         return self._blocks[number]
 
-    def answer(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
+    def answer(self, queries: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of a measurement, each (B,).
 
         Args:
             queries: (B, D) float64.
-            number: of the process; one that is not there has no rows.
+            number: (B,) int64, of the process; one that is not there has no rows.
         """
-        block = self.block(number) if number in self.processes else None
-        prior = self.never if block is None else block.process.prior
-        columns = self.columns(queries)
-        mean = prior.mean(queries)[:, 0] + columns @ self.mean
-        own = prior.columns(queries)
-        left = prior.kernel.amplitude * prior.variance(own)
-        if block is not None:
-            cross = deviation_of(prior) * block.process.cross(queries, own)
-            white = block.process.factor.whitened(cross.T).T
-            mean = mean + white @ (block.values - block.columns @ self.mean)
-            left = (left - white.square().sum(1)).clamp_min(0.0)
-            columns = columns - white @ block.columns
-        return mean, left + self.factor.whitened(columns.T).square().sum(0)
+        own, columns = self.never.columns(queries), self.columns(queries)
+        mean, left = self.never.mean(queries)[:, 0], torch.zeros(len(queries), dtype=torch.float64)
+        for one in number.unique().tolist():
+            for at in (number == one).nonzero()[:, 0].split(QUERIES):
+                said = self._said(queries[at], one, own[at], columns[at])
+                mean = mean.index_add(0, at, said.more)
+                prior = said.prior.kernel.amplitude * said.prior.variance(own[at])
+                known = prior if said.white is None else (prior - said.white.square().sum(1)).clamp_min(0.0)
+                left = left.index_add(0, at, known + said.shared.square().sum(1))
+        return mean, left
+
+    def together(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        """Means (B, k) and covariances (B, k, k) of measurements of one process, at (B, k, D) float64."""
+        flat, groups = queries.flatten(0, 1), queries.shape[:2]
+        own = self.never.columns(flat)
+        said = self._said(flat, number, own, self.columns(flat))
+        terms, kernel = own.unflatten(0, groups), said.prior.kernel
+        left = kernel.between(queries, queries) + terms @ terms.mT
+        left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
+        for root, sign in ((said.white, -1), (said.shared, 1)):
+            if root is not None:
+                each = root.unflatten(0, groups)
+                left = left + sign * each @ each.mT
+        mean = self.never.mean(flat)[:, 0] + said.more
+        return mean.unflatten(0, groups), left
+
+    def _said(self, queries: Tensor, number: int, own: Tensor, columns: Tensor) -> _Said:
+        """By one process; `own` (B, Q) and `columns` (B, P) are terms at the queries."""
+        if number not in self.processes:
+            return _Said(self.never, columns @ self.mean, None, self.factor.whitened(columns.T).T)
+        block = self.block(number)
+        prior = block.process.prior
+        cross = deviation_of(prior) * block.process.cross(queries, own)
+        white = block.process.factor.whitened(cross.T).T
+        more = columns @ self.mean + white @ (block.values - block.columns @ self.mean)
+        return _Said(prior, more, white, self.factor.whitened((columns - white @ block.columns).T).T)
 
     @torch.no_grad()
     def left_out(self, number: int) -> tuple[Tensor, Tensor]:

@@ -43,6 +43,23 @@ def test_help_waited_seconds_for_torch(words):
     assert re.search(said.get(words[0], "usage: gsparc check"), done.stdout)
 
 
+def test_composing_waited_seconds_for_torch():
+    """The classes of all methods, or of the one chosen, were imported for their settings."""
+    code = """
+import sys
+from hydra import compose, initialize_config_module
+from gsparc.commands.listing import COMMANDS
+from gsparc.commands.shared import cli
+names = [command.name for command in COMMANDS.values() if command.configured]
+with initialize_config_module("gsparc.conf", version_base="1.3"):
+    for name in names:
+        cli.overview("", name), compose(name)
+    compose("train", ["model=splat", "model.field.count=3", "paper=gsrf"])
+sys.exit("torch" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
 def test_a_typo_gets_the_nearest_command():
     line = "error: no command is called 'tardeoff'; did you mean 'tradeoff'?"
     assert gsparc("tardeoff", "ckpt=x") == Answer(1, [], [line])

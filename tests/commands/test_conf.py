@@ -18,15 +18,16 @@ from lightning import Trainer
 from omegaconf import OmegaConf, open_dict
 
 import gsparc.conf
+from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main
 from gsparc.models.method import Method
-from gsparc.models.registry import METHODS, build
+from gsparc.models.registry import build, methods
 from gsparc.training.fit import DEFAULTS
 
 CONF = Path(gsparc.conf.__path__[0])
 GROUPS = ("dataset", "split", "trainer", "callbacks", "logger", "paper", "experiment")  # of train.yaml
 CHOICES = sorted(f"{group}={file.stem}" for group in GROUPS for file in (CONF / group).glob("*.yaml"))
-CHOICES += [f"model={name}" for name in METHODS]
+CHOICES += [f"model={name}" for name in methods()]
 NEEDED = {
     "dataset=own": ["dataset.file=x.npz"],
     "dataset=newrf": ["dataset.file=x.npz"],
@@ -93,6 +94,16 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
         "effects.array", "effects.moving_array", "effects.phase", "effects.power", "effects.visibility",
         "effects.residual", "steps",
     }  # fmt: skip
+
+
+def test_all_settings_of_a_model_are_printed_and_kept(tmp_path):
+    """Also those that its file leaves to its class."""
+    given = "model=idw", "model.power=3", "dataset=own", f"dataset.file={spectra(tmp_path / 'own.npz')}"
+    said = knock(COMMANDS["train"].run, "train", [*given, "--cfg", "job"])
+    assert {"  power: 3", "  neighbours: 8"} < set(said.out)
+    done = knock(main, "train.py", [*given, "baselines=[]", f"hydra.run.dir={tmp_path / 'run'}"])
+    kept = yaml.safe_load((tmp_path / "run" / ".hydra" / "config.yaml").read_text())["model"]
+    assert done.status == 0 and (kept["power"], kept["neighbours"]) == (3, 8)
 
 
 def test_trainer_defaults_in_code_are_those_of_the_configuration():

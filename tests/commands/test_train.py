@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,13 +24,13 @@ from omegaconf import open_dict
 
 import gsparc
 from gsparc.commands import evaluate
-from gsparc.commands.train import Objects, main, train
+from gsparc.commands.train import Objects, main, objective_of, train
 from gsparc.data.datamodule import Loaded
 from gsparc.data.load import datamodule
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
-from gsparc.evaluation.experiment import options, run
+from gsparc.evaluation.experiment import options
 from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
@@ -107,7 +108,6 @@ def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
     more, times, spectra_file, tmp_path, monkeypatch
 ):
     fits, fit = [], GaussianProcess.fit
-    monkeypatch.setattr(run, "platform_cache", lambda: None)
     monkeypatch.setattr(GaussianProcess, "fit", lambda *given: fits.append(1) or fit(*given))
     facts, _ = train(plain(spectra_file, "gp", "baselines=[gp]", *more), tmp_path)
     assert len(fits) == times
@@ -123,12 +123,35 @@ def test_a_checkpoint_evaluates_to_the_same_figures(field):
     assert image.shape == (16, 32) and image.max() <= 1
 
 
+def test_calls_down_to_the_trainer_are_those_of_the_map(spectra_file, tmp_path, monkeypatch):
+    called = []
+
+    def reached(*unused, **named):
+        stack = [one.name for one in traceback.extract_stack() if str(ROOT / "gsparc") in one.filename]
+        called.extend(name for name in stack if name != "<genexpr>")
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Trainer, "fit", reached)
+    with pytest.raises(ZeroDivisionError):
+        train(short(spectra_file), tmp_path)
+    text = (ROOT / "ARCHITECTURE.md").read_text().partition("Calls down to the Trainer: ")[2]
+    assert called == [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", text.partition(".\n")[0])]
+
+
 def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):
     config = short(spectra_file, "split=grouped", "split.folds=2", "split.buffer_m=0")
     facts, objects = train(config, tmp_path)
     assert [p.parent.name for p in objects.checkpoints] == ["fold0", "fold1"]
     assert facts["split/folds"] == 2 and facts["test/samples"] == 40
     assert facts["time/train_total_s"] == pytest.approx(2 * facts["time/train_s"])
+
+
+def test_a_file_of_a_run_without_folds_was_no_error(field, spectra_file, tmp_path):
+    """All folds began anew: `not folder.glob(...)` is never true, as a generator is not empty."""
+    config = short(spectra_file, "split=grouped", "split.folds=2", "split.buffer_m=0")
+    config.ckpt_path = str(field.checkpoints[0])
+    with pytest.raises(ValueError, match="split=grouped has 2 folds, give the run's folder"):
+        train(config, tmp_path)
 
 
 def test_the_simulated_stand_in_says_so(tmp_path):
@@ -178,7 +201,7 @@ def test_loggers_are_closed_whatever_happens(spectra_file, tmp_path, monkeypatch
         config.logger = {"own": {"_target_": f"{__name__}.Recording"}}
     Recording.made.clear()
     if fails:
-        monkeypatch.setattr(run, "evaluate", lambda *a, **k: 1 / 0)
+        monkeypatch.setattr("gsparc.commands.train.evaluate", lambda *a, **k: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             train(config, tmp_path)
     else:
@@ -421,14 +444,14 @@ def test_the_objective_is_a_figure_of_the_kind():
     config = compose("eval_on=val")
     for kind in KINDS:
         config.objective = None
-        assert run.objective_of(config, kind) == DECIDING[kind] and DECIDING[kind] in figure_names(kind)
+        assert objective_of(config, kind) == DECIDING[kind] and DECIDING[kind] in figure_names(kind)
         for figure in (*figure_names(kind), "skill"):
             config.objective = f"val/{figure}"
-            assert run.objective_of(config, kind) == figure
+            assert objective_of(config, kind) == figure
         config.objective = "val/nmsee"
         said = r"objective=val/nmsee: no such figure; did you mean 'val/nmse'\?"
         with pytest.raises(ValueError, match=said):
-            run.objective_of(config, kind)
+            objective_of(config, kind)
 
 
 def test_every_figure_grows_when_the_prediction_is_better():

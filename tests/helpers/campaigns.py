@@ -56,9 +56,14 @@ def compose(*overrides: str, config: str = "train"):
     from hydra import initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
 
+    from gsparc.models.registry import complete
+
     GlobalHydra.instance().clear()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        return hydra_compose(config, overrides=["hydra.run.dir=.", *overrides])
+        composed = hydra_compose(config, overrides=["hydra.run.dir=.", *overrides])
+    if "model" in composed:
+        complete(composed.model)
+    return composed
 
 
 def runs_in(patch, folder: Path) -> None:

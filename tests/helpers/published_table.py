@@ -10,7 +10,8 @@ from typing import Any
 
 import yaml
 
-from gsparc.models.registry import METHODS, method_node
+from gsparc.data.instantiate import node_of
+from gsparc.models.registry import method_class
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "peers.md"
@@ -31,7 +32,7 @@ def table() -> str:
         same = [f"{key} {value}" for key, value in paper.items() if ours[key] == value]
         other = [f"{key} {ours[key]} ({value})" for key, value in paper.items() if ours[key] != value]
         alone = [f"{key} {value}" for key, value in ours.items() if key not in paper and value is not None]
-        said = " ".join((import_module(METHODS[peer].rpartition(".")[0]).__doc__ or "").split())
+        said = " ".join((import_module(method_class(peer).__module__).__doc__ or "").split())
         left_out = re.findall(r"Left out: (.*?)\.(?: |$)", said)
         rows.append((f"`{peer}`", *map("; ".join, (same, other, alone, left_out))))
     return "\n".join(f"| {' | '.join(row)} |" for row in rows).replace("None", "null")
@@ -41,7 +42,7 @@ def settings(group: str, peer: str) -> dict[str, Any]:
     """Settings of a peer: ours (`model`), or those of conf/paper."""
     file = ROOT / "conf" / "paper" / f"{peer}.yaml"
     paper = yaml.safe_load(file.read_text(encoding="utf-8")).get("model", {}) if file.exists() else {}
-    chosen = method_node(METHODS[peer]) if group == "model" else paper
+    chosen = node_of(method_class(peer)) if group == "model" else paper
     return {key: value for key, value in chosen.items() if key not in NO_SETTING}
 
 

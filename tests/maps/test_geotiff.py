@@ -26,7 +26,7 @@ def test_read_back_at_the_right_place(tmp_path):
     found = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
-        assert file.descriptions[0] == "power_db" and file.count == 10
+        assert file.descriptions[0] == "power_db" and file.count == 11
         for row, column in ((0, 0), (14, 19), (7, 3)):
             x, y = file.xy(len(found.grid.y) - 1 - row, column)
             longitude, latitude = transform(file.crs, "EPSG:4326", [x], [y])

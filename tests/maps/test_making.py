@@ -10,16 +10,26 @@ import numpy as np
 import pytest
 import torch
 from campaigns import channels
+from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
-from gsparc.maps.field_map import ARRAYS, REFUSED, FieldMap, best_server, loads, server_chance, sinr
+from gsparc.maps.field_map import (
+    ARRAYS,
+    REFUSED,
+    FieldMap,
+    best_server,
+    loads,
+    overlapping,
+    server_chance,
+    sinr,
+)
 from gsparc.maps.intervals import Evidence
 from gsparc.maps.making import _usual, answering, levels_at, map_of
-from gsparc.maps.pictures import Layer, Legend, layers
+from gsparc.maps.pictures import Layer, Legend, layers, named_areas, shades
 from gsparc.maps.promise import Promise
 from gsparc.maps.refining import refined
 from gsparc.models.registry import method_class
@@ -116,6 +126,42 @@ def test_ratio_of_signal_to_interference_by_hand():
     assert loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
 
 
+def test_ratio_and_overlap_are_within_one_carrier():
+    power = np.array([[-50.0, -90.0], [-52.0, -60.0], [-54.0, -61.0], [-57.0, np.nan]])
+    carrier = np.array([0, 1, 0, 0])
+    assert overlapping(power, carrier).tolist() == [2, 1] and overlapping(power, carrier * 0).tolist() == [
+        3,
+        2,
+    ]
+    found = sinr(power, np.ones(4), None, carrier)
+    assert found[0] == pytest.approx(-50 - 10 * np.log10(10**-5.4 + 10**-5.7)) and np.isnan(found[1])
+
+
+def test_sectors_that_err_together_are_told_apart():
+    """The chance of the best server took errors of sectors of one site for independent."""
+    power, error = np.array([[-60.0], [-64.0]]), np.full((2, 1), 6.0)
+    usual, floor = np.full((2, 2), np.nan), np.full(2, -np.inf)
+    alone = server_chance(power, error, usual, floor)[0]
+    together = server_chance(power, error, usual, floor, np.array([[1.0], [0.8]]))[0]
+    assert alone == pytest.approx(norm.cdf(4 / np.hypot(6, 6)))
+    assert together == pytest.approx(norm.cdf(4 / np.sqrt(72 * 0.2)))
+
+
+def test_twenty_one_stations_had_twenty_colours():
+    """Those of neighbours were shades of one hue: areas side by side have different ones, and names."""
+    classes = np.kron(np.arange(24.0).reshape(4, 6), np.ones((6, 6)))
+    found = shades(classes, 24)
+    assert found.min() >= 0 and found.max() < 10
+    grid = found[classes.astype(int)]
+    assert (grid[6:][::6] != grid[:-6][::6]).all() and (grid[:, 6:] != grid[:, :-6]).all()
+    words = tuple(f"cell {i}" for i in range(24))
+    table = Layer("best_server", classes, Legend("", -0.5, 23.5), words).table()
+    assert len(table) == 24 and len(np.unique(table, axis=0)) <= 10
+    named = list(named_areas(classes, words))
+    assert [word for _, _, word in named] == list(words)
+    assert all(classes[row, column] == words.index(word) for row, column, word in named)
+
+
 def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(predictor):
     power = np.array([[-60.0, -60.0, np.nan, -60.0], [-90.0, -60.0, np.nan, np.nan]])
     error, never = np.full((2, 4), 5.0), np.full((2, 2), np.nan)
@@ -194,11 +240,3 @@ def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
     assert names == ["west"] and "east was never heard" in notes[0]
     with pytest.raises(DataError, match="never heard"):
         answering(predictor, ["east"], promise)
-
-
-def test_twenty_one_stations_had_twenty_colours():
-    """Those of neighbours were shades of one hue, and the last was the first's."""
-    words = tuple(f"station {number}" for number in range(21))
-    colours = Layer("best_server", np.zeros((1, 1)), Legend("", -0.5, 20.5), words).table()[:, :3]
-    apart = np.linalg.norm(colours[:, None] - colours, axis=-1)
-    assert apart[~np.eye(21, dtype=bool)].min() > 0.1 and np.diag(apart, 1).min() > 0.4

@@ -18,7 +18,7 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baselines import fitting
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
+from gsparc.evaluation.experiment.fit import fit_folds, in_folders
 from gsparc.evaluation.scores import score
 from gsparc.models import checkpoint, loading
 from gsparc.models.per_station import PerStation, for_links, of_station
@@ -85,8 +85,9 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
 
 
 def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_taken_away(town, tmp_path):
-    split, context = split_for({"name": "stations"}, town), in_folders(FitContext(tmp_path))
-    fits = fit_and_score(method_class("mean"), town, split, context, eval_on=None)
+    split = split_for({"name": "stations"}, town)
+    contexts = in_folders(FitContext(tmp_path), split)
+    fits = fit_folds(method_class("mean"), town, split, contexts)
     found = evaluate(
         fits.methods, None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
     ).facts  # fmt: skip
@@ -95,7 +96,7 @@ def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_t
     assert found["test/rmse_db"] > max(10, 2 * found["test/rmse_db_after_constant"])
     gsparc_like = type("OneEnd", (method_class("mean"),), {"both_ends": False})
     with pytest.raises(ValueError, match="cannot predict stations that it never heard"):
-        fit_and_score(gsparc_like, town, split, context)
+        fit_folds(gsparc_like, town, split, contexts).scored_on(town, split)
 
 
 def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
@@ -128,8 +129,9 @@ def test_real_city(tmp_path):
             }
         )  # fmt: skip
     split = split_for({"name": "blocks", "side_m": 300.0}, data)
+    contexts = in_folders(FitContext(tmp_path), split)
     found = {
-        name: fit_and_score(method_class(name), data, split, in_folders(FitContext(tmp_path))).figures
+        name: fit_folds(method_class(name), data, split, contexts).scored_on(data, split).figures
         for name in ("mean", "idw")
     }
     assert 9 < found["mean"]["rmse_db"] < 11 and 6 < found["idw"]["rmse_db"] < 8

@@ -34,7 +34,7 @@ from gsparc.models.method import Method, Reducible, suited_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.per_station import for_links
-from gsparc.models.registry import METHODS, build, method_class
+from gsparc.models.registry import build, method_class, methods
 from gsparc.models.splat.array import ArrayField
 from gsparc.models.uplink.search import SearchSettings as UplinkSearch
 from gsparc.ops import Pose
@@ -142,7 +142,7 @@ def ends(method: Method, moving: torch.Tensor) -> Query:
     return Query(moving, Pose(still, torch.from_numpy(turn).float()))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", methods())
 def test_a_method_is_what_the_table_says(name):
     method = method_class(name)()
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
@@ -209,7 +209,7 @@ def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.
     return predictor.linear(**{data.site.moving_end: places}).mean / data.site.target_scale
 
 
-@pytest.mark.parametrize("name", [name for name in METHODS if name != "calibrated_raytracer"])
+@pytest.mark.parametrize("name", [name for name in methods() if name != "calibrated_raytracer"])
 def test_what_is_scored_is_what_is_served(name):
     """`answer` of rows and `predict` of places were two ways, each with code of its own."""
     method, data, fold = fitted(name)

@@ -10,10 +10,10 @@ from campaigns import compose
 from gsparc.data import instantiate
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method
-from gsparc.models.registry import METHODS, build, method_class
+from gsparc.models.registry import build, method_class, methods
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", methods())
 def test_choices_hold_defaults_of_their_class(name):
     """`baselines=[gsrf]` trained other settings than `model=gsrf`."""
     chosen, own = build(compose(f"model={name}").model), method_class(name)()

@@ -15,7 +15,7 @@ from shoeboxes import scatter
 from gsparc.data.datasets.argos import load_argos
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import LIGHT
-from gsparc.models.registry import METHODS, build, method_class
+from gsparc.models.registry import build, method_class, methods
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
 from gsparc.simulate.shoebox import Room, trace
@@ -188,4 +188,4 @@ def test_methods_of_the_uplink_stay_finite_or_refuse(tmp_path, name, wrong):
 
 def test_no_method_is_forgotten():
     here = {name for names in (*QUICK.values(), UPLINK, *(cut[2] for cut in SLOW.values())) for name in names}
-    assert here | {"calibrated_raytracer"} == set(METHODS)  # it needs a scene: tests/peers
+    assert here | {"calibrated_raytracer"} == set(methods())  # it needs a scene: tests/peers

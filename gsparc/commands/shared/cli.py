@@ -8,8 +8,10 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from functools import partial, wraps
+from io import StringIO
+from pathlib import Path
 from types import FrameType
 
 import hydra
@@ -17,7 +19,7 @@ import yaml
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from gsparc.commands.shared.plugins import offer, offer_scenes
@@ -52,7 +54,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     offer()
     if config == "simulate":
         offer_scenes()
-    if config == "train":
+    if config == "train" and any(word.startswith("ckpt_path=") for word in sys.argv):
         from gsparc.commands.shared.continued import with_settings_of_run  # which brings torch
 
         sys.argv[1:] = with_settings_of_run(sys.argv[1:])
@@ -66,7 +68,10 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         with _noting(interrupts):
             for folder in (given.config_dir, given.config_path):
                 check_yaml(folder)
-            main()
+            if given.cfg in ("job", "all"):
+                _show_whole(main)
+            else:
+                main()
     except BrokenPipeError:  # of Hydra's own lists: gsparc/__main__.py ends quietly
         raise
     except (_Failed, InUse, KeyboardInterrupt, Exception) as failure:
@@ -87,6 +92,17 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
+
+
+def _show_whole(main: Callable[[], object]) -> None:
+    """What `--cfg` prints, with those settings of the model that its file leaves to its class."""
+    with redirect_stdout(StringIO()) as said:
+        main()
+    config = DictConfig(OmegaConf.create(said.getvalue()))
+    node = config if "_target_" in config else config.get("model")  # the former with `--package model`
+    if isinstance(node, DictConfig):
+        registry.complete(node)
+    sys.stdout.write(OmegaConf.to_yaml(config))
 
 
 @contextmanager
@@ -150,9 +166,8 @@ def _message_of(error: BaseException) -> str:
 def overview(answers: str, config: str) -> str:
     """What `--help` says: what a command `answers`, its settings with their comments, choices of its groups.
 
-    Read from files: Hydra's own list of all values imports the classes whose arguments they are, for seconds.
+    Read from files: Hydra's own list of all values has no comments.
     """
-    registry.offer()
     offer_scenes()
     text = (config_folder() / f"{config}.yaml").read_text(encoding="utf-8")
     texts = [answers, text.partition("\nhydra:")[0].rstrip()]
@@ -167,11 +182,23 @@ def overview(answers: str, config: str) -> str:
     return "\n\n".join(texts) + f"\n\n`gsparc {config} key=value ... --cfg job` shows every value.\n"
 
 
+def _complete(config: DictConfig) -> None:
+    """Add the settings of a model that its file leaves to its class, also to what Hydra has written."""
+    registry.complete(config.model)
+    hydra_config = HydraConfig.get()
+    if hydra_config.output_subdir is not None:
+        OmegaConf.save(
+            config, Path(hydra_config.runtime.output_dir, hydra_config.output_subdir, "config.yaml")
+        )
+
+
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
     @wraps(task)
     def wrapped(config: DictConfig) -> object:
         logging.captureWarnings(True)  # now that there is a log
         try:
+            if "model" in config:
+                _complete(config)
             return task(config)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.RUN:

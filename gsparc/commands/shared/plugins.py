@@ -10,7 +10,6 @@ from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
 
 from gsparc.data.instantiate import GROUPS, node_of, plugins
-from gsparc.models.registry import method_node
 from gsparc.simulate.scenes.shipped import settings, shipped
 
 
@@ -22,11 +21,13 @@ def offer() -> None:
     for group in GROUPS:
         for name, path in plugins(group).items():
             try:
-                own = method_node(path) if group == "model" else node_of(get_class(path))
+                own = node_of(get_class(path))
             except Exception as error:  # whatever another package does when it is imported
                 warnings.warn(f"plugin {name} ({path}) is left out: {error}", stacklevel=1)
                 continue
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
+            if group == "model" and "seed" in own:
+                shared["seed"] = "${seed}"
             node = {**own, **shared}
             ConfigStore.instance().store(name=name, group=group, node=node, provider="plugin")
 

@@ -17,7 +17,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import plain as plain
-from gsparc.models.registry import build, known
+from gsparc.models.registry import known
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,10 @@ class RunSettings(Checked):
             raise SettingError(f"trainer.accelerator={accelerator!r}: one of {', '.join(kinds)}")
         if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
             raise SettingError(f"trainer.accelerator={accelerator}: there is no GPU here; say trainer=cpu")
-        if "model" in config:
-            build(config.model)  # its parts check themselves, and so do callbacks
         for name, node in (config.get("callbacks") or {}).items():
             if node is not None and not isinstance(node, Mapping):
                 raise SettingError(f"callbacks.{name}={node}: is a group of settings; null leaves it out")
-            instantiate(node)
+            instantiate(node)  # checks itself
         for key, value in _leaves(values):
             if isinstance(value, float):
                 Limit("a finite number", math.isfinite).check(key, value)

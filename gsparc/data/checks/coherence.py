@@ -57,8 +57,8 @@ class Coherence:
             else f"every row has a {self.freedom.replace('+', ', ')} of its own: "
         )
         return (
-            f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, by "
-            f"{self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
+            f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
+            f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
             f"scatter by {self.level_db:.1f} dB ({self.pairs} pairs)"
         )
 

@@ -16,7 +16,7 @@ from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems
-from gsparc.data.files import read_text
+from gsparc.data.files import Several, read_text
 from gsparc.data.own import interpret
 from gsparc.data.public.fetch import fetched, found
 from gsparc.data.raw import Raw, read_raw
@@ -30,7 +30,7 @@ class Campaign(DataModule):
     """A published campaign with stations, of which all rows or a part are used.
 
     Args:
-        file: what `raw` reads; None: what `gsparc data` fetched of it.
+        file: what `raw` reads, one or several tables of the same columns; None: what `gsparc data` fetched.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
         stations, runs, min_rssi_db, max_rows, level_steps: see `gsparc.data.selection.Selection`.
         **settings: what `reader` takes besides.
@@ -42,7 +42,7 @@ class Campaign(DataModule):
 
     def __init__(
         self,
-        file: str | Path | None = None,
+        file: str | Path | Sequence[str | Path] | None = None,
         name: str | None = None,
         batch_size: int = 16,
         stations: Sequence[str | int] | None = None,
@@ -54,7 +54,9 @@ class Campaign(DataModule):
     ) -> None:
         super().__init__(name or self.choice, batch_size)
         file = fetched(self.choice) if file in (None, "", "???") else file
-        self.file = str(file) if "://" in str(file) else Path(file)  # which would make one of two slashes
+        one = str(file) if isinstance(file, str | Path) else Several(file)
+        whole = isinstance(one, Several) or "://" in one  # a path would make one of two slashes
+        self.file = one if whole else Path(one)
         self.settings = settings
         self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
 

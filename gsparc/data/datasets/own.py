@@ -20,6 +20,7 @@ from gsparc.data.datasets.techtile_power import raw_of_techtile_power
 from gsparc.data.datasets.wifi_csi import raw_of_wifi_csi
 from gsparc.data.datasets.wsr import raw_of_wsr
 from gsparc.data.errors import Caution, DataError
+from gsparc.data.files import Several
 from gsparc.data.limits import choice, finite, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
@@ -189,6 +190,8 @@ def raw_of(
     Raises:
         DataError: not readable, or columns that nothing can be made of.
     """
+    if isinstance(path, Several) and not (cell_m is None and all(is_table(one) for one in path.paths)):
+        raise DataError(f"{path}: several files are read as one where all are tables, without dataset.cell_m")
     if cell_m is None and not is_table(path):
         named = any(value is not None for value in (columns or {}).values())
         for name in [name for name, given in (("columns", named), ("stations_file", stations_file)) if given]:

@@ -11,7 +11,8 @@ from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker, is_unit, quat
 from gsparc.data.schema import ENDS, OTHER, End, Links, Stations
 
 # Of a station's beam, in the order of `Stations.sector`.
-SECTOR = ("station_azimuth", "station_tilt", "station_width", "station_thickness", "station_power_db")
+SECTOR = ("station_azimuth", "station_tilt", "station_width", "station_thickness", "station_power_db",
+          "station_site")  # fmt: skip
 FULL_TURN = 360.0
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 

@@ -11,7 +11,7 @@ from gsparc.data.errors import Caution, some
 from gsparc.data.links.stations import SECTOR
 from gsparc.data.tables.columns import Chosen, as_station, choose, station_names
 from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, understand, words_of
-from gsparc.data.tables.sectors import TILTS, meaning, read_sectors
+from gsparc.data.tables.sectors import TILTS, meaning, read_sectors, sites_of
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
@@ -199,6 +199,9 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     aliases = _aliases(sheet, used)
     sectors, more = read_sectors(sheet, {head for head in used if head} | {pair[0] for pair in aliases})
     notes += more
+    sites = sites_of(sheet)
+    if sites is not None:
+        sectors["station_site"] = sites
     if coordinates is not None and coordinates.height is None and "height" in sectors:
         coordinates = replace(coordinates, height=np.nan_to_num(sectors["height"], nan=UNKNOWN_HEIGHT))
     if coordinates is None:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from gsparc.data.checks.outliers import two_groups
 from gsparc.data.errors import Caution, nearest, some
+from gsparc.data.files import Several
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS
@@ -54,7 +55,7 @@ def understand_table(
     """The arrays of a table, and what was guessed.
 
     Args:
-        path: *.csv, *.tsv, *.txt or *.parquet.
+        path: *.csv, *.tsv, *.txt or *.parquet, or several.
         columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for all rows,
             a pattern with a `*` for a column per station.
         stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
@@ -81,9 +82,9 @@ def understand_table(
     arrays = builder.build()
     sheet.problems.raise_if_any()
     power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
-    about = {}
+    about = {"name": "+".join(Path(one).stem for one in path.paths)} if isinstance(path, Several) else {}
     if power is not None and power.unit is not None:
-        about = {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
+        about |= {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
         if not power.unit.name.startswith("x "):  # a column that is scaled has the schema's unit
             about["unit"] = power.unit.name
     about |= {"zones": builder.zones} if builder.zones else {}

@@ -28,6 +28,10 @@ SAID: dict[str, str] = {
     "band": "band|frequency band|lte band|freq band",
 }
 HEADS = {text: name for name, texts in SAID.items() for text in texts.split("|")}
+SITES = {  # heads of what sectors of one site have alike
+    *("site", "site id", "site name", "site code", "enodeb", "enodeb id", "enodeb name", "enb", "enb id"),
+    *("gnodeb", "gnodeb id", "gnodeb name", "gnb id", "nodeb", "mast", "tower", "bts", "base station"),
+}
 OTHER = {
     *("antenna", "ant", "sector", "cell", "site", "deg", "degree", "degrees", "dbm", "mhz", "of", "the"),
 }
@@ -118,6 +122,16 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
             )
         )
     return found, notes
+
+
+def sites_of(sheet: Sheet) -> np.ndarray | None:
+    """Numbers (T,) float64 of the sites that a column of the list names; None where none does."""
+    for head in sheet.heads:
+        words = sheet.words(head) if head and " ".join(words_of(head)) in SITES else np.zeros(0, str)
+        number, names = pd.factorize(words)
+        if 1 < len(names) < len(words) and (words != "").all():
+            return number.astype(np.float64)
+    return None
 
 
 def _number(word: str) -> str:

@@ -17,7 +17,7 @@ import pandas as pd
 from fsspec.core import url_to_fs
 
 from gsparc.data.errors import Caution, DataError, Problems, lines_of, reason
-from gsparc.data.files import checked_line
+from gsparc.data.files import Several, checked_line
 from gsparc.data.tables import TABLE_SUFFIXES
 from gsparc.data.tables.heads import PERCENT, UNITS, Unit, understand
 
@@ -497,6 +497,8 @@ def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet,
     Raises:
         DataError: no such file, another ending, or no table.
     """
+    if isinstance(path, Several):
+        return _stacked([sheet_of(one, problems) for one in path.paths], path)
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")
@@ -504,3 +506,19 @@ def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet,
         raise DataError(f"{path}: expected a name ending in .csv, .tsv, .txt or .parquet")
     sheet, notes = (read_parquet(str(path)), []) if path.suffix.lower() == ".parquet" else read_text(path)
     return replace(sheet, problems=Problems(path) if problems is None else problems), notes
+
+
+def _stacked(parts: list[tuple[Sheet, list[str]]], source: str) -> tuple[Sheet, list[str]]:
+    """Rows of one table after those of the other; `DataError` where their columns differ."""
+    first = parts[0][0]
+    for sheet, _ in parts[1:]:
+        if set(sheet.heads) != set(first.heads) or sheet.decimal != first.decimal:
+            lacking = sorted(set(sheet.heads) ^ set(first.heads))[:3]
+            raise DataError(f"{sheet.source}: other columns than {first.source} has: {', '.join(lacking)}")
+    columns = (
+        pd.concat([sheet.columns[sheet.heads.index(head)] for sheet, _ in parts], ignore_index=True)
+        for head in first.heads
+    )
+    rows = tuple(f"{Path(sheet.source).name}, {row}" for sheet, _ in parts for row in sheet.rows)
+    notes = list(dict.fromkeys(note for _, own in parts for note in own))
+    return replace(first, source=source, columns=tuple(columns), rows=rows), notes

@@ -13,11 +13,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
-
 from gsparc.data.instantiate import find, plugins, targets
 from gsparc.evaluation.experiment.problem import Problem
-from gsparc.models.registry import METHODS
+from gsparc.models.registry import methods
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 
@@ -80,13 +78,13 @@ class Cell:
 
 def plugged() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
-    offered, methods = ConfigStore.instance().repo.get("model", {}), {}
+    found = {}
     for name, path in plugins("model").items():
-        if name not in METHODS and f"{name}.yaml" in offered:
-            kind = find(path)
+        kind = find(path)
+        if name not in methods() and kind is not None:  # one that cannot be imported is warned of
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
-            methods[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
-    return methods
+            found[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
+    return found
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -82,44 +82,41 @@ class Outcome:
     cost: Cost = NO_COST
 
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
-        """The same fits scored on other data, such as displaced queries."""
+        """The same fits with figures, of what they learned from or of other data, as displaced queries."""
         started = time.perf_counter()
         figures = pooled(score(self.methods, data, split, eval_on), data, split)
         return replace(self, figures=figures, score_s=time.perf_counter() - started)
 
 
-def in_folders(context: FitContext) -> Callable[[int], FitContext]:
-    """The context of each fold, which differs in its folder."""
-    return lambda number: replace(context, run_dir=context.run_dir / f"fold{number}")
+def in_folders(whole: FitContext, split: Split) -> list[FitContext]:
+    """The contexts of its folds, each with a folder and series of figures of its own."""
+    return [whole.within(f"fold{number}") for number in range(len(split.folds))]
 
 
-def fit_and_score(
+def fit_folds(
     make: Callable[[], Method],
     data: Measurements,
     split: Split,
-    context: Callable[[int], FitContext],
+    contexts: Sequence[FitContext],
     *,
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
-    eval_on: str | None = "test",
     keep: Callable[[int, Method, FitReport], None] | None = None,
 ) -> Outcome:
-    """Fit an unfitted method per fold, then score them together.
+    """Fit an unfitted method on every fold; `Outcome.scored_on` scores them together.
 
     Args:
         make: an unfitted method.
         data, split: learned from `train` and `val` of each fold.
-        context: of each fold's fit, by its number.
+        contexts: of each fold's fit.
         learned: what is learned from instead, such as displaced or fewer measurements.
-        eval_on: `train`, `val` or `test` rows that are scored; None scores nothing.
         keep: called after each fit with the fold's number, the method and its report.
 
     Raises:
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
-    # Loggers and loaders of a run are of its process: elsewhere a fold has neither curves nor a DataModule.
-    left: dict[str, Any] = {"loggers": (), "datamodule": None} if elsewhere() and len(split.folds) > 1 else {}
-    contexts = [replace(context(number), **left) for number in range(len(split.folds))]
+    if elsewhere() and len(split.folds) > 1:  # loggers and loaders of a run are of its process
+        contexts = [replace(context, loggers=(), datamodule=None) for context in contexts]
 
     def fitted(number: int) -> tuple[Method, FitReport, float]:
         fold = split.folds[number]
@@ -134,8 +131,7 @@ def fit_and_score(
         if keep is not None:
             keep(number, *one[:2])
     methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
-    fits = Outcome(
+    return Outcome(
         methods, tuple(one.seconds for one in reports), processor, {}, 0.0, reports[0].notes,
         less_repeatable(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
     )  # fmt: skip
-    return fits if eval_on is None else fits.scored_on(data, split, eval_on)

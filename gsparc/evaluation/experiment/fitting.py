@@ -22,7 +22,7 @@ from gsparc.data.schema import Kind
 from gsparc.evaluation.console import one_line, plain
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.cells import Cell, Contender, key
-from gsparc.evaluation.experiment.fit import context_of, fit_and_score, in_folders
+from gsparc.evaluation.experiment.fit import context_of, fit_folds, in_folders
 from gsparc.evaluation.experiment.problem import RESULT, Problem, compose, facts_of
 from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.summary import provenance, write_summary
@@ -158,10 +158,10 @@ def fill(prepared: Prepared) -> Filled:
         checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
 
     folds = split if prepared.scored else replace(split, folds=split.folds[:1])
-    outcome = fit_and_score(
-        partial(build, config.model), data, folds, in_folders(context_of(config, run_dir=folder)),
-        eval_on="test" if prepared.scored else None, keep=keep,
-    )  # fmt: skip
+    contexts = in_folders(context_of(config, run_dir=folder), folds)
+    outcome = fit_folds(partial(build, config.model), data, folds, contexts, keep=keep)
+    if prepared.scored:
+        outcome = outcome.scored_on(data, folds)
     facts: dict[str, Any] = {f"test/{name}": value for name, value in outcome.figures.items()}
     facts |= {
         "time/train_s": statistics.fmean(outcome.train_s),

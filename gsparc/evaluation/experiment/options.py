@@ -20,7 +20,6 @@ from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.evaluation.console import config_folder
 from gsparc.models.method import Method, TrainsByGradient
 from gsparc.models.parts import leaves
-from gsparc.models.registry import build
 
 log = logging.getLogger(__name__)
 
@@ -66,9 +65,9 @@ def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]
             return
 
 
-def noting(config: DictConfig) -> Reads:
-    """What is to be noted of the options that were `given`."""
-    method, options = build(config.model), []
+def noting(config: DictConfig, method: Method) -> Reads:
+    """What is to be noted of the options that were `given` to a method that `config.model` describes."""
+    options = []
     for path in given():
         group, _, name = path.rpartition(".")
         node = OmegaConf.select(config, group) if group else None

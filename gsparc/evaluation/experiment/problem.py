@@ -23,6 +23,7 @@ from gsparc.data.public.fetch import found
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
+from gsparc.models.registry import complete
 from gsparc.simulate.scenes.build import names_scene
 
 log = logging.getLogger(__name__)
@@ -189,7 +190,9 @@ def compose(
 def _composed(overrides: tuple[str, ...]) -> DictConfig:
     """Composing takes half a second, and draws differ in numbers only."""
     chosen = ["logger=none", "~callbacks.pictures", *overrides]
-    return hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
+    config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
+    complete(config.model)
+    return config
 
 
 def problems_of(settings: Mapping[str, Any], cells_dir: Path) -> list[Problem]:

@@ -13,7 +13,7 @@ import pandas as pd
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.experiment.fit import Outcome, fit_and_score, in_folders
+from gsparc.evaluation.experiment.fit import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.models.method import Method
 from gsparc.models.refined_places import displaced as elsewhere
@@ -152,9 +152,10 @@ class Study:
             outcome = plain
             if outcome is None or condition.changes_training:
                 folder = context.run_dir / variant / str(condition).replace(" ", "-") / str(turn)
-                settings = in_folders(replace(context, run_dir=folder, seed=seed))
+                contexts = in_folders(replace(context, run_dir=folder, seed=seed), split)
                 learned_from = partial(condition.learned_from, seed=seed)
-                outcome = fit_and_score(self.variants[variant], data, split, settings, learned=learned_from)
+                fits = fit_folds(self.variants[variant], data, split, contexts, learned=learned_from)
+                outcome = fits.scored_on(data, split)
                 plain = plain if condition.changes_training else outcome
             if condition.what == "query":
                 outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)

@@ -69,9 +69,10 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     ]
     firsts = [group[0] for group in tables.grouped(runs).values()]
     study.pictures = [
-        (run.setting, _png(run.folder / "test.png"))
+        (f"{run.setting}{what}", _png(run.folder / name))
         for run in firsts[:MOST_PICTURES]
-        if (run.folder / "test.png").is_file()
+        for name, what in (("test.png", ""), ("sectors.png", ": sectors"))
+        if (run.folder / name).is_file()
     ]
     return study
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import count, pairwise
 from typing import Any, ClassVar
@@ -115,7 +115,6 @@ class TrainedPeer(Method):
     kinds: ClassVar[tuple[Kind, ...]]
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
-    linked: ClassVar[Mapping[str, str]] = {"seed": "${seed}", "budget_s": "${budget_s}"}
     name: str
     budget_s: float | None = None
     max_steps: int | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from gsparc.models.splat.method import LearnedField
 
@@ -16,7 +16,6 @@ class Splat(LearnedField):
     """
 
     effects = "image"
-    linked: ClassVar[dict[str, str]] = {"init": "${oc.select:init,null}"}  # the group `init`
 
     def __init__(self, name: str = "splat", **field: Any) -> None:
         super().__init__(name=name, **field)

@@ -112,9 +112,7 @@ def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_pa
     assert checkpoint.read(tmp_path / "run" / "model.ckpt").extra["run_id"] == first
     assert read_run(tmp_path / "run").facts["run_id"] == first
     with monkeypatch.context() as broken, pytest.raises(RuntimeError):
-        broken.setattr(
-            "gsparc.evaluation.experiment.run.evaluate", lambda *a, **b: (_ for _ in ()).throw(RuntimeError)
-        )
+        broken.setattr("gsparc.commands.train.evaluate", lambda *a, **b: (_ for _ in ()).throw(RuntimeError))
         train(compose(*given, "split.seed=5", "model=gp"), tmp_path / "run")
     left = {path.name for path in (tmp_path / "run").iterdir()}
     assert not {"summary.json", "per_sample.csv", "test.png"} & left

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
+from gsparc.evaluation.experiment.fit import fit_folds, in_folders
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -17,10 +17,9 @@ def test_folds_that_are_fitted_elsewhere_have_the_same_figures(campaign, folds, 
     kept = []
 
     def outcome():
-        context = in_folders(FitContext(tmp_path))
-        return fit_and_score(
-            method_class("gp"), data, split, context, keep=lambda number, *unused: kept.append(number)
-        )
+        context = in_folders(FitContext(tmp_path), split)
+        keep = lambda number, *unused: kept.append(number)  # noqa: E731
+        return fit_folds(method_class("gp"), data, split, context, keep=keep).scored_on(data, split)
 
     here = outcome()
     elsewhere("joblib")

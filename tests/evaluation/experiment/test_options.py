@@ -1,5 +1,6 @@
 """Every option is heeded or named: tiny fits of each method on each kind of data, and options perturbed."""
 
+from copy import deepcopy
 from functools import cache, partial
 from pathlib import Path
 from tempfile import mkdtemp
@@ -18,8 +19,8 @@ from gsparc.data.executor import Engine
 from gsparc.data.load import datamodule, split_for
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.fit import context_of, fit_and_score
-from gsparc.models.registry import build
+from gsparc.evaluation.experiment.fit import context_of, fit_folds
+from gsparc.models.registry import build, complete
 
 WORLDS = {
     "array": World("array", 1, 1, "tx", "metres", "none", "random", 30),
@@ -40,24 +41,24 @@ def file_of(world: str) -> Path:
 
 
 def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
-    """Names of options without effect, and answers at the test rows, after what `run` does until then."""
+    """Names of options without effect, and answers at the test rows, after what `train` does until then."""
     given = ["dataset=own", f"dataset.file='{file_of(world)}'", "logger=none", *overrides]
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         whole = hydra.compose("train", overrides=given, return_hydra_config=True)
     config = OmegaConf.masked_copy(whole, [key for key in whole if key != "hydra"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HydraConfig.instance(), "cfg", whole)
-        reads = options.noting(config)
+        method = build(complete(config.model))
+        reads = options.noting(config, method)
         with heeded.recording(reads):
             data = datamodule(config.dataset).measurements
             split = split_for(plain(config.split), data)
             folder = Path(mkdtemp())
-            fits = fit_and_score(
-                partial(build, config.model),
+            fits = fit_folds(
+                partial(deepcopy, method),
                 data,
                 split,
-                lambda n: context_of(config, run_dir=folder),
-                eval_on=None,
+                [context_of(config, run_dir=folder)] * len(split.folds),
             )
             method, rows = fits.methods[0], split.folds[0].test
             method.predict(data.batch(rows[:1]))

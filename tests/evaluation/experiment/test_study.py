@@ -10,7 +10,7 @@ from clocks import WoundClock
 from invented import divide, invent
 
 from gsparc.data.query import Batch
-from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
+from gsparc.evaluation.experiment.fit import fit_folds, in_folders
 from gsparc.evaluation.experiment.study import Measured, Positions, Study, facts_of
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
@@ -118,8 +118,8 @@ def test_more_measurements_are_better_and_are_counted():
 def test_folds_are_pooled_and_each_fit_is_handed_on():
     data, split = invent("csi"), divide(48, 3)
     kept = []
-    found = fit_and_score(Nearest, data, split, in_folders(CONTEXT), keep=lambda *given: kept.append(given))
+    fits = fit_folds(Nearest, data, split, in_folders(CONTEXT, split), keep=lambda *given: kept.append(given))
+    assert fits.figures == {} and np.isfinite(fits.train_cpu_s).all()
+    found = fits.scored_on(data, split)
     assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3
     assert found.figures["samples"] == 48 and found.score_s > 0
-    unscored = fit_and_score(Nearest, data, split, in_folders(CONTEXT), eval_on=None)
-    assert unscored.figures == {} and np.isfinite(unscored.train_cpu_s).all()

@@ -33,7 +33,6 @@ from gsparc.processes.shared import Shared
 from gsparc.training.time_budget import TimeBudget
 
 NEVER = -1  # in place of a station's number: one that was never heard
-QUERIES = 512  # at a time: memory
 MOST_EACH = 6_000  # rows of a station
 MEMORY = 3e9  # bytes of all stations' factors
 PLACES = 600  # that the shared process is known at in the end
@@ -107,20 +106,42 @@ class JointPowerField(ConditionalField):
             ValueError: before `condition`.
         """
         posterior, elsewhere = self._conditioned()
-        places, number = self._ends(query)
-        if self.network is not None:
-            places = torch.cat([places, number[:, None].clamp_min(0)], 1)
-            number = torch.where(number < 0, NEVER, torch.from_numpy(self.network.site)[number.clamp_min(0)])
+        places, number = self._by_process(*self._ends(query))
         mean, spread, share = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
-        for one in number.unique().tolist():
-            of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
-            for chosen in torch.nonzero(number == one)[:, 0].split(QUERIES):
-                mean[chosen], left = of.answer(places[chosen], one)
+        heard = torch.isin(number, torch.tensor([*posterior.processes]))
+        for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
+            if chosen.any():
+                mean[chosen], left = of.answer(places[chosen], number[chosen])
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
         power = self._power(mean)
         return Prediction(power, entry_variance(spread, power, "rssi"), share)
+
+    @torch.no_grad()
+    def joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Levels (G, k) of measurements [dB], covariances (G, k, k) and noise (k,) [dB^2], float64.
+
+        Args:
+            moving: (G, k, 3) places of the moving end [m].
+            stations: (k,) int64, of each place of a group: several of one place, or one of several.
+        """
+        posterior, elsewhere = self._conditioned()
+        still = torch.from_numpy(self.places)[stations].expand(*moving.shape[:2], 3)
+        places = torch.cat([moving.double(), still], 2).flatten(0, 1)
+        places, number = self._by_process(places, stations.repeat(len(moving)))
+        places, number = places.unflatten(0, moving.shape[:2]), number[: len(stations)]
+        groups, count = moving.shape[:2]
+        mean, noise = torch.zeros(groups, count).double(), torch.zeros(count).double()
+        covariance = torch.zeros(groups, count, count).double()
+        for one in number.unique().tolist():
+            at = (number == one).nonzero()[:, 0]
+            of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
+            mean[:, at], left = of.together(places[:, at], one)
+            covariance[:, at[:, None], at] = inflation * left
+            kernel = self.own.prior(one).kernel
+            noise[at] = inflation * kernel.amplitude * kernel.noise
+        return mean, covariance, noise
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
@@ -175,6 +196,13 @@ class JointPowerField(ConditionalField):
         here, there = torch.cat([moving, still], 1), torch.cat([still, moving], 1)
         places = torch.where(turned[:, None], there, here)
         return places, self._standing(places[:, 3:])
+
+    def _by_process(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+        """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""
+        if self.network is None:
+            return places, number
+        site = torch.from_numpy(self.network.site)[number.clamp_min(0)]
+        return torch.cat([places, number[:, None].clamp_min(0)], 1), torch.where(number < 0, NEVER, site)
 
     def _by_law(self, moving: Tensor) -> Tensor:
         """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.

@@ -8,11 +8,13 @@ rows that are only below a level count by expectation propagation.
 from __future__ import annotations
 
 import math
+import re
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
@@ -28,6 +30,7 @@ from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
+SAME_NAME_M = 100.0  # the same of those whose names differ in their last part alone
 USUAL = (0.0, 0.0, 65.0, 10.0, 0.0)  # of `Stations.sector` where it is not known
 NO_PATTERN = 1e9  # width [deg] of a beam in height whose tilt nobody gave
 ONE_BAND = 1.1  # ratio of carriers of one band
@@ -72,10 +75,12 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Network 
     stations = data.site.stations
     assert stations is not None
     places = stations.position if places is None else places
-    sector = np.full((len(places), len(USUAL)), np.nan) if stations.sector is None else stations.sector
-    near = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1) <= SAME_SITE_M
-    near |= np.eye(len(places), dtype=bool)  # at an unknown place, too
-    site = np.unique(near.argmax(1), return_inverse=True)[1].reshape(-1).astype(np.int64)
+    sector = np.full((len(places), len(USUAL) + 1), np.nan) if stations.sector is None else stations.sector
+    apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1)
+    stem = np.array([re.sub(r"(.)[-_ /.:][^-_ /.:]*$", r"\1", name) for name in stations.name])
+    near = (apart <= SAME_SITE_M) | ((apart <= SAME_NAME_M) & (stem[:, None] == stem))
+    near |= sector[:, None, 5] == sector[:, 5]  # as a column of the list says
+    site = connected_components(near)[1].astype(np.int64)
     levels = () if data.censored is None else np.unique(data.target[data.censored > 0])
     several = 2 * (np.bincount(site)[site] > 1).sum() >= len(site) and len(levels) > len(site)
     if not several and not np.isfinite(sector[:, 0]).any():
@@ -86,6 +91,7 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Network 
         order = np.argsort(stations.carrier_hz)
         steps = np.diff(stations.carrier_hz[order], prepend=stations.carrier_hz[order[:1]])
         band[order] = np.cumsum(steps > (ONE_BAND - 1) * stations.carrier_hz[order])
+    sector = sector[:, : len(USUAL)]
     table = np.where(np.isfinite(sector), sector, USUAL)
     table[:, 3] = np.where(np.isfinite(sector[:, 1]), table[:, 3], NO_PATTERN)
     table[:, 0] = np.where(np.isfinite(sector[:, 0]), sector[:, 0] % 360, NO_AZIMUTH)

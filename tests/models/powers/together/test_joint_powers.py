@@ -103,12 +103,15 @@ def test_it_is_the_dense_process():
     inner = np.linalg.solve(gram[:count, :count], np.c_[values[:count], gram[:count, count:]])
     mean = gram[count:, :count] @ inner[:, 0]
     variance = gram[count:, count:].diagonal() - (gram[count:, :count] * inner[:, 1:].T).sum(1)
+    places = torch.from_numpy(asked.places)
+    said = posterior.answer(places, torch.from_numpy(asked.station))
+    assert np.allclose(said[0].numpy(), asked.decibels - values[count:] + mean, atol=1e-8)
+    assert np.allclose(said[1].numpy(), variance, atol=1e-8)
+    known = gram[count:, count:] - gram[count:, :count] @ inner[:, 1:]
     for number in asked.stations:
-        at = np.flatnonzero(asked.station == number)
-        said = posterior.answer(torch.from_numpy(asked.places[at]), number)
-        law = asked.decibels[at] - values[count:][at]
-        assert np.allclose(said[0].numpy(), law + mean[at], atol=1e-8)
-        assert np.allclose(said[1].numpy(), variance[at], atol=1e-8)
+        at = np.flatnonzero(asked.station == number)[:2]
+        together = posterior.together(places[at][None], number)[1][0]
+        assert np.allclose(together.numpy(), known[np.ix_(at, at)], atol=1e-8)
 
 
 def joined(*parts):

@@ -1,5 +1,6 @@
 """A network of sectors: what lists of the strongest leave out, patterns, wrong azimuths, a known truth."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.data.units import in_decibels
+from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, for_links
@@ -51,6 +53,16 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6))
     assert found["rmse"] < 0.7 * plain["rmse"] and abs(found["bias_unlisted"]) < 3
     assert all(0.8 < found[name] < 0.97 for name in ("hold", "hold_listed", "hold_unlisted"))
+    every = method.every()
+    assert every is not None and every.joint() is not None
+    moving = torch.from_numpy(one.asked - method.site.origin)[:, None].expand(-1, 30, 3)
+    level, covariance, noise = every.joint().joint(moving, torch.arange(30))
+    mean, spread = levels(method, one)
+    assert np.allclose(level + 10 * np.log10(method.site.target_scale), mean, atol=1e-3)
+    assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
+    assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
+    assert (covariance[:, 0, 3] == 0).all() and (noise > 0).all()  # of sectors of two sites
+    assert draw_sector_levels(method, one.data(6), np.arange(500), tmp_path / "sectors.png")
     wrong = one.azimuth != network(1, moments=300, asked=120).azimuth
     named = [
         note.split("azimuth of ")[1].split(":")[0]
@@ -96,9 +108,22 @@ def test_stations_at_places_of_their_own_are_no_network():
     one = network(0)
     data = one.data(6, azimuths=False)
     assert network_of(data, one.place).site.max() == 9
-    assert network_of(data, one.place + 50 * np.arange(30)[:, None]) is None
+    assert network_of(data, one.place + 500 * np.arange(30)[:, None]) is None
     whole = from_arrays({"rx_position": one.moment, "station_position": one.place, "rssi_db": one.measured})
     assert network_of(whole) is None  # of all stations, not of the strongest
+
+
+def test_sectors_belong_to_a_site_by_name_or_by_a_column():
+    """Sectors on the corners of a roof, more than 5 m apart, were sites of their own."""
+    one = network(0)
+    apart = replace(one, place=one.place + np.tile([[0.0, 0, 0], [20, 0, 0], [0, 20, 0]], (10, 1)))
+    arrays = apart.arrays(6)
+    said = from_arrays(arrays, {"name": "network"})
+    assert network_of(said).site.tolist() == np.repeat(np.arange(10), 3).tolist()
+    names = {"station_name": np.array([f"cell{i}" for i in range(30)])}
+    assert network_of(from_arrays(arrays | names, {"name": "network"})).site.max() == 29
+    column = {"station_site": np.repeat(np.arange(10.0), 3)}
+    assert network_of(from_arrays(arrays | names | column, {"name": "network"})).site.max() == 9
 
 
 def sectors() -> Sectors:
