@@ -99,7 +99,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         for note in report.notes:
             log_of_models.info("%s", note)
         if not curve.read(folders[number]):  # a method that trains in one piece
-            context(number).curve(report.seconds, method.name, report.error)
+            context(number).curve(report.seconds, method.name)
         marks = parts.marks(report, data, split.folds[number], context(number))
         extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
         checkpoint.save(files[number], method, yaml, extra)
