@@ -72,20 +72,19 @@ def find(
     fields: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
     read: dict[str, set[str]] = {}
-    race: Race | None = None
     ended: dict[str, str] = {}
+    race: Race | None = None
 
     def note(what: str, error: float) -> None:
         context.curve(budget.counted.wall, what, error)
 
     for name, settings in plans:
         part = name.split()[-1]
-        if fields and context.resume is None and part in SEARCHES and budget.over():
-            log.info("init=%s is left out: the seconds were over", name)
-            continue
-        if part in SEARCHES and (why := ended.get(part) or _reached(race)):
-            log.info("init=%s is left out: %s", name, why)
-            continue
+        if part in SEARCHES:
+            spent = fields and context.resume is None and budget.over()
+            if why := "the seconds were over" if spent else ended.get(part) or _reached(race):
+                log.info("init=%s is left out: %s", name, why)
+                continue
         within, began = replace(context, budget_s=budget.left_s), budget.counted.wall
         if name.startswith("few "):
             within = replace(within, run_dir=Path(), resume=None)
@@ -103,24 +102,19 @@ def find(
             if field.held is not None:
                 target = comparable(data.batch(field.held.rows).target, data.site)
                 one = Race.of(field.held.rows, comparable(field.held.mean, data.site), target, note)
-                if race is not None and part in SEARCHES:
-                    race.looked(name, one.rows, one.squared)
-                else:
+                if race is None or part not in SEARCHES:
                     note(name, float(one.squared.mean()))
-                if race is None or one.error < race.error:
-                    race = one
+                else:
+                    race.looked(name, one.rows, one.squared)
+                race = one if race is None or one.error < race.error else race
         except KeyboardInterrupt:
             if not name.startswith("few "):
                 raise
             raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
-        except Behind as behind:
-            log.info("init=%s is left out: %s", name, behind)
-            ended[part] = str(behind)
-            fields.pop(name, None)
-            reports[name] = FitReport(budget.counted.wall - began)
-            continue
         except ValueError as error:
-            if len(parts) == 1 or name == init.name:
+            if isinstance(error, Behind):
+                ended[part], reports[name] = str(error), FitReport(budget.counted.wall - began)
+            elif len(parts) == 1 or name == init.name:
                 raise
             log.info("init=%s is left out: %s", name, error)
             fields.pop(name, None)
