@@ -73,7 +73,7 @@ class Queries:
                 return place[0] if len(place) == 1 else place
             if self.site.stations is not None:
                 raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
-            if self.site.kind == "rssi":  # learned without its transmitter's place
+            if self.site.kind in ("rssi", "csi"):  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
         if place is not None and (np.linalg.norm(place - known, axis=-1) > SAME_PLACE_M).any():

@@ -69,7 +69,7 @@ def convention_warnings(data: Measurements) -> list[str]:
     signals, labels = _arrayed(data, of_file)
     rows = _drawn(signals)
     few, signals, labels = of_file.rows(rows[:1]), signals.rows(rows), labels[rows]
-    zeros = _zeros(signals) if kind == "csi" else []
+    zeros = _zeros(signals) if kind == "csi" and len(rows) else []  # none where an end is at an unknown place
     entries = signals.values.shape[2] * (1 if signals.array is None else signals.values.shape[1])
     if len(rows) < FEWEST[kind]:
         return zeros

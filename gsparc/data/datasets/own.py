@@ -16,6 +16,7 @@ from gsparc.data.datasets.powder import raw_of_powder
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile import raw_of_techtile
 from gsparc.data.datasets.techtile_power import raw_of_techtile_power
+from gsparc.data.datasets.wifi_csi import raw_of_wifi_csi
 from gsparc.data.datasets.wsr import raw_of_wsr
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.limits import choice, or_null, switch
@@ -91,9 +92,13 @@ LOADERS: dict[str, Callable[[Path], Raw]] = {
     "newrf": raw_of_newrf,
     "techtile_power": raw_of_techtile_power,
     "wsr": raw_of_wsr,
+    "wifi_csi": raw_of_wifi_csi,
 }
 # What lies in folders of releases.
-FOLDERS = {"ble": "cnf/tetam.dev", "techtile_power": "*_positions.npy", "wsr": "**/csi_rx_*.dat"}
+FOLDERS = {
+    "ble": "cnf/tetam.dev", "techtile_power": "*_positions.npy",
+    "wsr": "**/csi_rx_*.dat", "wifi_csi": "*.pcap",
+}  # fmt: skip
 PLANE = 2  # coordinates of places in POWDER's files
 
 

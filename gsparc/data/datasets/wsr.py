@@ -52,7 +52,7 @@ NPZ = {
 
 @dataclass(frozen=True)
 class Log:
-    """One end's packets: card's and computer's time [s], sender, counter, channel (n, 30) [root of mW]."""
+    """One end's packets: card's and computer's time [s], sender, counter, channel (n, 30, 3) [root of mW]."""
 
     tick: np.ndarray
     time: np.ndarray
@@ -117,7 +117,7 @@ def _of_release(root: Path, transmitters: Mapping[str, Sequence[float]], spacing
 
 
 def read_log(path: Path) -> Log:
-    """Packets of an Intel 5300, of the first of its three antennas.
+    """Packets of an Intel 5300 with three antennas.
 
     Raises:
         DataError: missing, or its records are of another form.
@@ -146,7 +146,10 @@ def read_log(path: Path) -> Log:
     scale = np.sqrt(heard_mw * len(TONES) / np.maximum(np.sum(np.abs(csi) ** 2, axis=(1, 2)), 1))
     time = records["second"] + 1e-6 * records["microsecond"]
     numbers = records["number"].astype(np.int64)
-    return Log(1e-6 * records["tick_us"], time, records["sender"], numbers, csi[..., 0] * scale[:, None])
+    # Antennas come in the order of the card's receivers, which changes from packet to packet.
+    order = np.argsort(records["order"][:, None] >> [0, 2, 4] & 3, axis=1, kind="stable")
+    csi = np.take_along_axis(csi, order[:, None], axis=2) * scale[:, None, None]
+    return Log(1e-6 * records["tick_us"], time, records["sender"], numbers, csi)
 
 
 def _way(path: Path) -> np.ndarray:
@@ -183,7 +186,7 @@ def _link(
 def _square(robot: Log, other: Log, sender: np.void) -> tuple[float, np.ndarray, np.ndarray]:
     """How well neighbours agree (at most 1), the robot's packets (n,), the square of the channel (n, 30)."""
     mine, theirs, late = _paired(robot, other, sender)
-    square = without_slope(robot.csi[mine] * other.csi[theirs])
+    square = without_slope(robot.csi[mine, :, 0] * other.csi[theirs, :, 0])
     turn, step = np.sum(square[1:] * square[:-1].conj(), axis=1), np.diff(late)
     offsets = np.arange(-MOST_OFFSET_HZ, MOST_OFFSET_HZ, OFFSET_STEP_HZ)  # of the two oscillators [Hz]
     agree = [np.real(np.sum(turn * np.exp(-2j * np.pi * hz * step))) for hz in offsets]

@@ -84,7 +84,7 @@ def _without_table(check: Checker, measured: str) -> Links | None:
 def _with_table(check: Checker, measured: str) -> Links | None:
     """A file with a table of stations, wide or long, as one row per link."""
     before = len(check.problems)
-    stations = station_table(check, measured in POWERS)
+    stations = station_table(check, measured in (*POWERS, "csi"))
     ends = check.given("rx_position", "tx_position")
     if len(ends) != 1:
         names = " and ".join(ends) or "neither"

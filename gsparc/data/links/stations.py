@@ -63,7 +63,7 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
 def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
     """The table that a file gives; None where something is wrong with it (noted).
 
-    Places may be missing, NaN throughout, where powers alone are told by the stations.
+    Places may be missing, NaN throughout, where powers or channels alone are told by the stations.
     """
     arrays = check.raw.arrays
     positions = arrays["station_position"]

@@ -211,7 +211,10 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     if site.stations is None:
         return moving, static, turned, torch.zeros(count, dtype=torch.long)
     known = torch.from_numpy(np.asarray(site.stations.position, np.float64))
-    away, nearest = torch.cdist(static, known).min(1)
+    away, nearest = torch.cdist(static, known).nan_to_num(math.inf).min(1)
+    lost = known.isnan().any(1)  # an end at an unknown place is the first station at one
+    here = static.isnan().any(1) & lost.any()
+    away, nearest = away.masked_fill(here, 0), nearest.masked_fill(here, int(lost.int().argmax()))
     return moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY)
 
 

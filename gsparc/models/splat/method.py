@@ -127,6 +127,9 @@ class LearnedField(Method):
         """
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
         if data.site.kind == "csi":
+            if np.isnan([data.tx, data.rx_position]).any():
+                lost = f"{data.site.name} does not say where its static end is"
+                raise ValueError(f"{self.name}: {lost}; take model=complex_gp")
             self._shape = (data.target.shape[1], data.target.shape[2])
         self.choices, reasons = resolve(self.settings, self.init.name, data.site)
         for reason in reasons:
