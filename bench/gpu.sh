@@ -1,13 +1,12 @@
 #!/usr/bin/env bash
-# Everything there is to know about the CUDA backend on one GPU: bench/gpu.sh FOLDER [stage ...]
-# Stages: build tests hard bench sanitize train (all by default). Leaves FOLDER/cuda.json, FOLDER/cuda.md and a log of each
-# stage, also where one fails; in ten minutes at a time: "build tests", "bench sanitize", "hard train". WHEELS: a folder of
-# what is missing here (bench/wheels.sh). RFID: a folder of the real release, to train on instead of a simulated site.
+# Checks of the CUDA backend on one GPU: bench/gpu.sh FOLDER [stage ...]
+# Stages: build tests hard sanitize train (all by default). Leaves a log of each stage in FOLDER, also where one fails; in ten
+# minutes at a time: "build tests", "sanitize", "hard train". WHEELS: a folder of what is missing here (bench/wheels.sh).
 set -uo pipefail
 cd "$(dirname "$0")/.."
 OUT=$(mkdir -p "${1:?usage: bench/gpu.sh FOLDER [stage ...]}" && cd "$1" && pwd)
 shift
-STAGES=${*:-build tests hard bench sanitize train}
+STAGES=${*:-build tests hard sanitize train}
 PYTHON=${PYTHON:-$([ -x .venv/bin/python ] && echo .venv/bin/python || echo python3)}
 export PYTHONUNBUFFERED=1
 FAILED=""
@@ -23,7 +22,6 @@ if [ -n "${WHEELS:-}" ]; then
   done
   export PYTHONPATH="$SPARE${PYTHONPATH:+:$PYTHONPATH}"
 fi
-"$PYTHON" bench/gpu.py needs "$OUT/cuda.json"
 
 # Where gsparc is not installed (-P: the folders here are not the package), lay its rooms out under their installed names and build the CPU kernels there.
 if ! "$PYTHON" -P -c "import gsparc.ops._native" 2>/dev/null; then
@@ -46,7 +44,6 @@ stage() { # stage NAME LIMIT_S COMMAND...
   local status=$?
   tail -n "${LINES_SHOWN:-25}" "$OUT/$name.log"
   echo "== $name: exit $status after $((SECONDS - started)) s"
-  "$PYTHON" bench/gpu.py note "$OUT/cuda.json" "$name" "$status" "$((SECONDS - started))"
   [ $status -eq 0 ] || FAILED="$FAILED $name"
 }
 
@@ -62,14 +59,18 @@ sanitize() {
   done
   return $worst
 }
-export -f sanitize
-export PYTHON
+train() { # the splatted field, on the GPU and on the CPU: the figures of both stand in train.log
+  for accelerator in gpu cpu; do
+    "$PYTHON" -P train.py experiment=demo dataset.root=build/stand-ins dataset.count=160 "baselines=[nearest]" trainer.accelerator=$accelerator \
+      model.effects.array=false model.effects.phase=false hydra.run.dir="$OUT/train-$accelerator" || return
+  done
+}
+export -f sanitize train
+export PYTHON OUT
 
-stage build 300 "$PYTHON" bench/gpu.py build "$OUT/cuda.json"
+stage build 300 "$PYTHON" -P -m gsparc.ops.cuda_library
 stage tests 240 "$PYTHON" -P -m pytest tests/cuda tests/ops -q --maxfail=20 -k "gpu or test_device" -p no:cacheprovider
 stage hard 240 "$PYTHON" -P -m pytest tests/hard_cases -q --maxfail=20 -m "not slow" -k "cuda and not shim" -p no:cacheprovider
-stage bench 200 "$PYTHON" bench/gpu.py bench "$OUT/cuda.json"
 stage sanitize 290 bash -c sanitize
-stage train 290 "$PYTHON" bench/gpu.py train "$OUT/cuda.json"
-"$PYTHON" bench/gpu.py table "$OUT/cuda.json" | tee "$OUT/cuda.md"
+stage train 290 bash -c train
 [ -z "$FAILED" ] || { echo "failed:$FAILED"; exit 1; }

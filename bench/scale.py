@@ -86,13 +86,13 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
     missed = []
     for part in np.array_split(fold.test, -(-len(fold.test) // 256)):
         batch = data.batch(part)
-        missed.append(error(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()))
+        missed.append(error(method.predict(batch).mean.numpy(), batch.target.numpy()))
     squared = np.concatenate(missed)
     rmse = np.sqrt(squared.mean())
     ones = [data.batch(fold.test[i : i + 1]) for i in range(SINGLE)]
     began = time.process_time()
     for one in ones:
-        method.predict(one.tx, one.rx)
+        method.predict(one)
     query = (time.process_time() - began) / SINGLE * 1e3
     spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
     values = (cpu, wall, query, rmse, spread, before, peak_gb(), private.most, os.getloadavg()[0])

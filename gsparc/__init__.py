@@ -22,7 +22,6 @@ _PUBLIC = {
     "Predictor": "gsparc.prediction.predictor",
     "Pose": "gsparc.ops",
     "SphereGrid": "gsparc.ops",
-    "load_ipython_extension": "gsparc.commands.shared.notebook",  # what `%load_ext gsparc` asks for
 }
 __all__ = ["Pose", "Predictor", "SphereGrid", "fit", "load"]
 

@@ -11,7 +11,6 @@ import pytest
 from gsparc.data.assemble import identity
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
-from gsparc.evaluation import baseline_cache
 from gsparc.evaluation.experiment import problem
 from gsparc.evaluation.experiment.cells import key
 from gsparc.evaluation.experiment.problem import SplitChoice, load_problems
@@ -33,45 +32,40 @@ FACTS = {
 
 
 class Asked(Exception):
-    """Carries the path that a cache looked for."""
+    """Carries the key that was looked for."""
 
 
-def _keys(data, split, monkeypatch, folder) -> dict[str, str]:
+def _keys(data, split, monkeypatch) -> dict[str, str]:
     """The name under which each cache keeps what it finds of these data."""
 
-    def asked(path, *unused):
-        raise Asked(str(path))
+    def asked(key):
+        raise Asked(key)
 
-    monkeypatch.setattr(vector_cache, "_read", asked)
-    monkeypatch.setattr(baseline_cache, "_stored_fit", asked)
+    monkeypatch.setattr(vector_cache, "_kept", asked)
     monkeypatch.setattr(problem, "compose", lambda *unused: SimpleNamespace(dataset={}, split={}))
     monkeypatch.setattr(problem, "plain", lambda node: node)
     monkeypatch.setattr(problem, "load", lambda unused: data)
     monkeypatch.setattr(problem, "split_for", lambda *unused: split)
     found = {}
     rows = np.arange(len(data))
-    for name, look in {
-        "vectors": lambda: vector_cache.recovered(data, rows, folder),
-        "baselines": lambda: baseline_cache.baseline("mean", data, split, cache=folder),
-    }.items():
-        with pytest.raises(Asked) as path:
-            look()
-        found[name] = str(path.value)
+    with pytest.raises(Asked) as key_of_vectors:
+        vector_cache.recovered(data, rows)
+    found["vectors"] = str(key_of_vectors.value)
     found["searches"] = str(ImageSourceGP()._depends_on(data, rows))
     (one,) = load_problems("toy", {}, [SplitChoice("random")])
     found["cells"] = key({}, {}, *one.hashes)
     return found
 
 
-def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, folds, monkeypatch, tmp_path):
+def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, folds, monkeypatch):
     """Of another `grid_deg` or `normalisation` a comparison showed the kept 32.4169 dB for 32.3799."""
     assert set(FACTS) == {one.name for one in fields(Site)}, "a new fact of a site is to be named here"
     data, split = campaign("spectrum", 20), folds(20)
-    before = _keys(data, split, monkeypatch, tmp_path)
-    assert before == _keys(replace(data), split, monkeypatch, tmp_path)
+    before = _keys(data, split, monkeypatch)
+    assert before == _keys(replace(data), split, monkeypatch)
     for name, value in FACTS.items():
         other = replace(data, site=replace(data.site, **{name: value}))
-        after = _keys(other, split, monkeypatch, tmp_path)
+        after = _keys(other, split, monkeypatch)
         same = [cache for cache in before if before[cache] == after[cache]]
         assert not same, f"{name}: {same}"
     for renamed in (("one", "three"), ("two", "one")):
@@ -85,18 +79,3 @@ def test_facts_are_the_same_after_a_checkpoint(campaign):
     whole = replace(data.site, **{**FACTS, "target_scale": np.float64(3.0)})
     again = _site_from(_as_numpy(_plain(asdict(whole), "site")))
     assert identity(replace(data, site=again)) == identity(replace(data, site=whole))
-
-
-def test_baselines_of_another_program_text_are_fitted_again(monkeypatch, tmp_path):
-    """A change of the shared processes or metrics left kept baselines as they were."""
-    files = [tmp_path / name for name in ("models/gp.py", "processes/kernel.py", "evaluation/metrics.py")]
-    for file in (*files, tmp_path / "evaluation/scores.py"):
-        file.parent.mkdir(exist_ok=True)
-        file.write_text("a = 1\n")
-    (tmp_path / "physics").mkdir()
-    monkeypatch.setattr("gsparc.__file__", str(tmp_path / "__init__.py"))
-    found = {baseline_cache.program.__wrapped__()}
-    for file in files:
-        file.write_text("a = 2\n")
-        found.add(baseline_cache.program.__wrapped__())
-    assert len(found) == 4

@@ -31,7 +31,7 @@ ARROWS = {
     "training": "data field ops",
     "models": "data field ops physics processes simulate training",
     "prediction": "data field locate models ops physics processes training",
-    "locate": "data models ops processes training",
+    "locate": "data models processes training",
     "evaluation": "conf data locate models prediction simulate training",
     "maps": "data evaluation models prediction processes training",
     "view": "data evaluation maps models ops prediction",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import resource
 import sys
 import tempfile
@@ -54,5 +55,6 @@ def main(names: list[str]) -> float:
 
 
 if __name__ == "__main__":
+    os.environ["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # of `gsparc` in cells
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     main(sys.argv[1:])

@@ -76,6 +76,5 @@ class GPyTorch(Interpolator):
             asked = torch.from_numpy(queries).expand(len(self.y), -1, -1)
             found = self._ready(asked)
             scores, spread = found.mean.T * self.unit, found.variance.mean(0) / self._ready.kernel.outputscale
-        return Prediction(
-            self._decode(self.mean + scores.float() @ self.axes), (1 - spread).clamp(0, 1).float()
-        )
+        mean = self._decode(self.mean + scores.float() @ self.axes)
+        return Prediction(mean, unknown=spread.clamp(0, 1).float())

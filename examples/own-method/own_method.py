@@ -29,7 +29,7 @@ class NearestK(Interpolator):
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        """At places (B, 3) [m]; `variance=` and `confidence=` (B,) may be given besides."""
+        """At places (B, 3) [m]; `variance=` and `unknown=` (B,) may be given besides."""
         near = cKDTree(self.places.numpy()).query(queries, k=range(1, self.k + 1))[1]
         return Prediction(self._decode(self.rows[near].float().mean(1)))
 

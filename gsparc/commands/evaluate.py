@@ -10,7 +10,6 @@ from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
-from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation.evaluate import Evaluation, evaluate
@@ -26,7 +25,6 @@ def evaluate_files(
     *,
     eval_on: str = "test",
     baselines: Sequence[str] | None = (),
-    cache: Path | None = None,
 ) -> tuple[Evaluation, Measurements, Split]:
     """Evaluate checkpoints of one run, one per fold.
 
@@ -37,7 +35,6 @@ def evaluate_files(
         paths, dataset, split: see `open_files`.
         eval_on: `train`, `val` or `test`.
         baselines: shown beside it; None: all plain methods that serve the data.
-        cache: where baselines are kept; None keeps nothing.
 
     Raises:
         ValueError: as `open_files`.
@@ -49,7 +46,7 @@ def evaluate_files(
     seconds = [one.extra.get("train_s") for one in run.stored]
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
     evaluation = evaluate(
-        run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines, cache=cache,
+        run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines,
         learned=run.trained if other else None,
     )  # fmt: skip
     evaluation.facts.update({"split/foreign": run.foreign, "split/without_baselines": without})
@@ -67,7 +64,6 @@ def task(config: DictConfig) -> dict[str, Any]:
         plain(config.split),
         eval_on=config.eval_on,
         baselines=config.baselines,
-        cache=platform_cache() if config.cache is None else Path(config.cache),
     )
     seed = checkpoint.read(paths[0]).configuration.get("seed")
     facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}

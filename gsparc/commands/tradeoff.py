@@ -15,7 +15,6 @@ from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import plain
-from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
 from gsparc.evaluation.metric_formats import DECIDING, score_of
@@ -45,9 +44,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, reduced(method, some, measured)) for some in settings]
-    cache = platform_cache() if config.cache is None else Path(config.cache)
-    contenders = config.baselines, config.peers, config.ckpt, config.eval_on
-    others = tradeoff.others_of(run, *contenders, cache)
+    others = tradeoff.others_of(run, config.baselines, config.peers, config.ckpt, config.eval_on)
     places = data.moving[rows] + data.site.origin
     clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)

@@ -15,7 +15,8 @@ import torch
 
 from gsparc.data.checks import outliers
 from gsparc.data.limits import check_arguments, whole
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.query import Batch
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 
 log = logging.getLogger(__name__)

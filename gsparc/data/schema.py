@@ -1,4 +1,4 @@
-"""Facts of a dataset, its samples and batches of them."""
+"""Facts of a dataset and its samples."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
+from gsparc.data.query import Batch
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
 
@@ -204,45 +205,6 @@ class Site:
         if self.carrier_hz is None:
             raise ValueError(f"{self.name}: neither subcarriers_hz nor carrier_hz is known; phase needs them")
         return np.array([self.carrier_hz], dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Samples handed to a model together; positions are local float32 [m].
-
-    Attributes:
-        index: (B,) int64 row in the dataset.
-        tx: (B, 3) [m].
-        rx: one shared Pose, or B poses.
-        target: (B, H, W) float32, or (B, antennas, subcarriers) complex64, or (B, 1) float32.
-        mask: like target, bool, True where measured; None when everything was.
-        noise_variance: (B,) float32 in target units; None when unknown.
-        uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
-        station: (B,) int64, which of the site's stations each is of; None where there is one.
-        run: (B,) int64, see `Measurements`; None where all are in phase.
-        share: of a training step's rows, where processes share them; 0 where another has these rows.
-    """
-
-    index: Tensor
-    tx: Tensor
-    rx: Pose
-    target: Tensor
-    mask: Tensor | None = None
-    noise_variance: Tensor | None = None
-    uplink: Tensor | None = None
-    station: Tensor | None = None
-    run: Tensor | None = None
-    share: float = 1.0
-
-    def __len__(self) -> int:
-        return self.index.shape[0]
-
-    def to(self, device: torch.device | str) -> Batch:
-        """The same samples on another device."""
-        moved: dict[str, Any] = {
-            k: v.to(device) for k, v in vars(self).items() if isinstance(v, (Tensor, Pose))
-        }
-        return replace(self, **moved)
 
 
 @dataclass(frozen=True)

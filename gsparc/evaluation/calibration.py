@@ -16,9 +16,8 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
-from gsparc.models.method import Method
+from gsparc.models.method import Method, predictions
 from gsparc.prediction.confidence import (
-    CHUNK,
     Evidence,
     Trusted,
     gather,
@@ -320,8 +319,7 @@ def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, floa
     """`peers/*` and `denormalised/*` of Argos data: the figures under both normalisations, all test rows."""
     if data.uplink is None:
         return {}
-    batches = (data.batch(fold.test[i : i + CHUNK]) for i in range(0, len(fold.test), CHUNK))
-    predicted = np.concatenate([method.answer(batch).mean.numpy() for batch in batches])
+    predicted = np.concatenate([said.mean.numpy() for _, _, said in predictions(method, data, fold.test)])
     target = data.target[fold.test]
     both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
     results = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}

@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.data.assemble import identity
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
+from gsparc.evaluation.baselines import Fitted, baseline, fitting
 from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.scores import Scores, rows_of, score, unseen_runs
@@ -66,7 +66,7 @@ def evaluate(
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
         baselines: names in `gsparc.models.registry.METHODS`; None: all plain ones that serve these rows.
-        cache: folder where baselines are kept between runs; None keeps nothing.
+        cache: unused.
         clock: how long to measure latencies.
         learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
         shared: the baseline that the methods are, which is then not fitted again.
@@ -87,7 +87,7 @@ def evaluate(
     if fitted := [name for name in names if name != shared]:
         log.info("%-10s%s", "baselines", ", ".join(fitted))
     same = Fitted(methods, scores, tuple(seconds or ()))
-    others = {n: same if n == shared else baseline(n, data, split, eval_on, cache, learned) for n in names}
+    others = {n: same if n == shared else baseline(n, data, split, eval_on, learned) for n in names}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
     alone = [method.field_alone() for method in methods]

@@ -21,7 +21,7 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     batch = data.batch(rows)
-    prediction = method.answer(batch)
+    prediction = method.predict(batch)
     true, predicted = batch.target.numpy(), prediction.mean.numpy()
     if not spectra:
         scale = data.site.target_scale

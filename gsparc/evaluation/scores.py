@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.metrics import metrics_for
-from gsparc.models.method import Method
+from gsparc.models.method import Method, predictions
 
 SUBSETS = ("train", "val", "test")
 CHUNK = 64  # rows predicted at a time
@@ -122,9 +122,8 @@ def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.n
     turn = torch.ones(len(rows), dtype=torch.complex64)
     for run in runs:
         mine, overlap = np.flatnonzero(data.run[rows] == run), 0j  # type: ignore[index]
-        for start in range(0, len(mine), CHUNK):
-            batch = data.batch(rows[mine[start : start + CHUNK]])
-            product = (method.answer(batch).mean.cpu().conj() * batch.target).to(torch.complex128)
+        for _, batch, said in predictions(method, data, rows[mine], CHUNK):
+            product = (said.mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
         if overlap:
             turn[torch.from_numpy(mine)] = torch.tensor(overlap / abs(overlap), dtype=torch.complex64)
@@ -155,24 +154,19 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
         runs = unseen_runs(data, fold, eval_on)
         turn = best_phases(method, data, rows, runs) if len(runs) else None
         metric = metrics_for(data.site.kind, data.site.target_scale)
-        # One station at a time: each has a model of its own, whose matrices are read for every chunk.
-        order = (
-            np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
-        )
-        outputs: dict[str, list[np.ndarray]] = {"confidence": [], "variance": []}
-        for start in range(0, len(rows), CHUNK):
-            chunk = order[start : start + CHUNK]
-            batch = data.batch(rows[chunk])
-            prediction = method.answer(batch)
-            mean = prediction.mean if turn is None else prediction.mean * turn[chunk, None, None]
+        outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
+        order = []
+        for chosen, batch, prediction in predictions(method, data, rows, CHUNK):
+            mean = prediction.mean if turn is None else prediction.mean * turn[chosen, None, None]
             metric.update(mean, batch.target, batch.mask)
             for name, values in outputs.items():
-                output, none = getattr(prediction, name), np.full(len(batch), np.nan)
-                values.append(none if output is None else output.detach().cpu().double().numpy())
-        back = np.argsort(order)
+                if (output := getattr(prediction, name)) is not None:
+                    values[chosen] = output.detach().cpu().double().numpy()
+            order.append(chosen)
+        back = np.argsort(np.concatenate(order))
         samples.append({name: values[back] for name, values in metric.compute().items()})
-        confidence.append(np.concatenate(outputs["confidence"])[back])
-        variance.append(np.concatenate(outputs["variance"])[back])
+        confidence.append(outputs["confidence"])
+        variance.append(outputs["variance"])
     return Scores(
         kind=data.site.kind,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),

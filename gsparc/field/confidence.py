@@ -55,13 +55,10 @@ class ErrorModel(nn.Module):
         self.far, self.power = level * (1 + LEAST_UNKNOWN) ** power, power
 
     def forward(self, unknown: Tensor) -> tuple[Tensor, Tensor]:
-        """Confidence (B,) in [0, 1] and variance (B,) of unknown shares (B,).
-
-        The confidence is the share of the squared error expected far from all data that is not expected here.
-        """
+        """Variance (B,) of unknown shares (B,), and its share (B,) of what is expected far from all data."""
         one = ONE.to(unknown.dtype)
         share = torch.lerp(unknown, one, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow(self.power)
-        return torch.sub(ONE, share), share * self.far
+        return share * self.far, share
 
     def get_extra_state(self) -> Tensor:
         """For `state_dict`."""

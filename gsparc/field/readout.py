@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch
+from gsparc.data.query import Batch
 from gsparc.field import edit
 from gsparc.field.frozen import seen_by_array
 from gsparc.field.model import GaussianModel

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Site
 from gsparc.locate.snapshots import compared
 from gsparc.models.method import Method, suited_threads
-from gsparc.ops import Pose
 
 CHUNK = 512  # places that are asked about at a time
 DB = 10 / np.log(10)
@@ -59,22 +59,10 @@ class SiteField:
 
     def _chunk(self, places: Tensor) -> Moments:
         site, many = self.site, len(places) * self.count
-        station = torch.arange(self.count).repeat(len(places))
-        moving = places.float().repeat_interleave(self.count, 0)
-        still = self._still()[station]
-        turned = self._rotation()[station]
-        ends = (moving, still) if site.moving_end == "tx" else (still, moving)
-        rx = Pose(ends[1], turned)
-        if self.count == 1 and site.static_end == "rx":
-            rx = Pose(ends[1][0], turned[0])
-        dtype = torch.complex64 if site.kind == "csi" else torch.float32
-        target = torch.zeros(1, dtype=dtype).expand(many, 1)
-        batch = Batch(
-            torch.zeros(many, dtype=torch.int64), ends[0], rx, target,
-            station=None if site.stations is None else station,
-        )  # fmt: skip
+        station = torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
+        query = Query.at(site, places.float().repeat_interleave(self.count, 0), station)
         with suited_threads(self.method, many):
-            prediction = self.method.answer(batch)
+            prediction = self.method.predict(query)
         if prediction.variance is None:
             raise ValueError(
                 f"locate: {self.method.name} states no variance, and has no likelihood of a place"
@@ -91,19 +79,3 @@ class SiteField:
     def _joined(self, mean: Tensor, variance: Tensor) -> Moments:
         """Of rows by place and station (G T, p): (G, T p)."""
         return Moments(*(part.reshape(-1, self.count * part.shape[1]) for part in (mean, variance)))
-
-    def _still(self) -> Tensor:
-        """Places (T, 3) float32 of the static ends."""
-        site = self.site
-        if site.stations is not None:
-            return torch.from_numpy(site.stations.position).float()
-        known = np.full(3, np.nan) if site.static_position is None else site.static_position
-        return torch.from_numpy(known).float()[None]
-
-    def _rotation(self) -> Tensor:
-        """(T, 3, 3) float32 of receivers."""
-        site = self.site
-        one = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-        if site.stations is not None and site.stations.rotation is not None and site.static_end == "rx":
-            return torch.from_numpy(site.stations.rotation).float()
-        return torch.from_numpy(one).float().expand(self.count, 3, 3)

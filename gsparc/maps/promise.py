@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold, SplitSettings
 from gsparc.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
 from gsparc.maps.levels import measured, predicted
 from gsparc.models import checkpoint
-from gsparc.models.method import Method, Reconditions
+from gsparc.models.method import Method, Reconditions, predictions
 from gsparc.models.per_station import PerStation, for_links, trained_stations
 from gsparc.training.context import FitContext
 
@@ -177,13 +177,8 @@ def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarra
 def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] that `method` predicts for rows (n,); NaN where it has no answer."""
     mean, spread = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    station = station_of(data, rows)
-    for number in np.unique(station):  # one at a time: each has a model of its own
-        chosen = np.flatnonzero(station == number)
-        for start in range(0, len(chosen), CHUNK):
-            part = chosen[start : start + CHUNK]
-            prediction = method.answer(data.batch(rows[part]))
-            mean[part], spread[part] = predicted(prediction, data.site.kind, data.site.target_scale)
+    for chosen, _, said in predictions(method, data, rows, CHUNK):
+        mean[chosen], spread[chosen] = predicted(said, data.site.kind, data.site.target_scale)
     return mean, spread
 
 

@@ -21,7 +21,7 @@ from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method
 from gsparc.ops import SphereGrid
 
-VERSION = 1  # of what a checkpoint holds; later ones stay readable
+VERSION = 1  # of what a checkpoint holds
 FORMAT = "gsparc-checkpoint"
 DEEPEST = 50  # of containers in containers
 MODEL = "model.ckpt"  # of a run's folder
@@ -136,8 +136,8 @@ def read(path: str | Path) -> Stored:
     """Read a checkpoint onto the CPU; runs no code from the file.
 
     Raises:
-        CheckpointError: missing, not a checkpoint, damaged, hostile, of a version before 1 or after ours, or
-            holding numbers that are NaN or infinite.
+        CheckpointError: missing, not a checkpoint, damaged, hostile, of another version, or holding numbers
+            that are NaN or infinite.
     """
     path = Path(path)
     return _stored(_content(path), path)
@@ -172,13 +172,9 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
     version = content.get("version")
-    if type(version) is not int or version < 1:
+    if version != VERSION:
         raise CheckpointError(
-            f"{path}: written before checkpoints of version 1; train again with this gsparc"
-        )
-    if version > VERSION:
-        raise CheckpointError(
-            f"{path}: of version {version}, this gsparc reads up to {VERSION}: update gsparc"
+            f"{path}: of version {version}, this gsparc reads {VERSION}; train again with it"
         )
     if _overgrown(content):  # what walks over it would not end
         raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")

@@ -14,26 +14,10 @@ from typing import Any, ClassVar
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
-from gsparc.ops import Pose
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """What a field says about B queries, in the units of the stored targets.
-
-    Attributes:
-        mean: (B, ...) of all terms.
-        variance: (B,) expected squared error per entry of the mean.
-        explained: (B, ...) the share of the mean that its Gaussians predict; None where it has none.
-        unknown: (B,) in [0, 1], the posterior's variance relative to the prior's; 1 far away.
-    """
-
-    mean: Tensor
-    variance: Tensor
-    explained: Tensor | None
-    unknown: Tensor
+from gsparc.models.method import Prediction
 
 
 @dataclass(frozen=True)
@@ -63,7 +47,6 @@ class ConditionalField(ABC):
     kind: ClassVar[str] = ""
     site: Site
     held: LeftOutRows | None = None
-    reads_rows: ClassVar[bool] = False  # whether `answer` knows more than places tell
 
     @property
     @abstractmethod
@@ -85,15 +68,11 @@ class ConditionalField(ABC):
         """Set the weights from rows (n,)."""
 
     @abstractmethod
-    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
-        """Answer at tx (B, 3) [m] and one shared or B receiver poses, local coordinates.
+    def __call__(self, query: Query) -> Prediction:
+        """Predict, with `variance` and `unknown`; see `Method.predict`.
 
         Followed by autograd, and of double precision, where positions are float64.
         """
-
-    def answer(self, batch: Batch) -> Posterior:
-        """Answer rows, whose stations and runs may matter."""
-        return self(batch.tx, batch.rx)
 
     def objects(self) -> SiteObjects:
         """What it found to stand in the site."""

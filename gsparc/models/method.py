@@ -5,17 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Batch, Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 
 if TYPE_CHECKING:
@@ -24,22 +24,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a method says about B positions, in the units of the stored targets.
+    """What is said about B queries, in the units of the stored targets.
 
     Attributes:
         mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32; all of it
             in double precision where positions are float64, see `Method.gradient_problem`.
-        confidence: (B,) float32 in [0, 1], larger is surer; None when the method has none.
         variance: (B,) float32, expected squared error per entry; None when the method has none.
+        unknown: (B,) float32 in [0, 1]; 1 where nothing is known, such as far away, and of a process its
+            variance relative to the prior's; None when the method does not say.
+        explained: like the mean, its share that Gaussians predict; None where that is not told apart.
     """
 
     mean: Tensor
-    confidence: Tensor | None = None
     variance: Tensor | None = None
+    unknown: Tensor | None = None
+    explained: Tensor | None = None
+
+    @property
+    def confidence(self) -> Tensor | None:
+        """Return 1 - `unknown`, (B,) in [0, 1]: larger is surer."""
+        return None if self.unknown is None else (1 - self.unknown).clamp(0, 1)
 
     @staticmethod
     def joined(parts: Sequence[Prediction], order: Tensor | None = None) -> Prediction:
-        """One after the other, then in an order (B,); what any part lacks is None."""
+        """Return one after the other, then in an order (B,); what any part lacks is None."""
+        if len(parts) == 1 and order is None:
+            return parts[0]
 
         def of(name: str) -> Any:
             values = [getattr(part, name) for part in parts]
@@ -47,7 +57,7 @@ class Prediction:
                 return None
             return torch.cat(values) if order is None else torch.cat(values)[order]
 
-        return Prediction(of("mean"), of("confidence"), of("variance"))
+        return Prediction(*(of(field.name) for field in fields(Prediction)))
 
 
 class Method(ABC):
@@ -94,8 +104,12 @@ class Method(ABC):
         """Learn from `fold.train` (and choose settings on `fold.val`); `fold.test` is not looked at."""
 
     @abstractmethod
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """Predict at tx (B, 3) [m] and one shared or B receiver poses, all in local coordinates."""
+    def predict(self, query: Query) -> Prediction:
+        """Predict what would be measured there.
+
+        Raises:
+            ValueError: before `fit` or `restore`, or the query lacks what the method reads.
+        """
 
     def gradient_problem(self) -> str | None:
         """Why predictions have no gradients by position; None where they have.
@@ -104,10 +118,6 @@ class Method(ABC):
         mean, variance and confidence, in double precision. What float32 positions get is not changed by it.
         """
         return "the method does not say that its operations are differentiable"
-
-    def answer(self, batch: Batch) -> Prediction:
-        """Predict a batch; a method that reads the fresh uplink of its snapshots overrides this."""
-        return self.predict(batch.tx, batch.rx)
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
@@ -126,7 +136,7 @@ class Method(ABC):
         return SiteObjects.of()
 
     def shares(self, site: Site) -> bool:
-        """Whether it learns several stations of this site at once, told which by `Batch.station`."""
+        """Whether it learns several stations of this site at once, told which by `Query.station`."""
         return False
 
     def best_stations(
@@ -147,6 +157,20 @@ class Method(ABC):
             "model/variance_explained": None,
             "time/init_s": None,
         }
+
+
+def predictions(
+    method: Method, data: Measurements, rows: np.ndarray, size: int = 64
+) -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
+    """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch, and the answer.
+
+    One station after the other: each may have a model of its own, whose matrices are read for every batch.
+    """
+    order = np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
+    for start in range(0, len(rows), size):
+        chosen = order[start : start + size]
+        batch = data.batch(rows[chosen])
+        yield chosen, batch, method.predict(batch)
 
 
 @contextmanager
@@ -186,7 +210,7 @@ class HasProcess(Protocol):
 class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 
-    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """Gains (B, A, N), delays (B, A, N) [s], directions of arrival (B, N, 3), and the carrier [Hz].
 
         Raises:
@@ -198,8 +222,8 @@ class HasPaths(Protocol):
 class HasGaussians(Protocol):
     """What it renders are Gaussians in space."""
 
-    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
-        """All of them, with what they emit for tx (B, 3) [m]: the root mean square over these positions.
+    def gaussians(self, query: Query) -> GaussianCloud:
+        """All of them, with what they emit: the root mean square over these queries.
 
         Raises:
             ValueError: what was fitted here has none.

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
-from gsparc.models.method import Method
-from gsparc.ops import Pose
+from gsparc.models.conditional import ConditionalField, LeftOutRows
+from gsparc.models.method import Method, Prediction
 from gsparc.training.context import FitContext
 
 
@@ -40,12 +40,11 @@ class MethodField(ConditionalField):
         """See `ConditionalField`."""
         self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
 
-    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
-        """See `ConditionalField`."""
-        result = self.method.predict(tx, rx)
-        return Posterior(
-            result.mean, result.variance, result.mean if self.count else None, 1 - result.confidence
-        )
+    def __call__(self, query: Query) -> Prediction:
+        """See `ConditionalField`; Gaussians explain all, where the method does not say otherwise."""
+        result: Prediction = self.method.predict(query)
+        said = result.explained is not None or not self.count
+        return result if said else replace(result, explained=result.mean)
 
     def left_out(self) -> LeftOutRows:
         """Not known: `ValueError`."""

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.executor import each, elsewhere
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, parts
@@ -29,7 +30,6 @@ from gsparc.models.method import Method, Prediction, Reconditions
 from gsparc.models.parts import common_label
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
-from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.time_budget import Spent, less_repeatable
@@ -225,23 +225,17 @@ class PerStation(Method):
             result._copies[number] = learned
         return result if result._copies else None
 
-    def answer(self, batch: Batch) -> Prediction:
-        """Each row by its station's copy."""
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`; by each station's copy."""
         if self._shared:
-            return self._copies[UNHEARD].answer(batch)
-        stations = self._stations(batch.tx, batch.rx) if batch.station is None else batch.station
-        return self._gathered(stations, lambda copy, chosen: copy.answer(_rows(batch, chosen, copy.site)))
-
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """By the copy of the station that stands at the static end; see `Method.predict`."""
-        if self._shared:
-            return self._copies[UNHEARD].predict(tx, rx)
-        everyone = torch.arange(len(tx))
-
-        def ask(copy: Method, chosen: Tensor) -> Prediction:
-            return copy.predict(tx[chosen], _pose(rx, chosen, copy.site))
-
-        return self._gathered(self._stations(tx, rx)[everyone], ask)
+            return self._copies[UNHEARD].predict(query)
+        stations = self._stations(query) if query.station is None else query.station
+        answers: list[tuple[Tensor, Prediction]] = []
+        for number in stations.unique().tolist():
+            chosen, copy = (stations == number).nonzero()[:, 0], self.of(number)
+            answers.append((chosen, copy.predict(_seen_by(copy.site, query.rows(chosen)))))
+        rows, parts = zip(*answers, strict=True)
+        return Prediction.joined(parts, torch.argsort(torch.cat(rows)))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; that of any copy."""
@@ -264,10 +258,11 @@ class PerStation(Method):
         """The site as a copy sees it: whole, where one learns several stations as such."""
         return site if number == UNHEARD and self.wrapped.shares(site) else of_station(site, number)
 
-    def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
+    def _stations(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
         assert self.site is not None and self.site.stations is not None
-        ends = tx if self.site.static_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3)
+        ends = query.tx if self.site.static_end == "tx" else receiver
         table = torch.from_numpy(self.site.stations.position)
         distance = torch.cdist(ends.detach().cpu().double(), table)
         apart, number = distance.min(dim=1)
@@ -280,14 +275,6 @@ class PerStation(Method):
             row = int(apart.argmax())
             raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M * 100:g} cm of row {row}")
         return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
-
-    def _gathered(self, stations: Tensor, ask: Callable[[Method, Tensor], Prediction]) -> Prediction:
-        answers: list[tuple[Tensor, Prediction]] = []
-        for number in stations.unique().tolist():
-            chosen = (stations == number).nonzero()[:, 0]
-            answers.append((chosen, ask(self.of(number), chosen)))
-        rows, result = zip(*answers, strict=True)
-        return Prediction.joined(result, torch.argsort(torch.cat(rows)))
 
     def state(self) -> dict[str, Any]:
         """The state of every copy, by its station's number."""
@@ -333,11 +320,9 @@ class OfStation(View):
         """That of all stations."""
         return self.inner.gradient_problem()
 
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        rows = torch.arange(len(tx))
-        station = torch.full_like(rows, self.number)
-        return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
+        return self.inner.predict(replace(query, station=torch.full((len(query),), self.number)))
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:
@@ -350,21 +335,10 @@ def _over(values: list[Any], name: str) -> float | int | str | None:
     return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
 
 
-def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
-    """The chosen poses; one for all where the receiver is the station."""
+def _seen_by(site: Site | None, query: Query) -> Query:
+    """Rows of one station as its copy sees them: one pose where the receiver is the station, no number."""
     assert site is not None
-    if not rx.batched:
-        return rx
-    if site.static_end == "rx" and site.stations is None:
-        return Pose(rx.position[chosen[0]], rx.rotation[chosen[0]])
-    return Pose(rx.position[chosen], rx.rotation[chosen])
-
-
-def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
-    values: dict[str, Any] = {
-        name: value[chosen] if isinstance(value, Tensor) and name != "station" else value
-        for name, value in vars(batch).items()
-    }
-    known = batch.station is not None and site is not None and site.stations is not None
-    station = batch.station[chosen] if known and batch.station is not None else None
-    return Batch(**{**values, "rx": _pose(batch.rx, chosen, site), "station": station})
+    if site.stations is not None:
+        return query
+    still = site.static_end == "rx" and query.rx.batched
+    return replace(query, rx=query.rx[0] if still else query.rx, station=None)

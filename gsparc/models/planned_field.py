@@ -19,7 +19,8 @@ from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
@@ -38,7 +39,6 @@ from gsparc.models.refined_places import displaced, refined
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
 from gsparc.models.terms import EffectSettings, Plan
-from gsparc.ops import Pose
 from gsparc.processes.posterior import approximated
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
@@ -228,37 +228,22 @@ class PlannedField(LearnedField):
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
         return waves or site.kind == "rssi"
 
-    def answer(self, batch: Batch) -> Prediction:
-        """See `Method.answer`."""
-        if self.field is None or not self.field.reads_rows:
-            result = super().answer(batch)
-        else:
-            of_field = self.field.answer(replace(batch, run=None))
-            result = Prediction(of_field.mean, (1 - of_field.unknown).clamp(0, 1), of_field.variance)
-        return self.runs.restored(result, batch.run)
-
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
         if self.field is not None:
-            parts = [
-                self.field(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
-                for i in range(0, len(tx), QUERY_CHUNK)
-            ]
-            mean, variance, unknown = (
-                torch.cat([getattr(part, name) for part in parts]) for name in ("mean", "variance", "unknown")
-            )
-            return Prediction(mean, (1 - unknown).clamp(0, 1), variance)
+            told = Prediction.joined([self.field(part) for part in query.split(QUERY_CHUNK)])
+            return self.runs.restored(told, query.run)
         if self._average is not None and not self.size():
-            return self._average[0].predict(tx, rx)
-        own = super().predict(tx, rx)
+            return self._average[0].predict(query)
+        own = super().predict(query)
         if self._average is None:
             return own
         if self._average_mean is None:
             self._average_mean = mean_alone(self._average[0])
         method, weight = self._average
-        if tx.dtype == torch.float64:
-            return replace(own, mean=own.mean.lerp(method.mean_at(tx, rx), weight))
-        return replace(own, mean=own.mean.lerp_(self._average_mean.predict(tx, rx).mean, weight))
+        if query.tx.dtype == torch.float64:
+            return replace(own, mean=own.mean.lerp(method.mean_at(query), weight))
+        return replace(own, mean=own.mean.lerp_(self._average_mean.predict(query).mean, weight))
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -279,7 +264,7 @@ class PlannedField(LearnedField):
         process_only = self._average is not None and not self.size()
         return None if self.field is not None or process_only else super().gradient_problem()
 
-    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.
 
         What other solutions and the residual add to channels is in no path.
@@ -290,7 +275,7 @@ class PlannedField(LearnedField):
         made = [(w, one.method) for w, one in parts if isinstance(getattr(one, "method", None), HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
-        result = [(weight, method.paths(tx, rx)) for weight, method in made]
+        result = [(weight, method.paths(query)) for weight, method in made]
         gain = torch.cat([weight * one[0] for weight, one in result], dim=2)
         delay = torch.cat([one[1] for _, one in result], dim=2)
         return gain, delay, torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]

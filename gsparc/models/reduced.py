@@ -12,11 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.method import Method, Prediction, Reducible
 from gsparc.models.pareto import Settings
-from gsparc.ops import Pose, SphereGrid
+from gsparc.ops import SphereGrid
 
 log = logging.getLogger(__name__)
 
@@ -83,9 +84,9 @@ class View(Method):
     def __init__(self, inner: Method) -> None:
         self.inner, self.name, self.threads_pay = inner, inner.name, inner.threads_pay
 
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        return self.inner.predict(tx, rx)
+        return self.inner.predict(query)
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`."""
@@ -111,17 +112,17 @@ class MeanOnly(View):
 
     Args:
         inner: fitted.
-        mean_at: answers with its mean alone, at tx (B, 3) [m] and receiver poses; None: it has no such thing.
+        mean_at: answers with its mean alone; None: it has no such thing.
     """
 
-    def __init__(self, inner: Method, mean_at: Callable[[Tensor, Pose], Tensor] | None = None) -> None:
+    def __init__(self, inner: Method, mean_at: Callable[[Query], Tensor] | None = None) -> None:
         super().__init__(inner)
         self._mean_at = mean_at
 
     @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; the mean alone."""
-        return Prediction(self._mean_at(tx, rx) if self._mean_at else self.inner.predict(tx, rx).mean)
+        return Prediction(self._mean_at(query) if self._mean_at else self.inner.predict(query).mean)
 
 
 def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
@@ -157,10 +158,10 @@ class Filled(View):
         self._between = torch.arange(stride) / stride
 
     @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; images (B, H, W) of the full grid."""
-        result = self.inner.predict(tx, rx)
-        return Prediction(self.fill(result.mean), result.confidence, result.variance)
+        result = self.inner.predict(query)
+        return Prediction(self.fill(result.mean), result.variance, result.unknown)
 
     def fill(self, image: Tensor) -> Tensor:
         """(B, h, w) -> (B, H, W)."""
@@ -176,23 +177,24 @@ class Blended(View):
 
     Args:
         inner: answers for the field; its confidence and variance stay.
-        other: what has the other mean, at tx (B, 3) [m] and receiver poses.
+        other: what has the other mean.
         weight: of the other mean.
         own: of the field's.
     """
 
     def __init__(
-        self, inner: Method, other: Callable[[Tensor, Pose], Any], weight: float, own: float = 1.0
+        self, inner: Method, other: Callable[[Query], Prediction], weight: float, own: float = 1.0
     ) -> None:
         super().__init__(inner)
         self.other, self.weight, self.own = other, weight, own
 
     @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        result = self.inner.predict(tx, rx)
+        result = self.inner.predict(query)
         mean = result.mean if self.own == 1 else result.mean * self.own
-        return replace(result, mean=torch.add(mean, self.other(tx, rx).mean, alpha=self.weight))
+        mean = torch.add(mean, self.other(query).mean, alpha=self.weight)
+        return Prediction(mean, result.variance, result.unknown)
 
 
 def mean_alone(process: Method, settings: Settings | None = None) -> Method:

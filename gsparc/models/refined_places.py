@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.query import Batch
+from gsparc.data.schema import Measurements
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.mixture.weights import comparable, real
 from gsparc.ops import Pose
@@ -104,10 +105,11 @@ def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray
         return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
 
     def mean(places: Tensor) -> Tensor:
-        return real(comparable(field.answer(at(places)).mean, site))
+        return real(comparable(field(at(places)).mean, site))
 
     with torch.no_grad():
-        result = field.answer(at(moving))  # what is computed once and kept must not be so inside `jvp`
+        result = field(at(moving))  # what is computed once and kept must not be so inside `jvp`
+    assert result.variance is not None
     variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
     if site.kind == "rssi":
         variance = variance * (10 / math.log(10) / left.mean.flatten().double().clamp_min(1e-30)).square()

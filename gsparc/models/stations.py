@@ -82,7 +82,7 @@ def _by_station(
 
 @torch.no_grad()
 def _levels(field: ConditionalField, data: Measurements, rows: np.ndarray) -> Tensor:
-    return _decibels(field.answer(data.batch(rows)).mean)
+    return _decibels(field(data.batch(rows)).mean)
 
 
 def _decibels(power: Tensor) -> Tensor:

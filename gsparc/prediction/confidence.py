@@ -16,7 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_kernel, principal_components
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, Prediction, predictions
 from gsparc.models.target_rows import training_targets
 from gsparc.prediction.risk_threshold import Guarantee, Threshold
 from gsparc.processes.factor import Factor
@@ -24,7 +24,6 @@ from gsparc.processes.kernel import Kernel
 
 RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
-CHUNK = 64
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 
 
@@ -50,13 +49,13 @@ class Evidence:
 
 def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """What `method` predicts of rows, and the rivals of its confidence."""
-    parts = []
-    for start in range(0, len(rows), CHUNK):
-        some = rows[start : start + CHUNK]
-        batch = data.batch(some)
-        parts.append(Evidence(some, data.moving[some], *judged(method.answer(batch), batch.target)))
-    evidence = joined(parts)
-    return replace(evidence, scores=evidence.scores | rivals(data, fold, rows))
+    evidence = joined(
+        [
+            Evidence(rows[chosen], data.moving[rows[chosen]], *judged(said, batch.target))
+            for chosen, batch, said in predictions(method, data, rows)
+        ]
+    )
+    return replace(evidence, scores=evidence.scores | rivals(data, fold, evidence.row))
 
 
 def judged(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths, UplinkMethod
@@ -110,8 +111,8 @@ class Paths:
 
 
 def judged(method: Method, site: Site, uplink: Any) -> Prediction:
-    """Channels of the measured tones in stored units with their confidence and variance; see `heard`."""
-    return _reader(method).from_uplink(_snapshots(method, site, uplink))
+    """Channels of the measured tones in stored units with what else is said of them; see `_heard`."""
+    return method.predict(_heard(method, site, uplink))
 
 
 def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> Tensor:
@@ -120,23 +121,25 @@ def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any =
     Raises:
         ValueError: the model reads no uplink, or one of another shape.
     """
-    snapshots = _snapshots(method, site, uplink)
+    query = _heard(method, site, uplink)
     if frequency_hz is None:
-        frequency_hz = site.subcarriers_hz
+        return method.predict(query).mean * site.target_scale
     wanted = torch.from_numpy(np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64)))
-    return _separator(method).from_uplink_at(snapshots, wanted).mean * site.target_scale
+    assert query.uplink is not None
+    return _separator(method).from_uplink_at(query.uplink, wanted).mean * site.target_scale
 
 
 def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
-    """The sources of uplinks (B, U, L), physical units; see `heard`."""
-    sources = _separator(method).sources(_snapshots(method, site, uplink))
-    assert site.uplink_hz is not None
+    """The sources of uplinks (B, U, L), physical units; see `_heard`."""
+    query = _heard(method, site, uplink)
+    assert query.uplink is not None and site.uplink_hz is not None
+    sources = _separator(method).sources(query.uplink)
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
     gain, delay = (sources.gain * site.target_scale).numpy(), (sources.delay.double() / spacing).numpy()
     return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=sources.direction.numpy())
 
 
-def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
+def placed_paths(method: Method, site: Site, query: Query) -> Paths:
     """The paths of a coherent field at positions in local coordinates.
 
     Of several solutions that are averaged these are those of each that is made of paths, by its weight.
@@ -147,7 +150,7 @@ def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
     if not isinstance(method, HasPaths):
         raise ValueError(f"paths: channels of {method.name} are not made of paths {WITH_PATHS}")
     try:
-        gain, delay, direction, carrier_hz = method.paths(tx, rx)
+        gain, delay, direction, carrier_hz = method.paths(query)
     except ValueError as error:
         raise ValueError(f"paths: {method.name}: {error} {WITH_PATHS}") from error
     return Paths((gain * site.target_scale).numpy(), delay.numpy(), carrier_hz, direction=direction.numpy())
@@ -173,20 +176,16 @@ def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None)
     return channel if symbols is None else resource_grid(channel, symbols, site.moving_end)
 
 
-def _reader(method: Method) -> UplinkMethod:
-    if not isinstance(method, UplinkMethod):
-        raise ValueError(f"uplink=: {method.name} reads no uplink, it predicts at positions")
-    return method
-
-
 def _separator(method: Method) -> SeparatesPaths:
     if not isinstance(method, SeparatesPaths):
         raise ValueError(f"uplink=: {method.name} knows only the measured tones, no paths (model=uplink)")
     return method
 
 
-def _snapshots(method: Method, site: Site, uplink: Any) -> Tensor:
-    _reader(method)
+def _heard(method: Method, site: Site, uplink: Any) -> Query:
+    """Uplinks (B, U, L) or (U, L) in physical units, from places that nobody says."""
+    if not isinstance(method, UplinkMethod):
+        raise ValueError(f"uplink=: {method.name} reads no uplink, it predicts at positions")
     if site.uplink_array is None or site.uplink_hz is None:
         raise ValueError(f"uplink=: {site.name} has no uplink")
     shape = (len(site.uplink_array), len(site.uplink_hz))
@@ -196,4 +195,5 @@ def _snapshots(method: Method, site: Site, uplink: Any) -> Tensor:
         raise ValueError(f"uplink=: expected (B, {shape[0]}, {shape[1]}) complex, got {tuple(values.shape)}")
     if not torch.isfinite(torch.view_as_real(values)).all():
         raise ValueError("uplink=: holds NaN or Inf")
-    return values / site.target_scale
+    nowhere = torch.full((len(values), 3), torch.nan)
+    return Query(nowhere, Pose.identity(nowhere), uplink=values / site.target_scale)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.links.stations import station_number
+from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models.method import Method, Prediction, suited_threads
@@ -19,7 +20,7 @@ from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
 from gsparc.ops.transforms import carries_tangent, mapped, transforming
 from gsparc.prediction.confidence import Trusted
-from gsparc.prediction.query import Queries, Query, read_places, usual_heights
+from gsparc.prediction.query import Queries, read_places, usual_heights
 from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
@@ -178,9 +179,10 @@ class Predictor:
         wanted = self._in(unit)
         if grad:
             return self._followed(self._whole, tx, rx, wanted)[0]
-        query = self._query(tx, rx)
+        query = self._query(tx, rx).query
         own = _predicted(self._whole, query)
-        return replace(_in_unit(own, wanted), confidence=self._confidence(own, query))
+        sure = self._confidence(own, query)
+        return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
     def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
         """What `predict` says, powers as such: their levels are in `site.level_unit`."""
@@ -196,12 +198,12 @@ class Predictor:
         """
 
         def ask(asked: Predictor) -> Any:
-            query = asked._query(tx, rx)
+            query, single, as_torch = asked._query(tx, rx)
             said = _in_unit(_predicted(asked._whole, query), asked._in(unit))
             if said.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
             spread = said.variance.sqrt().float().reshape(-1, *[1] * (said.mean.ndim - 1))
-            return _returned(spread, query.single, query.as_torch)
+            return _returned(spread, single, as_torch)
 
         return self._of_stations(ask, tx, rx)
 
@@ -286,8 +288,7 @@ class Predictor:
 
         if uplink is not None:
             return export.uplink_paths(self.method, self.site, uplink)
-        query = self._query(tx, rx)
-        return export.placed_paths(self._whole, self.site, query.tx, query.rx)
+        return export.placed_paths(self._whole, self.site, self._query(tx, rx).query)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
         """Received power (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
@@ -382,9 +383,8 @@ class Predictor:
             sure = self._confidence(export.judged(self.method, self.site, uplink), None)
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
-            query = self._query(tx, rx)
+            query, single, as_torch = self._query(tx, rx)
             sure = self._confidence(_predicted(self._whole, query), query)
-            single, as_torch = query.single, query.as_torch
         if sure is None:
             raise ValueError(f"{self.method.name} has no confidence")
         return sure, single, as_torch
@@ -393,7 +393,7 @@ class Predictor:
         """Of the method's own predictions (B,), of the kind that is wanted; None where it has none."""
         if own.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             return None
-        places = None if query is None else self.site.moving(query.tx, query.rx).double().numpy()
+        places = None if query is None else query.places(self.site).numpy()
         return torch.from_numpy(self.trusted.confidence(own, places, self.kind))
 
     def _ask(self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None) -> Any:
@@ -406,9 +406,8 @@ class Predictor:
         if grad:
             moments, single = self._followed(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
-        query = self._query(tx, rx)
-        mean = _in_unit(_predicted(self.method, query), wanted).mean
-        return _returned(mean, query.single, query.as_torch)
+        query, single, as_torch = self._query(tx, rx)
+        return _returned(_in_unit(_predicted(self.method, query), wanted).mean, single, as_torch)
 
     def _followed(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
@@ -427,35 +426,36 @@ class Predictor:
             raise ValueError("grad=True: torch.vmap is not followed; give all positions at once, (B, 3)")
         if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
             raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
-        query = self._query(tx, rx, torch.float64)
+        query, single, _ = self._query(tx, rx, torch.float64)
         origin = torch.from_numpy(np.asarray(self.site.origin, np.float64))
-        local = {end: (value.cpu().double() - origin).expand(len(query.tx), 3) for end, value in ends.items()}
+        local = {end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()}
         at = Pose(local.get("rx", query.rx.position), query.rx.rotation)
-        with suited_threads(method, len(query.tx)):
+        with suited_threads(method, len(query)):
             if transforming() and method not in self._prepared:  # what it keeps must not be a transform's
                 self._prepared.append(method)
                 with torch._C._DisableFuncTorch(), torch.no_grad():
-                    method.predict(query.tx, query.rx)
-            moments = method.predict(local.get("tx", query.tx), at)
+                    method.predict(query)
+            moments = method.predict(replace(query, tx=local.get("tx", query.tx), rx=at))
         dtype = torch.float32
         for value in ends.values():
             dtype = torch.promote_types(dtype, value.dtype)
         said, own = _in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
         mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
-        sure = None if said.confidence is None or not own else said.confidence.to(dtype)
-        return Prediction(mean, sure, said.variance), query.single
+        unknown = None if said.unknown is None or not own else said.unknown.to(dtype)
+        return Prediction(mean, said.variance, unknown), single
 
 
 @torch.no_grad()
 def _predicted(method: Method, query: Query) -> Prediction:
-    with suited_threads(method, len(query.tx)):
-        return method.predict(query.tx, query.rx)
+    with suited_threads(method, len(query)):
+        return method.predict(query)
 
 
 def _in_unit(own: Prediction, unit: PowerUnit) -> Prediction:
     """Of stored targets, in a unit."""
     variance = None if own.variance is None else unit.variance(own.mean, own.variance)
-    return replace(own, mean=unit.values(own.mean).to(own.mean.dtype), variance=variance)
+    explained = None if own.explained is None else unit.values(own.explained).to(own.mean.dtype)
+    return Prediction(unit.values(own.mean).to(own.mean.dtype), variance, own.unknown, explained)
 
 
 def _returned(value: Tensor, single: bool, as_torch: bool) -> Any:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.assemble import FARTHEST
+from gsparc.data.query import Query
 from gsparc.data.schema import End, Site
 from gsparc.ops import Pose
 from gsparc.ops.transforms import numbers
@@ -17,11 +18,10 @@ SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is
 COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
 
 
-class Query(NamedTuple):
-    """Both ends (B, 3) in local coordinates, whether one position was given, and whether torch was."""
+class Asked(NamedTuple):
+    """A query, whether one position was given, and whether torch was."""
 
-    tx: Tensor
-    rx: Pose
+    query: Query
     single: bool
     as_torch: bool
 
@@ -34,7 +34,7 @@ class Queries:
         # The pose of a receiver that never moved, made once.
         self._still = None if still is None else Pose(_float(still), _float(self._rotation(None, 1)))
 
-    def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Query:
+    def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Asked:
         """Both ends as they were given, checked."""
         receiver = rx.position if isinstance(rx, Pose) else rx
         places = {
@@ -48,7 +48,7 @@ class Queries:
         common = self._still is not None and len(places) == 1 and dtype == torch.float32
         if self._still is not None and common:  # with nothing to look up
             sender = _float(np.atleast_2d(places[moving] - self.site.origin))
-            return Query(sender, self._still, single, isinstance(tx, Tensor))
+            return Asked(Query(sender, self._still), single, isinstance(tx, Tensor))
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
         count = max(len(place) for place in local.values())
         for end, place in local.items():
@@ -63,7 +63,7 @@ class Queries:
             turned = np.broadcast_to(rotation, (count, 3, 3))
             pose = Pose(_float(positions, dtype), _float(turned, dtype))
         sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        return Query(sender, pose, single, any(isinstance(v, Tensor) for v in (tx, receiver)))
+        return Asked(Query(sender, pose), single, any(isinstance(v, Tensor) for v in (tx, receiver)))
 
     def _static(self, place: np.ndarray | None) -> np.ndarray:
         """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""

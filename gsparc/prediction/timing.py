@@ -15,7 +15,8 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements
 from gsparc.models.method import Method, Prediction, suited_threads
 
 Key = TypeVar("Key")
@@ -102,15 +103,15 @@ def _visit(call: Call, turn: int, settings: ClockSettings) -> list[float]:
     return times
 
 
-def cycling(methods: Mapping[Key, Method], queries: Sequence[Batch]) -> dict[Key, Call]:
+def cycling(methods: Mapping[Key, Method], queries: Sequence[Query]) -> dict[Key, Call]:
     """Calls that answer one of `queries` each, another one every time."""
 
     def call(method: Method) -> Call:
         return lambda turn: answered(method, queries[turn % len(queries)])
 
-    def answered(method: Method, query: Batch) -> Prediction:
+    def answered(method: Method, query: Query) -> Prediction:
         with suited_threads(method, len(query)):
-            return method.answer(query)
+            return method.predict(query)
 
     return {name: call(method) for name, method in methods.items()}
 
@@ -120,7 +121,7 @@ def percentiles(times: np.ndarray) -> tuple[float, float]:
     return float(np.median(times)), float(np.quantile(times, 0.95))
 
 
-def queries(data: Measurements, rows: np.ndarray, size: int = 1) -> list[Batch]:
+def queries(data: Measurements, rows: np.ndarray, size: int = 1) -> list[Query]:
     """Batches of `size` of the rows (n,), another set each, without targets; at most `QUERIES`."""
     picks = [np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))]
     where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images

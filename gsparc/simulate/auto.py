@@ -39,7 +39,6 @@ class AutoSettings:
         confidence: with which the quantile must follow from them (`allowed_failures`).
         held_back: other receivers on which the choice is then verified, at most.
         rays: share of the rays that is tried as well, where that may pay; 1 for none.
-        reuse: whether a decision for the same scene, transmitters, area, band and requirement is taken over.
         full: what "everything on" means.
     """
 
@@ -49,7 +48,6 @@ class AutoSettings:
     confidence: float = 0.85
     held_back: int = 128
     rays: float = 0.3
-    reuse: bool = True
     full: PropagationEffects = field(default_factory=lambda: PropagationEffects(depth=5))
 
     def __post_init__(self) -> None:
@@ -129,12 +127,10 @@ class Choice:
         seconds: that deciding took, tracing the probes included, which are rows of the file [s].
         samples: rays that are enough, of a call; None for those of the settings.
         refuted: effects that probes allowed and held-back receivers did not, so that everything is needed.
-        untried: whether fewer rays were not tried, because too few rows were left for that to pay.
         row_all, row_chosen: CPU seconds of a row with everything and with the choice, compiling excluded;
             None where none was traced so.
         compiling: CPU seconds of compiling the solver for a set of effects; None where not measured.
         verdict: filled by `verify`.
-        reused: whether it was taken over from an earlier run.
     """
 
     effects: PropagationEffects
@@ -144,12 +140,10 @@ class Choice:
     seconds: float = 0.0
     samples: int | None = None
     refuted: str = ""
-    untried: bool = False
     row_all: float | None = None
     row_chosen: float | None = None
     compiling: float | None = None
     verdict: Verification | None = None
-    reused: bool = False
 
     @property
     def saved(self) -> float | None:

@@ -76,7 +76,6 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     row_s = _trace_all(campaign, survey, effects, shards)
     if choice is not None and decision.as_chosen and row_s:
         choice = replace(choice, row_chosen=row_s)
-        decider.remember(choice)
     laps.append(time.perf_counter())
     error = convergence(campaign, survey, effects, shards, left_out)
     laps.append(time.perf_counter())
@@ -92,12 +91,10 @@ def _decided(decider: deciding.Decider, shards: Shards) -> Decision:
     stored = shards.read_note()
     if stored is not None:
         return Decision.of(stored)
-    # of a process that was killed before it noted by which decision it was made
-    shards.path(0).unlink(missing_ok=True)
     decision = decider.decide()
-    if decision.rows is not None and decision.paths is not None:
-        arrays = shard_arrays(decision.paths, decider.campaign, decider.survey.engine.wavelength)
-        shards.put(0, {**arrays, ROWS: decision.rows, SECONDS: np.array(0.0)})  # they are in the decision's
+    assert decision.rows is not None and decision.paths is not None
+    arrays = shard_arrays(decision.paths, decider.campaign, decider.survey.engine.wavelength)
+    shards.put(0, {**arrays, ROWS: decision.rows, SECONDS: np.array(0.0)})  # they are in the decision's
     shards.write_note(decision.note())
     return decision
 

@@ -1,9 +1,7 @@
-"""How a run comes to its effects: looked up, or by probes until it is clear, which are rows of the file."""
+"""How a run comes to its effects: by probes until it is clear, which are rows of the file."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import os
 import time
@@ -13,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsparc.data.files import platform_cache, whole_file
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Probe, reasons
 from gsparc.simulate.auto import AutoSettings, Choice
@@ -28,7 +25,6 @@ Judgement = TypeVar("Judgement")
 
 NONE = np.zeros(0, dtype=np.int64)
 TRIAL = 2  # how much more fewer rays are to save than their trial costs, because it may fail
-OWN = ("name", "num_receivers", "test_share", "seed")  # of a scene's settings: not of what is decided
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,7 @@ class Decision:
         samples: with how many rays of a call; None for those of the settings.
         changed: errors at held-back receivers; None where there are none.
         rows: (n,) of the survey, those that were traced.
-        paths: of these rows, with `effects`.
+        paths: of these rows, with `effects`; None in a resumed run, which has them in a shard.
     """
 
     choice: Choice
@@ -128,14 +124,10 @@ def busy_s() -> float:
 
 
 def pays(choice: Choice, rows: int, saved: float) -> bool:
-    """Whether a share of the time of so many rows, saved, pays for compiling the solver for other effects.
-
-    Where rows were traced with the choice before, its kernels are in Dr.Jit's cache. In a later run those of
-    everything are, of both sizes of a call, and all of the choice's are to be compiled.
-    """
-    if choice.row_chosen is not None or choice.row_all is None or choice.compiling is None:
+    """Whether a share of the time of so many rows, saved, pays for compiling the solver for other effects."""
+    if choice.row_all is None or choice.compiling is None:
         return rows > 0
-    return rows * choice.row_all * saved > (2 if choice.reused else 1) * choice.compiling
+    return rows * choice.row_all * saved > choice.compiling
 
 
 class Decider:
@@ -145,17 +137,10 @@ class Decider:
         self.campaign, self.settings, self.survey = campaign, settings, survey
         self.full = survey.engine.supported(settings.full)
         self.probes, self.held_back = self._groups()
-        self._stored = platform_cache() / "scenes" / f"{self._key()}.json"
 
     def decide(self) -> Decision:
-        """Look the decision up, or take it and store it."""
+        """Measure probes, decide, verify."""
         begin, both = time.perf_counter(), np.concatenate([self.probes, self.held_back])
-        if self.settings.reuse and self._stored.exists():
-            choice = Choice.from_dict(json.loads(self._stored.read_text(encoding="utf-8")))
-            if not (choice.untried and self._may_pay(choice, len(self.survey) - len(both), len(both))):
-                log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
-                choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
-                return Decision(choice, *self._simulated(choice, len(self.survey)))
         size = self.campaign.sampling.part if self.survey.engine.random else 1
         traced = Traced(self.survey, self.full, both, size)
         choice, changed = self._choose(traced), None
@@ -172,14 +157,8 @@ class Decider:
         choice = traced.timed(choice)
         effects, samples = self._simulated(choice, len(self.survey) - len(traced.rows))
         choice = replace(choice, seconds=time.perf_counter() - begin)
-        self.remember(choice)
         rows = np.sort(traced.rows)
         return Decision(choice, effects, samples, changed, rows, traced.paths(rows).under(effects))
-
-    def remember(self, choice: Choice) -> None:
-        """Store a decision; anew, with what rows were measured to cost."""
-        with whole_file(self._stored) as partial:
-            partial.write_text(json.dumps(asdict(choice), indent=1), encoding="utf-8")
 
     def _simulated(self, choice: Choice, rows: int) -> tuple[PropagationEffects, int | None]:
         """Effects and rays of the choice, or everything where that is cheaper for so many rows."""
@@ -232,7 +211,7 @@ class Decider:
             traced.paths(self.held_back[: auto.first_look(len(self.held_back))])
         choice = traced.timed(choice)
         if not self._may_pay(choice, len(survey) - len(traced.rows), len(traced.rows)):
-            return replace(choice, untried=True), changed
+            return choice, changed
         samples = max(round(self.settings.rays * sampling.samples), 1)
         log.info("auto: probes with %d rays", samples)
         both = np.concatenate([self.probes, self.held_back])
@@ -275,21 +254,6 @@ class Decider:
         array = campaign.csi.elements(wavelength)
         paths = traced.paths(rows)
         return Probe(paths, traced.effects, frequency, wavelength, array, campaign.spectrum, nearest)
-
-    def _key(self) -> str:
-        """Hash of geometry, materials, transmitters, where receivers are, band, solver and requirement."""
-        campaign, survey, engine = self.campaign, self.survey, self.survey.engine
-        scene = {name: value for name, value in asdict(campaign.scene).items() if name not in OWN}
-        requirement = {name: value for name, value in asdict(self.settings).items() if name != "reuse"}
-        about: dict[str, Any] = {
-            "geometry": engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
-            "materials": engine.materials(), "versions": engine.versions(), "scene": scene,
-            "asked": requirement, "antennas": [getattr(e, "antenna", None) for e in survey.engines],
-            "samples": campaign.sampling.samples, "names": survey.names, "inputs": campaign.inputs(),
-        }  # fmt: skip
-        if self.settings.required.kind != "coverage":
-            about |= {"csi": asdict(campaign.csi), "spectrum": asdict(campaign.spectrum)}
-        return hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
 def _until_clear(rows: np.ndarray, judge: Callable[[np.ndarray, bool], Judgement | None]) -> Judgement:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -126,15 +125,6 @@ class RayTracer(Engine):
         from importlib.metadata import version
 
         return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
-
-    def fingerprint(self) -> str:
-        """Of vertices, faces and material of every object."""
-        digest = sha256()
-        for name, thing in sorted(self.scene.objects.items()):
-            digest.update(f"{name} {thing.radio_material.name};".encode())
-            digest.update(thing.mi_mesh.vertex_positions_buffer().numpy().tobytes())
-            digest.update(thing.mi_mesh.faces_buffer().numpy().tobytes())
-        return digest.hexdigest()
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """ITU name, thickness [m] and scattering coefficient of every material in use."""

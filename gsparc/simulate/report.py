@@ -9,7 +9,7 @@ from rich.table import Table
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
 
-STATED = ("deliverable", "probes", "samples", "untried", "row_all", "row_chosen", "saved", "reused")
+STATED = ("deliverable", "probes", "samples", "row_all", "row_chosen", "saved")
 
 
 def choice_table(choice: Choice) -> Table:
@@ -40,7 +40,6 @@ def verdict(choice: Choice) -> str:
     """What was chosen, what it saves, and whether the requirement is met on held-back receivers."""
     chosen = f"needed: {choice.effects}"
     chosen += "" if choice.samples is None else f", {choice.samples:,} rays"
-    chosen += ", as decided before" if choice.reused else ""
     if choice.saved is not None and choice.row_chosen and choice.row_all:
         chosen += (
             f"; a receiver takes {choice.row_chosen * 1e3:.0f} CPU ms instead of {choice.row_all * 1e3:.0f} "

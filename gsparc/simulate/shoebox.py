@@ -8,7 +8,6 @@ image of the transmitter; the amplitude law is wavelength / (4 pi d), the phase 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 from itertools import product
 from typing import Any
 
@@ -253,10 +252,6 @@ class ShoeboxEngine(Engine):
             (way / distance[:, None]).astype(np.float32), np.where(order > 0, SPECULAR, 0).astype(np.uint8),
             order,
         )  # fmt: skip
-
-    def fingerprint(self) -> str:
-        """Of the room."""
-        return sha256(repr(self.room).encode()).hexdigest()
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """Amplitude reflection coefficients of the walls."""

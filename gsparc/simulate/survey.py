@@ -99,9 +99,6 @@ class Engine(Protocol):
     def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
-    def fingerprint(self) -> str:
-        """Hash of the geometry, and of which material is where."""
-
     def materials(self) -> dict[str, dict[str, Any]]:
         """Material properties of the scene, for provenance and physical expectations."""
 

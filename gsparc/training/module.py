@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import Checked, choice, number, setting
-from gsparc.data.schema import Batch
+from gsparc.data.query import Batch
 from gsparc.field import edit
 from gsparc.field.confidence import weighted
 from gsparc.field.initial import Snapshot

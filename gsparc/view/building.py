@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsparc.data.blocks import evenly
+from gsparc.data.query import Query
 from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import SceneWalls, box_faces
@@ -164,27 +165,23 @@ def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> 
     method, site = predictor.method, predictor.site
     if isinstance(method, HasGaussians):
         try:
-            cloud = method.gaussians(*_queries(site, measured))
+            cloud = method.gaussians(_query(site, measured))
             return replace(cloud, means=cloud.means + site.origin)
         except ValueError:
             pass  # of this kind are only some of those that it fits
     return None
 
 
-def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]:
+def _query(site: Site, measured: Measured | None) -> Query:
     """Local places of both ends at which emissions are asked."""
     box = site.moving_box[:, -3:]
     places = np.random.default_rng(0).uniform(box[0], box[1], (QUERIES, 3))
     if measured is not None:
         places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)] - site.origin
-    still = np.zeros(3) if site.static_position is None else site.static_position
-    still = site.box.mean(0) if site.static_end is None else still
-    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-    moving, fixed = (torch.from_numpy(np.asarray(x, np.float32)) for x in (places, still))
-    turn = torch.from_numpy(np.asarray(rotation, np.float32))
-    if site.moving_end == "tx":
-        return moving, Pose(fixed, turn)
-    return fixed.expand(len(moving), 3), Pose(moving, turn.expand(len(moving), 3, 3))
+    moving = torch.from_numpy(places).float()
+    if site.static_end is None:
+        return Query(torch.from_numpy(site.box.mean(0)).float().expand_as(moving), Pose.identity(moving))
+    return Query.at(site, moving)
 
 
 def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:

@@ -151,7 +151,7 @@ class Viewed:
 def _errors(predictor: Predictor, data: Measurements, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Of rows (n,): |difference of levels| [dB], or PSNR [dB] of spectra."""
     batch = data.batch(rows)
-    prediction = predictor.method.answer(batch)
+    prediction = predictor.method.predict(batch)
     if data.site.kind == "spectrum":
         square = (prediction.mean - batch.target).square().flatten(1).mean(1).double().numpy()
         return -10 * np.log10(np.maximum(square, LEAST_RATIO))

@@ -32,7 +32,7 @@ def trained(tmp_path_factory):
 
 def test_the_command_leaves_summary_samples_and_table(trained, tmp_path):
     given = f"ckpt={trained}", f"hydra.run.dir={tmp_path / 'run'}", "eval_on=test", "threads=1"
-    done = knock(COMMANDS["evaluate"].run, "evaluate", [*given, f"cache={tmp_path / 'cache'}"])
+    done = knock(COMMANDS["evaluate"].run, "evaluate", [*given])
     assert done.status == 0, done
     facts = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert facts["test/nmse"] == facts["baseline/nearest/nmse"] and facts["test/skill"] == 0
@@ -103,18 +103,15 @@ def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_it
     with np.load(file) as stored:
         moved = stored["rx_position"] + [0.02, 0.01, 0]
         np.savez(later, **{**stored, "rx_position": moved, "csi": np.roll(stored["csi"], 1, axis=0)})
-    found, data, split = evaluate_files(
-        [model], {"file": str(later)}, {"name": None}, cache=tmp_path / "cache"
-    )
+    found, data, split = evaluate_files([model], {"file": str(later)}, {"name": None})
     assert (
         split.name == "whole" and found.facts["test/samples"] == found.facts["split/test"] == len(data) == 80
     )
     assert "baseline/nearest/nmse" not in found.facts  # as asked
-    for _ in range(2):  # fitted, then from the cache
-        found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None, cache=tmp_path / "cache")
-        assert found.facts["test/nmse"] == found.facts["baseline/nearest/nmse"] > 0.5
-        assert found.facts["split/without_baselines"] is None
-    same, *_ = evaluate_files([model], {"file": str(file)}, baselines=["nearest"], cache=tmp_path / "cache")
+    found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None)
+    assert found.facts["test/nmse"] == found.facts["baseline/nearest/nmse"] > 0.5
+    assert found.facts["split/without_baselines"] is None
+    same, *_ = evaluate_files([model], {"file": str(file)}, baselines=["nearest"])
     assert same.facts["split/name"] == "random" and same.facts["split/foreign"] is None
     asked, _, split = evaluate_files([model], {"file": str(later)}, {"name": "corner"}, baselines=["nearest"])
     assert split.name == "corner" and asked.facts["test/nmse"] == asked.facts["baseline/nearest/nmse"]

@@ -33,7 +33,7 @@ def swept(field, tmp_path_factory):
     config = compose(
         f"ckpt='{ckpt}'", "threads=[1]", "rounds=5",
         "grid.keep=[1.0,0.3]", "grid.stride=[1,2]",
-        "baselines=[mean]", f"peers=['{field.checkpoints[0]}']", f"cache='{folder}/cache'", config="tradeoff",
+        "baselines=[mean]", f"peers=['{field.checkpoints[0]}']", config="tradeoff",
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         runs_in(patch, folder)

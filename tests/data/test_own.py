@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsparc.data.datasets.newrf import load_newrf
+from gsparc.data.load import load
 from gsparc.data.own import SSIM_WINDOW, from_arrays, load_own, write_own
 from gsparc.training.losses import WINDOW_RADIUS
 
@@ -133,7 +133,7 @@ def test_a_single_row_leaves_no_trace_in_the_scale(csi_arrays):
 
 
 def test_newrf_conference(real_newrf):
-    data = load_newrf(real_newrf)
+    data = load({"name": "newrf", "file": str(real_newrf)})
     assert data.site.kind == "csi" and data.site.static_end == "tx" and data.site.grid is None
     assert data.target.shape == (433, 1, 1) and data.target.dtype == np.complex64
     assert 0.85 < np.mean(np.abs(data.target) ** 2) < 1.2

@@ -1,4 +1,4 @@
-"""The harness: pooling, pairing, skill, cache, time beside every accuracy."""
+"""The harness: pooling, pairing, skill, time beside every accuracy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.baseline_cache import BASELINES, baseline
+from gsparc.evaluation.baselines import BASELINES, baseline
 from gsparc.evaluation.evaluate import evaluate, paired_differences
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import decided_by_a_row, result_rows, write_samples, write_summary
@@ -136,12 +136,12 @@ def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["nearest", "gp"])
-def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, tmp_path, name):
+def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, name):
     data, split = campaign("csi", 40), folds(40)
     for subset in ("test", "val"):
-        assert baseline(name, data, split, subset, cache=tmp_path).scores.figures()["nmse"] > 0.001
-    assert baseline(name, data, split, "test", cache=tmp_path).methods[0].size() == 30
-    assert baseline(name, data, split, "val", cache=tmp_path).methods[0].size() == 27
+        assert baseline(name, data, split, subset).scores.figures()["nmse"] > 0.001
+    assert baseline(name, data, split, "test").methods[0].size() == 30
+    assert baseline(name, data, split, "val").methods[0].size() == 27
 
 
 def test_wrong_counts_are_refused(campaign, folds, tmp_path):
@@ -161,64 +161,6 @@ def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
         evaluate(method, None, data, split, clock=QUICK)
 
 
-def test_cached_baselines_are_not_refitted(campaign, folds, stored, monkeypatch):
-    data, split = campaign("csi", 40), folds(40, 2)
-    first = baseline("gp", data, split, cache=stored)
-
-    def refuse(*arguments):
-        raise AssertionError("fitted again")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("gsparc.models.baselines.gp.GaussianProcess.fit", refuse)
-        patch.setattr("gsparc.evaluation.baseline_cache.score", refuse)
-        second = baseline("gp", data, split, cache=stored)
-    assert second.train_s == first.train_s
-    for name, values in first.scores.samples.items():
-        assert np.array_equal(second.scores.samples[name], values)
-    other = dataclasses.replace(data, site=dataclasses.replace(data.site, sha256="other"))
-    with monkeypatch.context() as patch, pytest.raises(AssertionError, match="fitted again"):
-        patch.setattr("gsparc.models.baselines.gp.GaussianProcess.fit", refuse)
-        baseline("gp", other, split, cache=stored)
-
-
-def test_a_cheap_fit_is_timed_anew(campaign, folds, tmp_path, monkeypatch):
-    """A fit that once took a second on a busy machine stood in every later table with that second."""
-    data, split = campaign("csi", 40), folds(40)
-    steps = iter(range(100))
-    monkeypatch.setattr("gsparc.training.time_budget.time.monotonic", lambda: 5.0 * next(steps))
-    baseline("gp", data, split, cache=tmp_path)
-    assert not list(tmp_path.rglob("fold*.ckpt")) and list(tmp_path.rglob("test.npz"))
-
-
-def test_the_cache_knows_the_local_frame(campaign, folds, stored):
-    data, split = campaign("csi", 40), folds(40)
-    here = baseline("gp", data, split, cache=stored).scores.figures()
-    shift = np.array([5.0, 0.0, 0.0])
-    site = dataclasses.replace(data.site, origin=data.site.origin - shift)
-    moved = dataclasses.replace(data, site=site, tx=data.tx + shift, rx_position=data.rx_position + shift)
-    there = baseline("gp", moved, split, cache=stored)
-    fold = split.folds[0]
-    assert np.allclose(there.methods[0].scores.places, moved.tx[np.concatenate([fold.train, fold.val])])
-    assert there.scores.figures()["nmse"] == pytest.approx(here["nmse"], rel=1e-2)
-
-
-def test_a_damaged_cache_is_made_anew(campaign, folds, stored, caplog):
-    data, split = campaign("csi", 40), folds(40)
-    first = baseline("gp", data, split, cache=stored)
-    for path in stored.rglob("*.*"):
-        path.write_bytes(b"rubbish")
-    again = baseline("gp", data, split, cache=stored)
-    assert again.scores.figures() == first.scores.figures()
-    assert "fitted again" in caplog.text
-
-
-@pytest.fixture
-def stored(tmp_path, monkeypatch):
-    """A cache that keeps every fit."""
-    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
-    return tmp_path
-
-
 class Remembering(Method):
     """Keeps the rows it was asked about."""
 
@@ -230,9 +172,9 @@ class Remembering(Method):
     def fit(self, data, fold, run_dir):
         raise NotImplementedError
 
-    def predict(self, tx, rx):
-        self.asked.append(tx.clone())
-        return Prediction(torch.zeros(len(tx), *self.shape))
+    def predict(self, query):
+        self.asked.append(query.tx.clone())
+        return Prediction(torch.zeros(len(query), *self.shape))
 
     def state(self):
         return {}

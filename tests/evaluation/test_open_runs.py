@@ -12,7 +12,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables.read import understand_table
-from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.open_runs import Opened, aligned
 from gsparc.evaluation.scores import score
 from gsparc.models.per_station import for_links
@@ -93,14 +93,13 @@ def test_degrees_about_another_origin_were_taken_for_the_same_metres():
     assert same.site.georeference == whole.site.georeference
 
 
-def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations(tmp_path, monkeypatch):
+def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations():
     """A cache told data apart by their content, not by the numbers that a model has for their stations."""
-    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
     other = town((2, 0, 1))
     split = make_split(other.moving, SplitSettings(), place=other.place)
     for data in (other, aligned(other, town().site)):
-        assert baseline("idw", data, split, cache=tmp_path).scores.figures()["rmse_db"] < 4
-    found = baseline("idw", aligned(other, town().site), split, "train", cache=tmp_path)
+        assert baseline("idw", data, split).scores.figures()["rmse_db"] < 4
+    found = baseline("idw", aligned(other, town().site), split, "train")
     assert found.scores.figures()["rmse_db"] < 1e-3
 
 

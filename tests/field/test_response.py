@@ -74,7 +74,7 @@ def test_1664_channels_cost_no_more_than_twice_one(tmp_path):
     for _ in range(40):
         for name, (method, batch) in calls.items():
             begin = time.perf_counter()
-            method.predict(batch.tx, batch.rx)
+            method.predict(batch)
             times[name].append(time.perf_counter() - begin)
     many, one = (np.quantile(times[name], 0.2) for name in ("many", "one"))
     assert many <= 2 * one

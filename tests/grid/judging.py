@@ -12,7 +12,7 @@ from worlds import World, arrays
 
 from gsparc.commands.train import Objects, train
 from gsparc.data.schema import Kind, Measurements
-from gsparc.evaluation.baseline_cache import baseline, fitting
+from gsparc.evaluation.baselines import baseline, fitting
 from gsparc.evaluation.scores import score
 
 BEHIND = 1.05  # times the best plain method's error that ours may have

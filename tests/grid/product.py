@@ -31,7 +31,7 @@ def reloaded(world: World, folder: Path, objects: Objects) -> None:
     """The checkpoint answers as the model that was trained."""
     method, _ = loading.load(folder / "run" / "model.ckpt")
     batch = objects.data.batch(objects.split.folds[0].test[:16])
-    before, after = (one.answer(batch) for one in (objects.methods[0], method))
+    before, after = (one.predict(batch) for one in (objects.methods[0], method))
     scale = float(before.mean.abs().max()) or 1.0
     assert torch.allclose(after.mean, before.mean, atol=1e-4 * scale), "reload: other predictions"
     if before.confidence is not None:

@@ -26,7 +26,7 @@ def fitted(folder, autocast: bool) -> tuple[torch.Tensor, torch.Tensor]:
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
         method, data = trained(spectra(folder / "own.npz"), folder, 30)
         batch = data.batch(np.arange(8))
-        mean = method.predict(batch.tx, batch.rx).mean
+        mean = method.predict(batch).mean
     assert mean.dtype == torch.float32 and mean.isfinite().all()
     assert all(p.dtype == torch.float32 and p.isfinite().all() for p in method.fitted().parameters())
     return mean, batch.target

@@ -54,5 +54,5 @@ def test_nobody_is_seen(tmp_path):
     file = spectra(tmp_path / "own.npz")
     method, data = trained(file, tmp_path, 10, "init=sphere", callbacks=lambda: [Sink()])
     batch = data.batch(np.arange(4))
-    assert (method.predict(batch.tx, batch.rx).mean == 0).all()
+    assert (method.predict(batch).mean == 0).all()
     assert all(p.isfinite().all() for p in method.fitted().parameters())

@@ -55,7 +55,7 @@ def test_no_seed_breaks(tmp_path, name, seeds):
         method.fit(data, fold, short(tmp_path / str(seed), 15, callbacks=callbacks, seed=seed))
         assert all(p.isfinite().all() for p in method.fitted().parameters())
         batch = data.batch(fold.test[:16])
-        predicted = method.predict(batch.tx, batch.rx).mean
+        predicted = method.predict(batch).mean
         error = float(np.square(np.abs((predicted - batch.target).numpy())).mean())
         power = float(np.square(np.abs(batch.target.numpy())).mean())
         assert np.isfinite(error) and error < 100 * power

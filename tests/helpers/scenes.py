@@ -9,8 +9,10 @@ from shoeboxes import as_arrays, scatter
 
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays, load_own
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.models.conditional import ConditionalField
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace
 
@@ -68,16 +70,17 @@ def shadowed(rows: int = 200, range_m: float = 2.0, noise_db: float = 0.5) -> tu
 
 
 def error(method, data: Measurements, rows: np.ndarray) -> float:
-    """sum |e|^2 / sum |target|^2 on the rows."""
+    """sum |e|^2 / sum |target|^2 on the rows, asked at their places alone."""
     batch = data.batch(rows)
-    return _share(method.predict(batch.tx, batch.rx).mean, batch.target)
+    return _share(method.predict(Query(batch.tx, batch.rx)).mean, batch.target)
 
 
 def answer_error(model, data: Measurements, rows: np.ndarray) -> float:
     """The same of a method's or a field's answers to rows, in the phase of their runs."""
     batch = data.batch(rows)
     with torch.no_grad():
-        return _share(model.answer(batch).mean, batch.target)
+        answer = model(batch) if isinstance(model, ConditionalField) else model.predict(batch)
+    return _share(answer.mean, batch.target)
 
 
 def _share(mean: torch.Tensor, target: torch.Tensor) -> float:

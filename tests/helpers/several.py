@@ -19,7 +19,8 @@ from torch import distributed
 
 from gsparc.callbacks import Checkpoint, Densify, OpacityReset
 from gsparc.data.datamodule import Loaded
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.query import Batch
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext

@@ -50,7 +50,7 @@ def predicted(model: str, data: Measurements, rows: np.ndarray, asked: np.ndarra
     method = build({"_target_": model})
     report = method.fit(data, Fold(rows, rows[:0], asked), FitContext())
     batch = data.batch(asked)
-    found = method.predict(batch.tx, batch.rx)
+    found = method.predict(batch)
     power = found.mean[:, 0].double()
     deviation = found.variance.double().sqrt() / (np.log(10) / 10 * power)
     return (10 * torch.log10(power * data.site.target_scale)).numpy(), deviation.numpy(), report.notes
@@ -97,7 +97,7 @@ def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
     again = build({"_target_": model})
     assert not again.fit(data, Fold(heard(data, rows), rows[:0], asked), FitContext()).notes
     batch = data.batch(asked)
-    assert torch.equal(found.predict(batch.tx, batch.rx).mean, again.predict(batch.tx, batch.rx).mean)
+    assert torch.equal(found.predict(batch).mean, again.predict(batch).mean)
 
 
 def test_without_censoring_all_rows_were_heard():

@@ -101,7 +101,7 @@ def asked(fitted: Fitted, count: int = 6):
 
 def same(one: Method, two: Method, batch) -> None:
     for part in ("mean", "confidence", "variance"):
-        a, b = getattr(one.answer(batch), part), getattr(two.answer(batch), part)
+        a, b = getattr(one.predict(batch), part), getattr(two.predict(batch), part)
         assert (a is None) == (b is None), part
         if a is not None:
             torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6 * float(a.abs().max()))
@@ -111,7 +111,7 @@ def same(one: Method, two: Method, batch) -> None:
 def test_every_kind_is_predicted_better_than_by_its_mean(name):
     fitted = default(name)
     batch = asked(fitted, 99)
-    found, target = fitted.method.answer(batch).mean, batch.target
+    found, target = fitted.method.predict(batch).mean, batch.target
     assert found.shape == target.shape and found.dtype == target.dtype
     if fitted.data.site.kind == "rssi":
         found, target = 10 * found.log10(), 10 * target.log10()
@@ -136,7 +136,7 @@ def test_far_from_all_data_nothing_is_known(name):
     there = (
         replace(batch, tx=far) if site.moving_end == "tx" else replace(batch, rx=Pose(far, batch.rx.rotation))
     )
-    near, away = fitted.method.answer(batch).confidence, fitted.method.answer(there).confidence
+    near, away = fitted.method.predict(batch).confidence, fitted.method.predict(there).confidence
     assert ((near >= 0) & (near <= 1)).all() and (away < 0.01).all() and near.mean() > 0.2
 
 
@@ -202,7 +202,7 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     rows = np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
     again.field.condition(fitted.data, rows)  # the same rows, the same weights
     batch = asked(fitted)
-    one, two = (m.predict(batch.tx, batch.rx).mean for m in (fitted.method, again))
+    one, two = (m.predict(batch).mean for m in (fitted.method, again))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
 
 
@@ -232,7 +232,7 @@ def test_without_gaussians_it_is_the_plain_process(name, plain):
         process, known = method_class(plain)(), np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
         process.fit(fitted.data, Fold(known, known[:0], fitted.fold.test), short(Path(mkdtemp()), 1))
         batch = asked(fitted)
-        one, two = fitted.method.answer(batch), process.answer(batch)
+        one, two = fitted.method.predict(batch), process.predict(batch)
         torch.testing.assert_close(one.mean, two.mean, rtol=1e-4, atol=0)
         torch.testing.assert_close(one.confidence, two.confidence, rtol=0, atol=1e-4)
 
@@ -246,7 +246,7 @@ def test_without_the_residual_gaussians_are_alone(name):
         assert method.state()["beside"] is None
         return
     batch = asked(fitted)
-    found = method.field(batch.tx, batch.rx)
+    found = method.field(batch)
     torch.testing.assert_close(found.mean, found.explained)
     assert not isinstance(method.field, Mixture)
 

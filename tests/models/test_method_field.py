@@ -21,9 +21,9 @@ def test_it_answers_as_the_process_does_and_is_read_back():
     field, _ = initialise(data, ROWS, InitSettings(), True, FitContext())
     plain, batch = GaussianProcess(), data.batch(np.arange(1, 160, 10))
     plain.fit(data, Fold(ROWS, ROWS[:0], ROWS[:0]), FitContext())
-    found, said = field(batch.tx, batch.rx), plain.predict(batch.tx, batch.rx)
-    assert torch.equal(found.mean, said.mean) and torch.equal(found.unknown, 1 - said.confidence)
-    again = ProcessField.restored(data.site, field.state())(batch.tx, batch.rx)
+    found, said = field(batch), plain.predict(batch)
+    assert torch.equal(found.mean, said.mean) and torch.equal(found.unknown, said.unknown)
+    again = ProcessField.restored(data.site, field.state())(batch)
     assert torch.allclose(again.mean, found.mean, atol=1e-6) and field.count == 0
 
 

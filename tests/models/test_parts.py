@@ -55,7 +55,7 @@ def test_stations_were_mixed_up_and_done_again_by_a_resumed_run(town, tmp_path, 
         again = fitted(town, tmp_path / "on", resume=type(tmp_path)(resume))
         assert Resumable.fits == 1
     whole, batch = fitted(town, tmp_path / "whole"), town[0].batch(town[1].test)
-    assert (again.answer(batch).mean == whole.answer(batch).mean).all()
+    assert (again.predict(batch).mean == whole.predict(batch).mean).all()
     assert len(list((tmp_path / "on").glob("station*/model.ckpt"))) == 3  # it can be gone on from, too
 
 

@@ -14,8 +14,9 @@ from scenes import fold_of
 import gsparc
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.baseline_cache import fitting
+from gsparc.evaluation.baselines import fitting
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.experiment.fit import fit_and_score, in_folders
 from gsparc.evaluation.scores import score
@@ -46,7 +47,7 @@ def fold(town):
 def test_every_station_has_its_own(town, fold, tmp_path):
     method = fitted("mean", town, fold, tmp_path)
     assert isinstance(method, PerStation)
-    found = method.answer(town.batch(fold.test)).mean[:, 0]
+    found = method.predict(town.batch(fold.test)).mean[:, 0]
     for number in range(len(POSTS)):
         rows = fold.test[town.station[fold.test] == number]
         alone = town.subset(np.flatnonzero(town.station == number), of_station(town.site, number))
@@ -59,7 +60,7 @@ def test_every_station_has_its_own(town, fold, tmp_path):
 def test_stations_are_found_by_their_places_too(town, fold, tmp_path):
     method = fitted("idw", town, fold, tmp_path)
     batch = town.batch(fold.test[::7])
-    assert torch.equal(method.predict(batch.tx, batch.rx).mean, method.answer(batch).mean)
+    assert torch.equal(method.predict(Query(batch.tx, batch.rx)).mean, method.predict(batch).mean)
 
 
 def test_checkpoints_hold_all_copies(town, fold, tmp_path):
@@ -68,12 +69,14 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
     again, stored = loading.load(tmp_path / "m.ckpt")
     assert stored.site.stations.name == town.site.stations.name
     batch = town.batch(fold.test)
-    assert torch.equal(again.answer(batch).mean, method.answer(batch).mean)
+    assert torch.equal(again.predict(batch).mean, method.predict(batch).mean)
     predictor = gsparc.load(tmp_path / "m.ckpt")
     place = town.tx[fold.test[0]] + town.site.origin
     number = int(town.station[fold.test[0]])
     one = predictor.at(number).rssi(tx=place, unit="linear")
-    assert one == pytest.approx(float(method.answer(town.batch(fold.test[:1])).mean) * town.site.target_scale)
+    assert one == pytest.approx(
+        float(method.predict(town.batch(fold.test[:1])).mean) * town.site.target_scale
+    )
     assert predictor.rssi(tx=place, unit="linear")[number] == one
     with pytest.raises(ValueError, match=r"say which station: \.at\(name\)"):
         predictor.confidence(tx=place)
@@ -99,7 +102,7 @@ def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
     fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
     method = for_links(method_class("mean"), town)
     method.fit(town, fold, FitContext(tmp_path, stations="together"))
-    assert len(dict(method)) == 1 and len(torch.unique(method.answer(town.batch(fold.test)).mean)) == 1
+    assert len(dict(method)) == 1 and len(torch.unique(method.predict(town.batch(fold.test)).mean)) == 1
     with pytest.raises(ValueError, match="stations='togehter': one of auto, each, together is needed"):
         FitContext(tmp_path, stations="togehter")
 
@@ -137,7 +140,7 @@ def test_a_station_that_heard_nothing_ended_the_run():
     data = heard(rssi_db=lambda far: free_space(far) - [40, 40, np.nan, 40], sensitivity_db=-80.0)
     fold = fold_of(data)
     for name in ("nearest", "kriging", "gp"):
-        assert fitted(name, data, fold).answer(data.batch(fold.test)).mean.isfinite().all()
+        assert fitted(name, data, fold).predict(data.batch(fold.test)).mean.isfinite().all()
 
 
 def test_sectors_of_one_mast_were_answered_by_the_first():
@@ -148,10 +151,10 @@ def test_sectors_of_one_mast_were_answered_by_the_first():
     )
     fold = fold_of(data)
     method, batch = fitted("idw", data, fold), data.batch(fold.test)
-    found = 10 * method.answer(batch).mean.log10()[:, 0]
+    found = 10 * method.predict(batch).mean.log10()[:, 0]
     assert (found[batch.station == 0] - found[batch.station == 1]).min() > 5
     with pytest.raises(ValueError, match="sector 1 and sector 2 stand at one place"):
-        method.predict(batch.tx, batch.rx)
+        method.predict(Query(batch.tx, batch.rx))
 
 
 def test_the_place_of_a_single_station_was_sought():
@@ -185,8 +188,8 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
     whole = score([method], town, Split("random", (fold,), ""))
     asked = []
     monkeypatch.setattr("gsparc.evaluation.scores.CHUNK", 6)
-    answer = method.answer
-    monkeypatch.setattr(method, "answer", lambda b: asked.append(len(b.station.unique())) or answer(b))
+    answer = method.predict
+    monkeypatch.setattr(method, "predict", lambda b: asked.append(len(b.station.unique())) or answer(b))
     parts = score([method], town, Split("random", (fold,), ""))
     assert sum(asked) < len(asked) + len(POSTS)
     np.testing.assert_array_equal(parts.row, whole.row)
@@ -220,4 +223,4 @@ def test_stations_that_are_fitted_elsewhere_are_the_same_bits(town, fold, tmp_pa
     here, batch = fitted("gp", town, fold, tmp_path / "here"), town.batch(fold.test)
     elsewhere("joblib")
     there = fitted("gp", town, fold, tmp_path / "there")
-    assert torch.equal(here.answer(batch).mean, there.answer(batch).mean)
+    assert torch.equal(here.predict(batch).mean, there.predict(batch).mean)

@@ -5,20 +5,26 @@ Methods are fitted once, on tiny data.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import kinds
 import numpy as np
 import pytest
 import torch
 from campaigns import RENDERED, channels, compose, powers, spectra
+from cities import city
 from contexts import short
 from rooms import directed, shoebox
-from scenes import fold_of
+from scenes import fold_of, lobes, room
+from worlds import World, arrays
 
 from gsparc.data.load import load
+from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
@@ -27,9 +33,13 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Reducible, suited_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
+from gsparc.models.per_station import for_links
 from gsparc.models.registry import METHODS, build, method_class
 from gsparc.models.splat.array import ArrayField
+from gsparc.models.uplink.search import SearchSettings as UplinkSearch
 from gsparc.ops import Pose
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
 
 DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink"), ""),
@@ -51,6 +61,15 @@ VARIANCE = (
     "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
     "moving_array",
 )  # fmt: skip
+# Settings of trainings that are over at once.
+SMALL: dict[str, dict[str, Any]] = {
+    **{name: {"count": 40, "max_steps": 3} for name in ("gsrf", "wrfgs", "swiftwrf", "ngrf")},
+    **{name: {"width": 16, "samples": 8, "max_steps": 3} for name in ("nerf2", "newrf")},
+}
+UPLINK: dict[str, dict[str, Any]] = {
+    "ridge": {}, "fire": {"steps": 3},
+    "uplink": {"search": UplinkSearch(rounds=2, picks=4, final=2), "teachers": 60},
+}  # fmt: skip
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
 FILES = {  # of rendered Gaussians, by what they render
     "gsparc": spectra,
@@ -71,6 +90,10 @@ def data_of(name: str, folder: Path) -> Measurements:
         return kinds.static_array(folder)
     if name == "moving_array":
         return kinds.moving_array(folder)
+    if name in SMALL:
+        return room(40, directions=True)[0] if name in ("ngrf", "newrf") else lobes(folder)[0]
+    if name in UPLINK:
+        return city("all")
     make = {"gp": kinds.images, "complex_gp": kinds.gains}.get(name, kinds.received)
     return make(folder)
 
@@ -88,7 +111,7 @@ def unfitted(name: str) -> Method:
     if name == "moving_array":
         search = SearchSettings(sources=8, rows=30, candidates=1000, steps=20)
         return MovingArrayField(search=search, components=32)
-    return method_class(name.removesuffix(" of powers"))()
+    return method_class(name)(**{**SMALL, **UPLINK}.get(name, {}))
 
 
 @cache
@@ -108,15 +131,15 @@ def places(method: Method, count: int = 5) -> torch.Tensor:
     return low + (0.2 + 0.6 * torch.rand(count, 3, generator=draw, dtype=torch.float64)) * (high - low)
 
 
-def ends(method: Method, moving: torch.Tensor) -> tuple[torch.Tensor, Pose]:
+def ends(method: Method, moving: torch.Tensor) -> Query:
     """Both ends, the moving one at places (B, 3); the static one where it stood."""
     site = method.site
     assert site is not None
     still = torch.zeros(3) if site.static_position is None else torch.from_numpy(site.static_position).float()
     if site.moving_end == "rx":
-        return still.expand(len(moving), 3), Pose.identity(moving)
+        return Query(still.expand(len(moving), 3), Pose.identity(moving))
     turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-    return moving, Pose(still, torch.from_numpy(turn).float())
+    return Query(moving, Pose(still, torch.from_numpy(turn).float()))
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -133,14 +156,14 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
     """Its state alone says all, without the settings."""
     method = fitted(name)[0]
     query = ends(method, places(method).float())
-    said = method.predict(*query)
+    said = method.predict(query)
     variance = said.variance
     assert variance is not None and variance.shape == (5,)
     assert variance.dtype == torch.float32 and (variance > 0).all()
     torch.save(method.state(), tmp_path / "state.pt")
     again = method_class(name)()
     again.restore(method.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    told = again.predict(*query)
+    told = again.predict(query)
     for part in ("mean", "confidence", "variance"):
         torch.testing.assert_close(getattr(told, part), getattr(said, part))
     assert again.size() == method.size()
@@ -159,10 +182,10 @@ def test_a_reduction_leaves_the_method_as_it_was(name, settings):
     method, data, fold = fitted(name)
     assert isinstance(method, Reducible) and set(settings) <= set(method.knobs())
     query = ends(method, places(method).float())
-    before = method.predict(*query)
+    before = method.predict(query)
     less = method.reduced(settings, method.contributions(data, fold.train))
-    assert not torch.equal(less.predict(*query).mean, before.mean)
-    after = method.predict(*query)
+    assert not torch.equal(less.predict(query).mean, before.mean)
+    after = method.predict(query)
     for part in ("mean", "confidence", "variance"):
         one, two = getattr(before, part), getattr(after, part)
         assert (one is None and two is None) or torch.equal(one, two)
@@ -178,3 +201,52 @@ def test_threads_of_a_query(monkeypatch, name, places, inside):
         assert torch.get_num_threads() == inside
         raise ZeroDivisionError
     assert torch.get_num_threads() == 2  # also after an error
+
+
+def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.Tensor:
+    """What a user is answered at the places of rows (n,), in stored units."""
+    places = data.moving[rows] + data.site.origin
+    return predictor.linear(**{data.site.moving_end: places}).mean / data.site.target_scale
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "calibrated_raytracer"])
+def test_what_is_scored_is_what_is_served(name):
+    """`answer` of rows and `predict` of places were two ways, each with code of its own."""
+    method, data, fold = fitted(name)
+    batch, predictor = data.batch(fold.test), Predictor(method, data.site)
+    scored = method.predict(batch).mean
+    if name not in UPLINK:
+        return torch.testing.assert_close(served(predictor, data, fold.test), scored, rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="uplink= is needed"):
+        method.predict(replace(batch, uplink=None))
+    heard = batch.uplink * data.site.target_scale
+    said = predictor.csi(uplink=heard) / data.site.target_scale
+    scored = method.predict(replace(batch, noise_variance=None)).mean
+    assert (said - scored).norm() < 1e-3 * scored.norm()  # a search among sources of nearly the same use
+
+
+@pytest.mark.parametrize(("name", "how"), [("gp", "each"), ("gp", "together"), ("gsparc", "together")])
+def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
+    data = kinds.several(tmp_path)
+    fold = fold_of(data)
+    method = for_links(method_class(name), data)
+    method.fit(data, fold, FitContext(tmp_path, stations=how))
+    predictor = Predictor(method, data.site)
+    for number in range(len(kinds.POSTS)):
+        rows = fold.test[data.station[fold.test] == number]
+        scored = method.predict(data.batch(rows)).mean
+        torch.testing.assert_close(served(predictor.at(number), data, rows), scored, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("words", ["model=complex_gp", "model=gsparc model.effects.phase=false"])
+def test_places_are_served_in_the_phase_of_the_largest_run(words):
+    data = from_arrays(arrays(World("tone", 3, 1, "rx", "metres", "none", "random", 30), 0))
+    fold, method = fold_of(data), build(compose(*words.split()).model)
+    method.fit(data, fold, FitContext())
+    batch = data.batch(fold.test)
+    factor = method.runs.of(batch.run)[:, None, None]
+    assert (factor - 1).abs().max() > 0.1
+    said = served(Predictor(method, data.site), data, fold.test)
+    torch.testing.assert_close(said * factor.to(said.dtype), method.predict(batch).mean, rtol=1e-4, atol=1e-5)
+    elsewhere = replace(batch, run=torch.full((len(batch),), 99))
+    torch.testing.assert_close(said, method.predict(elsewhere).mean, rtol=1e-4, atol=1e-5)

@@ -90,7 +90,7 @@ def _channels(error_m, rows=130, seed=0):
 def _missed(method, exact, fold):
     batch = exact.batch(fold.test)
     with torch.no_grad():
-        found = method.answer(batch).mean
+        found = method.predict(batch).mean
     return float((found - batch.target).abs().square().mean() / batch.target.abs().square().mean())
 
 
@@ -115,7 +115,7 @@ def test_an_error_of_zero_changes_nothing():
     exact, _, fold = _channels(0.0)
     plain, zero = (_fitted(exact, fold, **settings)[0] for settings in ({}, {"position_std": 0.0}))
     batch = exact.batch(fold.test)
-    assert torch.equal(plain.answer(batch).mean, zero.answer(batch).mean)
+    assert torch.equal(plain.predict(batch).mean, zero.predict(batch).mean)
 
 
 def test_exact_places_stay_though_errors_are_claimed():

@@ -67,7 +67,7 @@ def answers(file, name, tmp_path, leave_out):
     fold = split_for({"name": "random", "seed": 1, "leave_out": leave_out}, data).folds[0]
     method = method_class(name)()
     method.fit(data, fold, FitContext(tmp_path))
-    return method.answer(data.batch(np.setdiff1d(fold.test, [7]))).mean * data.site.target_scale
+    return method.predict(data.batch(np.setdiff1d(fold.test, [7]))).mean * data.site.target_scale
 
 
 @pytest.mark.parametrize("kind,name,wrong", cases())
@@ -137,7 +137,7 @@ def trained(name, data, fold, folder):
     config = compose(f"model={name}", "budget_s=0.5", *(["model.steps=20"] if name == "fire" else []))
     method = build(config.model)
     method.fit(data, fold, short(folder, 4, budget_s=0.5))
-    return method.answer(data.batch(fold.test)).mean
+    return method.predict(data.batch(fold.test)).mean
 
 
 def finite_or_refused(name, data, fold, folder):

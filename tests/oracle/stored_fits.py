@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ from rich.console import Console
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
-from gsparc.data.schema import Batch
 
 STORED = Path(__file__).parent / "stored"
 ANSWERED, DOUBLE = 1e-5, 1e-8  # of the targets' deviation: answers, and those of closed forms in float64
@@ -75,7 +75,7 @@ def fitted(name: str, folder: Path) -> tuple[gsparc.Predictor, dict[str, Any]]:
         facts = {key: value for key, value in summary.items() if TOLD.match(key)}
     predictor = gsparc.load(path)
     facts["error"] = missed(predictor, asked)
-    facts["predict and answer"] = doors(predictor, asked)
+    facts["rows and places"] = rows_and_places(predictor, asked)
     return predictor, facts
 
 
@@ -121,35 +121,28 @@ def answers(predictor: gsparc.Predictor, asked: Arrays) -> dict[str, np.ndarray]
     return result
 
 
-def doors(predictor: gsparc.Predictor, asked: Arrays) -> dict[str, float]:
-    """Largest difference of what `predict` and `answer` say, as a share of the targets' deviation."""
+def rows_and_places(predictor: gsparc.Predictor, asked: Arrays) -> dict[str, float]:
+    """Largest difference of answers to whole rows and to their places, a share of the answers' deviation.
+
+    Runs and uplinks make one.
+    """
     names = [] if "station_position" not in asked else list(predictor.site.stations.name)
+    known = {key: torch.from_numpy(np.asarray(asked[key])) for key in ("uplink", "run") if key in asked}
     result: dict[str, float] = {}
     for number, name in enumerate(names or [""]):
-        method = predictor.method
-        query = (predictor.at(name) if name else predictor)._query(
-            places(asked).get("tx"), places(asked).get("rx")
-        )
-        rows = torch.arange(len(query.tx))
-        rows_of = {"uplink": asked.get("uplink"), "run": asked.get("run")}
-        more = {
-            key: torch.from_numpy(np.asarray(value)) for key, value in rows_of.items() if value is not None
-        }
-        station = torch.full((len(rows),), number) if name else None
-        batch = Batch(rows, query.tx, query.rx, torch.zeros(len(rows), 1), station=station, **more)
+        ends = places(asked).get("tx"), places(asked).get("rx")
+        place = (predictor.at(name) if name else predictor)._query(*ends).query
+        station = torch.full((len(place),), number) if name else None
         with torch.no_grad():
-            told, said = method.answer(batch), None
+            told = predictor.method.predict(replace(place, station=station, **known))
             try:
-                said = method.predict(query.tx, query.rx)
-            except (ValueError, NotImplementedError) as error:
-                return {f"predict refuses: {error}": 1.0}
+                said = predictor.method.predict(place)
+            except ValueError as error:
+                return {f"places alone are refused: {error}": 1.0}
         scale = spread(told.mean.numpy())
-        for part in ("mean", "variance", "confidence"):
+        for part, unit in {"mean": scale, "variance": scale**2, "unknown": 1.0}.items():
             one, other = getattr(told, part), getattr(said, part)
-            unit = {"mean": scale, "variance": scale**2, "confidence": 1.0}[part]
-            if (one is None) != (other is None):
-                result[f"{part}, of {'answer' if other is None else 'predict'} alone"] = 1.0
-            elif one is not None and (apart := float((one - other).abs().max()) / unit) > 0:
+            if one is not None and (apart := float((one - other).abs().max()) / unit) > 0:
                 result[part] = max(result.get(part, 0.0), apart)
     return result
 

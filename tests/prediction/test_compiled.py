@@ -22,6 +22,7 @@ import gsparc
 from gsparc.commands import export
 from gsparc.commands.train import train
 from gsparc.data.assemble import FARTHEST
+from gsparc.data.query import Query
 from gsparc.models import checkpoint
 from gsparc.models.terms import EffectSettings
 from gsparc.prediction.compiled import make
@@ -182,11 +183,11 @@ def test_the_library_answers_as_the_model(name, library, example, tmp_path, monk
     assert np.abs(own - expected).max() < SCALE * scale
     if site.kind == "rssi" and not found.error:
         rx = torch.from_numpy(places)
-        said = predictor.method.predict(torch.tensor(site.static_position).float().expand(len(rx), 3),
-                                        gsparc.ops.Pose(rx, torch.eye(3).expand(len(rx), 3, 3)))  # fmt: skip
+        tx = torch.tensor(site.static_position).float().expand(len(rx), 3)
+        said = predictor.method.predict(Query(tx, gsparc.ops.Pose.identity(rx)))
         variance, unknown = (np.array(part) for part in list(zip(*answers, strict=True))[1:])
         np.testing.assert_allclose(variance, said.variance * site.target_scale**2, rtol=1e-4)
-        np.testing.assert_allclose(unknown, 1 - said.confidence, atol=1e-5)
+        np.testing.assert_allclose(unknown, said.unknown, atol=1e-5)
     else:
         assert np.isnan([one[1] for one in answers]).all()
     field.close()

@@ -37,7 +37,7 @@ def test_world_positions_many_and_one(spectra):
     assert isinstance(predictor.method, GaussianProcess)
     world = data.tx[:3] + data.site.origin
     batch = data.batch(np.arange(3))
-    expected = predictor.method.predict(batch.tx, batch.rx)
+    expected = predictor.method.predict(batch)
     many = predictor.spectrum(tx=world)
     assert isinstance(many, np.ndarray) and many.shape == (3, 12, 24) and many.dtype == np.float32
     assert np.allclose(many, expected.mean.numpy(), atol=1e-5)

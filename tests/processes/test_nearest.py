@@ -6,6 +6,7 @@ import torch
 from releases import real
 
 from gsparc.data.own import interpret
+from gsparc.data.query import Query
 from gsparc.data.raw import read_raw
 from gsparc.data.selection import keep_above
 from gsparc.data.splits import SplitSettings, make_split
@@ -114,7 +115,7 @@ def test_back_from_disk(many, tmp_path):
     torch.save(method.state(), tmp_path / "state.pt")
     again = GaussianProcess()
     again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    said, then = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
+    said, then = method.predict(batch), again.predict(batch)
     for part in ("mean", "confidence", "variance"):
         assert torch.equal(getattr(said, part), getattr(then, part))
     assert again.label == "gp (Vecchia 30)"
@@ -171,8 +172,8 @@ def test_kriging_of_many_places_says_how_many(monkeypatch):
     data, method = town(700), Kriging()
     batch, _ = fit(method, data, 400)
     assert method.label == "kriging (nearest 100)" and Kriging().label == "kriging"
-    one = [method.predict(batch.tx[i : i + 1], batch.rx[i : i + 1]).mean for i in range(300)]
-    assert torch.allclose(method.predict(batch.tx, batch.rx).mean, torch.cat(one))
+    one = [method.predict(Query(batch.tx[i : i + 1], batch.rx[i : i + 1])).mean for i in range(300)]
+    assert torch.allclose(method.predict(batch).mean, torch.cat(one))
 
 
 @pytest.mark.parametrize("kind", ["csi", "spectrum"])
@@ -183,7 +184,7 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
     batch, notes = fit(near, data, 80)
     assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
     assert "gp: each query is predicted from the 30 nearest of 80 rows (Vecchia)" in notes
-    said, exactly = near.predict(batch.tx, batch.rx), whole.predict(batch.tx, batch.rx)
+    said, exactly = near.predict(batch), whole.predict(batch)
     target = batch.target
     errors = [float((found.mean - target).abs().square().mean()) for found in (said, exactly)]
     assert errors[0] < 2 * errors[1] < 0.1 * float(target.abs().square().mean()), errors  # very smooth
@@ -191,9 +192,9 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
     torch.save(near.state(), tmp_path / "state.pt")
     again = GaussianProcess()
     again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said.mean)
-    assert torch.allclose(near.mean_at(batch.tx, batch.rx), said.mean)
-    lean = reduced(near, {"confidence": False}, {}).predict(batch.tx, batch.rx)
+    assert torch.equal(again.predict(batch).mean, said.mean)
+    assert torch.allclose(near.mean_at(batch), said.mean)
+    lean = reduced(near, {"confidence": False}, {}).predict(batch)
     assert lean.variance is None and torch.allclose(lean.mean, said.mean)
 
 
@@ -207,7 +208,7 @@ def test_near_rows_do_not_choose_a_process_of_a_thousand_times_the_power():
     method = GaussianProcess()
     method.fit(data, fold, FitContext())
     batch = data.batch(fold.test)
-    error = (method.predict(batch.tx, batch.rx).mean / batch.target).clamp_min(1e-30).log10() * 10
+    error = (method.predict(batch).mean / batch.target).clamp_min(1e-30).log10() * 10
     assert error.square().mean().sqrt() < 6.0
 
 

@@ -211,8 +211,6 @@ def test_decision_survives_its_file():
 
 @pytest.mark.parametrize("changes, rows, paid", [
     ({}, 200, False), ({}, 900, True),
-    ({"reused": True}, 900, False),  # two sizes of calls: it compiled for rows that took less than that
-    ({"row_chosen": 0.018}, 200, True),  # its kernels are there
     ({"compiling": None}, 200, True),
 ])  # fmt: skip
 def test_fewer_effects_are_compiled_for_only_where_that_pays(changes, rows, paid):

@@ -271,8 +271,8 @@ def test_auto_decides_verifies_and_is_drawn(tmp_path):
         assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
-def test_probes_are_rows_of_the_file_and_decisions_are_reused(tmp_path, monkeypatch):
-    """No row is traced twice, and the next set of receivers of the same scene needs no probes."""
+def test_probes_are_rows_of_the_file(tmp_path, monkeypatch):
+    """No row is traced twice."""
     real, traced = ShoeboxEngine.trace, []
 
     def counts(self, receivers, effects, seed=None):
@@ -285,13 +285,6 @@ def test_probes_are_rows_of_the_file_and_decisions_are_reused(tmp_path, monkeypa
     simulate(plan(effects=first.effects), tmp_path / "same.h5")
     # What probes kept of their full trace is what a run with the choice finds.
     assert_same(tmp_path / "first.h5", tmp_path / "same.h5")
-    traced.clear()
-    again = simulate(plan(effects=FEW_PROBES, scene=replace(SCENE, seed=3)), tmp_path / "again.h5")
-    assert again.choice.reused and again.effects == first.effects
-    assert sum(count for count, _ in traced) == 60 and {depth for _, depth in traced} == {first.effects.depth}
-    moved = plan(effects=FEW_PROBES, scene=replace(SCENE, transmitter_m=(1.0, 1.4, 2.6)))
-    for number, other in enumerate((moved, plan(effects=replace(FEW_PROBES, reuse=False)))):
-        assert not simulate(other, tmp_path / f"{number}.h5").choice.reused
 
 
 class Rays(ShoeboxEngine):
@@ -334,9 +327,6 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
     assert outcome.convergence.nmse == pytest.approx(1e-4, rel=0.01)
     assert outcome.convergence.power_db == pytest.approx(20 * np.log10(1.01), rel=0.01)
     assert "90,000 rays" in verdict(outcome.choice) and figures(outcome)["auto/samples"] == 90_000
-    again = simulate(plan(scene=replace(many, seed=3), effects=asked), tmp_path / "again.h5")
-    sampling = json.loads(arrays(tmp_path / "again.h5")[1]["sampling"])
-    assert again.choice.reused and sampling["samples"] == 90_000
 
 
 def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
@@ -346,18 +336,8 @@ def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
     assert json.loads(arrays(tmp_path / "box.h5")[1]["sampling"])["samples"] == 300_000
 
 
-def test_untried_rays_are_tried_where_that_pays(tmp_path, monkeypatch):
-    asked = with_rays(monkeypatch, 1.05)
-    with monkeypatch.context() as patch:
-        patch.setattr(deciding.Decider, "_may_pay", lambda *unused: False)
-        assert simulate(plan(effects=asked), tmp_path / "few.h5").choice.untried
-        assert simulate(plan(effects=asked), tmp_path / "same.h5").choice.reused
-    many = simulate(plan(effects=asked, scene=replace(SCENE, num_receivers=200)), tmp_path / "many.h5")
-    assert not many.choice.reused and many.choice.samples == 90_000
-
-
 def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
-    """A run said NOT MET, simulated the choice all the same, and the next set of receivers took it over."""
+    """A run said NOT MET and simulated the choice all the same."""
     real, full = deciding.auto.verify, replace(MIRROR, depth=4)
 
     def refuted(*arguments):
@@ -369,29 +349,27 @@ def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     outcome = simulate(plan(effects=settings), tmp_path / "box.h5")
     assert outcome.effects == outcome.choice.effects == full and outcome.choice.saved is None
     assert "NOT MET by less (line of sight, specular, depth" in verdict(outcome.choice)
-    again = simulate(plan(effects=settings, scene=replace(SCENE, seed=3)), tmp_path / "again.h5")
-    assert again.choice.reused and again.effects == full
 
 
 def test_everything_is_simulated_where_few_rows_are_left(tmp_path, monkeypatch):
-    """All rows are probes, or a decision is taken over for few."""
+    """All rows are probes, or few are left."""
     outcome = simulate(plan(effects=replace(FEW_PROBES, probes=60, held_back=60)), tmp_path / "box.h5")
     assert outcome.effects.depth == 4 and outcome.choice.effects.depth < 4
-    simulate(plan(effects=FEW_PROBES, shard=60), tmp_path / "first.h5")
     monkeypatch.setattr(deciding, "pays", lambda choice, rows, saved: rows > 60)
     few = simulate(plan(effects=FEW_PROBES), tmp_path / "few.h5")
-    assert few.choice.reused and few.effects.depth == 4 and few.choice.effects.depth < 4
-    many = simulate(plan(effects=FEW_PROBES, scene=replace(SCENE, num_receivers=61)), tmp_path / "many.h5")
-    assert many.choice.reused and many.effects == many.choice.effects
+    assert few.effects.depth == 4 and few.choice.effects.depth < 4
+    many = simulate(plan(effects=FEW_PROBES, scene=replace(SCENE, num_receivers=120)), tmp_path / "many.h5")
+    assert many.effects == many.choice.effects
 
 
 def test_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path):
     """The shard of a decision nobody had noted stayed, beside rows of the decision taken instead of it."""
-    probed = plan(effects=replace(FEW_PROBES, probes=60, held_back=60))
+    probed = plan(effects=FEW_PROBES)
     interrupted(Shards, "write_note", probed, tmp_path / "cut.h5")
-    assert (tmp_path / "cut.h5.parts" / "shard_0000.npz").exists()  # everything, at depth 4
+    stale = tmp_path / "cut.h5.parts" / "shard_0000.npz"
+    stale.write_bytes(stale.read_bytes()[:100])
     outcome = simulate(probed, tmp_path / "cut.h5")
-    assert outcome.choice.reused and outcome.effects.depth < 4
+    assert outcome.effects.depth < 4
     simulate(plan(effects=outcome.effects), tmp_path / "whole.h5")
     assert_same(tmp_path / "whole.h5", tmp_path / "cut.h5")
 

@@ -33,7 +33,7 @@ def fitted(measured, folder, *more, steps=40, **context):
 def held_out(method, measured):
     _, data, fold = measured
     batch = data.batch(fold.val)
-    return float((method.predict(batch.tx, batch.rx).mean - batch.target).square().mean())
+    return float((method.predict(batch).mean - batch.target).square().mean())
 
 
 def test_steps_that_pay_are_kept(measured, tmp_path):

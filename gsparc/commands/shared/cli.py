@@ -20,7 +20,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
-from gsparc.commands.shared import job_name  # noqa: F401  # configurations name folders by it
 from gsparc.commands.shared.plugins import offer, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release
 from gsparc.data.files import check_yaml

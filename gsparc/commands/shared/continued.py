@@ -12,11 +12,10 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.run_lock import in_use, locked
+from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import plain
 from gsparc.data.files import whole_file
 from gsparc.evaluation.report.sweep import FAILURE
-from gsparc.evaluation.summary import provenance
 from gsparc.models.parts import LAST
 
 log = logging.getLogger(__name__)
@@ -72,8 +71,7 @@ def once(
         run_dir: the job's own.
         config: of the job; `ckpt_path` is filled in where there is a checkpoint to go on from.
         work: does the job.
-        again: it is a run by itself: done anew where it has ended, and gone on with where the same settings
-            and program were interrupted in a folder beside this one.
+        again: it is a run by itself: done anew where it has ended.
 
     Raises:
         ValueError: another process is doing it.
@@ -82,25 +80,19 @@ def once(
         stated = {name: value for name, value in plain(config).items() if name not in WHERE}
         settings = json.loads(json.dumps(stated, default=str))
         now = {"settings": settings, "data": _files(settings.get("dataset"), run_dir)}
-        record, other = _read(run_dir / RECORD), None
+        record = _read(run_dir / RECORD)
         same = record is not None and all(record.get(key, now[key]) == now[key] for key in now)
         if record is None or not same or (again and record["returned"] is not None):
-            record = {**now, "program": provenance(), "began": time.time(), "returned": None}
+            record = {**now, "began": time.time(), "returned": None}
             _write(run_dir / RECORD, record)
-            other = _beside(run_dir, record) if again and config.ckpt_path is None else None
         elif record["returned"] is not None:
             log.info("%s: was done before", run_dir)
             return float(record["returned"])
         elif config.ckpt_path is None:
             config.ckpt_path = _last_state(run_dir, record["began"])
-        if other is not None:
-            config.ckpt_path = _last_state(other.parent, 0.0)
-            text = "going on from %s, where the same run was interrupted; to begin anew, delete it"
-            log.info(text, config.ckpt_path)
         (run_dir / FAILURE).unlink(missing_ok=True)  # of an earlier try
         value = work(config)
-        for path in (run_dir / RECORD, *([] if other is None else [other])):
-            _write(path, {**(_read(path) or record), "returned": value})
+        _write(run_dir / RECORD, {**record, "returned": value})
         return value
 
 
@@ -116,17 +108,6 @@ def _files(dataset: Any, run_dir: Path) -> dict[str, list[int]]:
         newest = max((one.st_mtime_ns for one in inside), default=0)
         stats[str(path)] = [len(inside), sum(one.st_size for one in inside), newest]
     return stats
-
-
-def _beside(run_dir: Path, record: dict[str, Any]) -> Path | None:
-    """The record of the newest interrupted run beside this one, of the same settings, data and program."""
-    for path in sorted(run_dir.parent.glob(f"*/{RECORD}"), reverse=True):
-        one = None if path.parent == run_dir else _read(path)
-        if one is None or any(one.get(k) != record[k] for k in ("settings", "data", "program", "returned")):
-            continue
-        if _last_state(path.parent, one["began"]) is not None and not in_use(path.parent):
-            return path
-    return None
 
 
 def _last_state(run_dir: Path, began: float) -> str | None:

@@ -89,15 +89,6 @@ def locked(folder: Path, setting: str = "hydra.run.dir") -> Iterator[None]:
         lock.release()
 
 
-def in_use(folder: Path) -> bool:
-    """Whether another run writes there."""
-    try:
-        _lock(folder).release()
-    except InUse:
-        return True
-    return False
-
-
 def _lock(folder: Path, setting: str = "hydra.run.dir", holder: str = "") -> FileLock:
     """Its lock, held, and beside it who holds it, where that is given."""
     lock = FileLock(folder.resolve() / LOCK)

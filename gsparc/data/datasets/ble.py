@@ -14,19 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, converted
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text
-from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import TEXT
+from gsparc.data.raw import Raw
 
 CARRIER_HZ = 2.44e9  # the middle of the three frequencies that beacons use in turns
-LAYOUT = {
-    "mobile_position": Expected(("S", 3), place=True, field="tx_position"),
-    "station_position": Expected(("T", 3), place=True),
-    "rssi_db": Expected(("S", "T")),
-    "station": Expected(("T",), TEXT, optional=True, field="station_name"),
-    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
+NPZ = {
+    **{"mobile_position": "tx_position", "station_position": "station_position", "rssi_db": "rssi_db"},
+    **{"station": "station_name", "frequency_hz": "carrier_hz"},
 }
 
 
@@ -39,13 +35,12 @@ def raw_of_ble(path: str | Path, hall: int = 1) -> Raw:
 
     Returns:
         `tx_position` (S, 3), `station_position` (T, 3) [m], `rssi_db` (S, T) [dBm], `station_name` (T,)
-        and `carrier_hz` () where the file has them.
+        and `carrier_hz` ().
 
     Raises:
-        DataError: no such file, or an array is missing or wrong; all problems with array and row.
+        DataError: no such file, or an array is missing, or a line is none of the release.
     """
-    raw = _of_release(Path(path), hall) if Path(path).is_dir() else read_raw(path)
-    return Raw(check_layout(raw, path, LAYOUT), {**raw.attributes, "layout": "ble"})
+    return _of_release(Path(path), hall) if Path(path).is_dir() else converted(path, NPZ, layout="ble")
 
 
 def _of_release(root: Path, hall: int) -> Raw:
@@ -65,13 +60,13 @@ def _of_release(root: Path, hall: int) -> Raw:
     where = sorted({place for _, place in levels}, key=lambda place: tuple(map(float, place.split("_"))))
     rssi = [[levels.get((name, place), np.nan) for name in sensors] for place in where]
     arrays = {
-        "mobile_position": np.array([place.split("_") for place in where], np.float64),
+        "tx_position": np.array([place.split("_") for place in where], np.float64),
         "station_position": np.array(list(sensors.values())),
-        "station": np.array(list(sensors)),
+        "station_name": np.array(list(sensors)),
         "rssi_db": np.array(rssi, np.float32),
-        "frequency_hz": np.array(CARRIER_HZ),
+        "carrier_hz": np.array(CARRIER_HZ),
     }
-    return Raw(arrays)
+    return Raw(arrays, {"layout": "ble"})
 
 
 def sensor_places(path: Path) -> dict[str, np.ndarray]:

@@ -19,7 +19,7 @@ from gsparc.data.errors import Caution, DataError, Problems
 from gsparc.data.files import read_text
 from gsparc.data.own import interpret
 from gsparc.data.public.fetch import fetched, found
-from gsparc.data.raw import Raw
+from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements
 from gsparc.data.selection import Selection, select
 
@@ -267,6 +267,24 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
                 problems.add_rows(where, rows, what)
     problems.raise_if_any()
     return {of.field or name: raw.arrays[name] for name, of in layout.items() if name in raw.arrays}
+
+
+def converted(path: str | Path, fields: Mapping[str, str], **about: str) -> Raw:
+    """Arrays of an npz that was made of a release, by field of the schema.
+
+    Args:
+        path: of the file.
+        fields: of the schema, by names in the file.
+        **about: attributes.
+
+    Raises:
+        DataError: no such file, or some of the arrays are not in it.
+    """
+    raw = read_raw(path)
+    missing = [f"{path}, {name}: missing" for name in fields if name not in raw.arrays]
+    if missing:
+        raise DataError(missing, path)
+    return Raw({field: raw.arrays[name] for name, field in fields.items()}, {**raw.attributes, **about})
 
 
 def _fits(dims: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> bool:

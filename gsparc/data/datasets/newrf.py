@@ -16,10 +16,8 @@ import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.errors import DataError
-from gsparc.data.own import interpreted
 from gsparc.data.pickles import unpickled_frame
 from gsparc.data.raw import Raw, read_raw, renamed
-from gsparc.data.schema import Measurements
 
 NAMES = {"tx_pos": "tx_position", "rx_pos": "rx_position"}
 COLUMNS = ("TxPos", "RxPos", "CSI", "Frequency", "LastXPts", "RxChanPerRay", "LineOfSight")
@@ -70,15 +68,6 @@ def _of_release(path: Path) -> dict[str, np.ndarray]:
 def _finite(value: object) -> bool:
     numbers = np.asarray(value)
     return numbers.dtype.kind in "fciub" and numbers.size > 0 and bool(np.isfinite(numbers).all())
-
-
-def load_newrf(path: str | Path) -> Measurements:
-    """Such a room as measurements: targets complex64 (S, 1, K) of about unit mean power, see `interpret`.
-
-    Raises:
-        DataError: anything is missing or wrong; all problems are listed with array and row.
-    """
-    return interpreted(raw_of_newrf(path), path)
 
 
 class NeWRF(Campaign):

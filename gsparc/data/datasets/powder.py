@@ -12,37 +12,27 @@ station (T,) names, latitude, longitude (S,) [deg], frequency_hz () [Hz].
 from __future__ import annotations
 
 import ast
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, converted
 from gsparc.data.errors import DataError, Problems, shortened
 from gsparc.data.files import read_text
 from gsparc.data.links.georeference import bad_degrees
-from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import TEXT
+from gsparc.data.raw import Raw
 
 CARRIER_HZ = 462.7e6
 NO_VALUE_DB = -101.0
 # Above ground: a radio in a hand; a wall or mast, which the release does not say.
 WALKER_M, STATION_M = 1.5, 10.0
 STATIONS = "location_coordinates.json"
-LATITUDES = ("tx_x_coord", "tx_lat", "tx_latitude", "latitude", "lat")
-LONGITUDES = ("tx_y_coord", "tx_lon", "tx_lng", "tx_long", "tx_longitude", "longitude", "lon", "lng", "long")
-TIMES = ("timestamp", "time", "date", "datetime")
-SLACK_M = 1.0  # an affine map from degrees to metres is good to centimetres over a campus
-LAYOUT = {
-    "mobile_position": Expected(("S", 2), place=True, field="tx_position"),
-    "station_position": Expected(("T", 2), place=True),
-    "rssi_db": Expected(("S", "T")),
-    "station": Expected(("T",), TEXT, optional=True, field="station_name"),
-    "latitude": Expected(("S",), optional=True),
-    "longitude": Expected(("S",), optional=True),
-    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
+LATITUDE, LONGITUDE, TIME = "tx_x_coord", "tx_y_coord", "timestamp"
+NPZ = {
+    **{"mobile_position": "tx_position", "station_position": "station_position", "rssi_db": "rssi_db"},
+    **{"latitude": "latitude", "longitude": "longitude"},
+    **{"station": "station_name", "frequency_hz": "carrier_hz"},
 }
 
 
@@ -60,10 +50,10 @@ def raw_of_powder(
         tx_height, station_height: above ground [m], the same for all; the ground is taken as flat.
 
     Returns:
-        `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg] (of an npz without
-        degrees `tx_position` (S, 2), `station_position` (T, 2) [m]), `tx_height`, `station_height` () [m],
-        `rssi_db` (S, T) [dB, each station on a scale of its own], `station_name` (T,), `carrier_hz` (); of a
-        CSV also `row_name` (S,). The attribute `left_out` says which columns are no stations.
+        `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg], `tx_height`,
+        `station_height` () [m], `rssi_db` (S, T) [dB, each station on a scale of its own], `station_name`
+        (T,), `carrier_hz` (); of a CSV also `row_name` (S,). The attribute `left_out` says which columns are
+        no stations.
 
     Raises:
         DataError: no such file, or something in it is missing or wrong; all problems with line and column.
@@ -75,41 +65,20 @@ def raw_of_powder(
     if path.suffix.lower() == ".csv":
         raw = _of_csv(path, path.with_name(STATIONS) if station_table is None else Path(station_table))
     else:
-        raw = _of_npz(read_raw(path), path)
+        raw = _of_npz(path)
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
     return Raw({**raw.arrays, **heights}, {"name": "powder", **raw.attributes, "layout": "powder"})
 
 
-def _of_npz(raw: Raw, path: Path) -> Raw:
-    arrays = {"carrier_hz": np.array(CARRIER_HZ), **check_layout(raw, path, LAYOUT)}
-    parts = [arrays.pop(name) for name in ("latitude", "longitude") if name in arrays]
-    if len(parts) == 2:
-        degrees = np.stack(parts, axis=1).astype(np.float64)
-        stations = _degrees_of(arrays.pop("station_position"), arrays.pop("tx_position"), degrees, path)
-        arrays |= {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
-        arrays |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
-    return Raw(arrays, raw.attributes)
-
-
-def _degrees_of(stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: Path) -> np.ndarray:
-    """Latitude and longitude (T, 2) of `stations` (T, 2) [m] by the affine map of rows known in both.
-
-    Args:
-        places, degrees: (S, 2), the same rows in metres and in degrees.
-    """
-    fault = bad_degrees(*degrees.T)
-    if fault:
-        raise DataError("{}, row {}: {}".format(path, *fault))
+def _of_npz(path: Path) -> Raw:
+    raw = converted(path, NPZ)
+    places, stations = raw.arrays.pop("tx_position"), raw.arrays.pop("station_position")
+    degrees = np.stack([raw.arrays["latitude"], raw.arrays["longitude"]], axis=1)
+    # Rows are known in degrees and in metres: over a campus an affine map is good to centimetres.
     middle, mean = places.mean(axis=0), degrees.mean(axis=0)
     turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
-    error = 111e3 * np.abs((places - middle) @ turn + mean - degrees).max(axis=1)  # a degree is 111 km
-    if error.max() > SLACK_M:
-        row = int(error.argmax())
-        raise DataError(
-            f"{path}, mobile_position, row {row}: {error[row]:.3g} m from where latitude and longitude say; "
-            "expected metres east and north"
-        )
-    return (stations - middle) @ turn + mean
+    latitude, longitude = ((stations - middle) @ turn + mean).T
+    return Raw({**raw.arrays, "station_latitude": latitude, "station_longitude": longitude}, raw.attributes)
 
 
 def _of_csv(path: Path, table: Path) -> Raw:
@@ -118,15 +87,13 @@ def _of_csv(path: Path, table: Path) -> Raw:
     from gsparc.data.tables.sheet import sheet_of
 
     (sheet, _), stations = sheet_of(path), station_places(table)
-    plain = {head.lower().replace(" ", "_"): head for head in sheet.heads}
-    if sum(name.startswith("tx") and name.endswith(("_x_coord", "_lat", "_latitude")) for name in plain) > 1:
-        raise DataError(f"{path}, line 1: two transmitters in a row; expected one, as in single_tx.csv")
-    chosen: dict[str, tuple[Column, ...]] = {}
-    for role, names in (("tx_latitude", LATITUDES), ("tx_longitude", LONGITUDES)):
-        head = next((plain[name] for name in names if name in plain), None)
-        if head is None:
-            raise DataError(f"{path}, line 1: no column {names[0]} (or {', '.join(names[1:])})")
-        chosen[role] = (Column(role, head=head),)
+    missing = [head for head in (LATITUDE, LONGITUDE) if head not in sheet.heads]
+    if missing:
+        raise DataError(f"{path}, line 1: no column {' and '.join(missing)}; expected those of single_tx.csv")
+    chosen: dict[str, tuple[Column, ...]] = {
+        "tx_latitude": (Column("tx_latitude", head=LATITUDE),),
+        "tx_longitude": (Column("tx_longitude", head=LONGITUDE),),
+    }
     columns = [head for head in sheet.heads if head in stations]
     if not columns:
         example = next(iter(stations), "none")
@@ -135,8 +102,7 @@ def _of_csv(path: Path, table: Path) -> Raw:
     sheet.problems.raise_if_any()
     assert walk is not None
     rssi = np.stack([level for level in levels if level is not None], axis=1)
-    known = {*columns, *(column.head for (column,) in chosen.values())}
-    rest = [head for name, head in plain.items() if head not in known and name not in TIMES]
+    rest = [head for head in sheet.heads if head not in (*columns, LATITUDE, LONGITUDE, TIME)]
     about = {}
     if rest:
         about["left_out"] = shortened(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}")
@@ -155,15 +121,19 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
     """Latitude and longitude [deg] of the stations that stay put, by name.
 
     Args:
-        path: JSON, or (as in the release) Python's notation, of a table from names to pairs; None stands for
-            a station that drives. Or a CSV with columns name, latitude, longitude.
+        path: a table from names to pairs in Python's notation; None stands for a station that drives.
 
     Raises:
         DataError: missing, not readable, or no pair of degrees.
     """
     expected = "the stations' coordinates, name the file with dataset.station_table"
     text = read_text(path, f"missing; expected {expected}")
-    content = _listed(path) if path.suffix.lower() == ".csv" else _literal(path, text)
+    try:
+        content = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
+        content = None
+    if not isinstance(content, Mapping):
+        raise DataError(f"{path}: not readable; expected a table from names to (latitude, longitude)")
     problems, places = Problems(path), {}
     for name, value in content.items():
         if value is None:
@@ -181,31 +151,6 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
     if not places:
         raise DataError(f"{path}: no station with coordinates in it")
     return places
-
-
-def _literal(path: Path, text: str) -> Mapping[str, Any]:
-    try:
-        try:
-            content = json.loads(text)
-        except json.JSONDecodeError:
-            content = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
-        content = None
-    if not isinstance(content, Mapping):
-        raise DataError(f"{path}: not readable; expected a table from names to (latitude, longitude)")
-    return content
-
-
-def _listed(path: Path) -> Mapping[str, Any]:
-    from gsparc.data.tables.places import read_stations
-    from gsparc.data.tables.sheet import sheet_of
-
-    sheet, _ = sheet_of(path)
-    stations, _ = read_stations(sheet)
-    sheet.problems.raise_if_any()
-    if stations is None or not stations.places.degrees:
-        raise DataError(f"{path}, line 1: expected the columns name, latitude, longitude")
-    return dict(zip(stations.names, stations.places.across.tolist(), strict=True))
 
 
 class Powder(Campaign):

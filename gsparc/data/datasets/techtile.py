@@ -17,23 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout, converted
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
-from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf, read_raw
-from gsparc.data.schema import COMPLEX, FLAGS, LABELS, TEXT
+from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf
+from gsparc.data.schema import FLAGS, LABELS, TEXT
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
 CHANNEL = 1  # of the two antennas of a tile, the one that received
 ANTENNAS = "techtile_antenna_locations.yml"
 NPZ = {
-    "tx_position": Expected(("S", 3), place=True),
-    "rx_antenna_position": Expected(("T", 3), place=True, field="station_position"),
-    "csi": Expected(("S", "T"), COMPLEX),
-    "frequency_hz": Expected(()),
-    "mask": Expected(("S", "T"), FLAGS, optional=True),
-    "run": Expected(("S",), LABELS, optional=True),
-    "station_name": Expected(("T",), TEXT, optional=True),
+    **{"tx_position": "tx_position", "rx_antenna_position": "station_position", "csi": "csi"},
+    **{"mask": "mask", "run": "run", "frequency_hz": "frequency_hz"},
 }
 RELEASE = {
     "csi_real": Expected(("E", "C", "H")),
@@ -69,9 +64,7 @@ def raw_of_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw
     path = Path(path)
     if path.suffix.lower() in NETCDF_SUFFIXES:
         return _of_release(_with_experiments(read_netcdf(path), path), path, antennas)
-    raw = read_raw(path)
-    about = {"name": "techtile", **raw.attributes, "layout": "techtile"}
-    return Raw(check_layout(raw, path, NPZ), about)
+    return converted(path, NPZ, name="techtile", layout="techtile")
 
 
 def _with_experiments(raw: Raw, path: Path) -> Raw:

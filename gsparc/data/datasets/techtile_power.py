@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.errors import DataError
 from gsparc.data.pickles import unpickled
 from gsparc.data.raw import Raw, read_raw
@@ -21,24 +21,19 @@ from gsparc.data.raw import Raw, read_raw
 CARRIER_HZ = 920e6
 PICOWATT_DB = -90.0  # relative to a milliwatt
 POSITIONS, VALUES = {"Positioner.PositionerValue"}, {"lib.ep.ep_data"}  # classes of the makers' recorder
-LAYOUT = {
-    "rx_position": Expected(("S", 3), place=True),
-    "rssi_db": Expected(("S",)),
-    "frequency_hz": Expected((), optional=True, field="carrier_hz"),
-}
 
 
 def raw_of_techtile_power(path: str | Path) -> Raw:
     """Read a folder of a run of the release, or an npz.
 
     Returns:
-        `rx_position` (S, 3) [m], `rssi_db` (S,) [dBm], `carrier_hz` () [Hz].
+        `rx_position` (S, 3) [m], `rssi_db` (S,) [dBm], `frequency_hz` () [Hz].
 
     Raises:
-        DataError: no such file, objects of other classes, or arrays missing or wrong.
+        DataError: no such file, or objects of other classes.
     """
     raw = _of_release(Path(path)) if Path(path).is_dir() else read_raw(path)
-    return Raw(check_layout(raw, path, LAYOUT), {"name": "techtile_power", **raw.attributes})
+    return Raw(raw.arrays, {"name": "techtile_power", **raw.attributes})
 
 
 def _of_release(folder: Path) -> Raw:

@@ -18,11 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout
+from gsparc.data.datasets.campaign import Campaign, converted
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_csv
-from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import COMPLEX, FLAGS
+from gsparc.data.raw import Raw
 
 CARRIER_HZ = 5.54e9  # Wi-Fi channel 108
 TONES = np.array([*range(-28, 0, 2), -1, *range(1, 28, 2), 28])  # of 64 that an Intel 5300 reports, at 20 MHz
@@ -39,14 +38,8 @@ LEAST_AGREEMENT = 0.6  # of neighbours: right pairs have .94 or more, others .36
 GAP_M = 0.007  # an eighth of a wavelength without a packet: the root's sign is lost
 AVERAGED = 5  # packets of a row: within 3 mm
 NPZ = {
-    "rx_position": Expected(("S", 3), place=True),
-    "tx_position": Expected(("T", 3), place=True, field="station_position"),
-    "tx_index": Expected(("S",), "iu", field="station"),
-    "segment": Expected(("S",), "iu", field="run"),
-    "h2": Expected(("S", "K"), COMPLEX, field="csi"),
-    "root_sign": Expected(("S", "K"), "iu"),
-    "subcarrier_hz": Expected(("K",), field="frequency_hz"),
-    "good": Expected(("S",), FLAGS, optional=True),
+    **{"rx_position": "rx_position", "tx_position": "station_position", "tx_index": "station"},
+    **{"segment": "run", "h2": "csi", "root_sign": "sign", "subcarrier_hz": "frequency_hz", "good": "good"},
 }
 
 
@@ -81,10 +74,9 @@ def raw_of_wsr(
     path = Path(path)
     if path.is_dir():
         return _of_release(path, LOS_SET_A if transmitters is None else transmitters, spacing_m)
-    raw = read_raw(path)
-    arrays = check_layout(raw, path, NPZ)
-    arrays["csi"] = np.sqrt(arrays["csi"]) * arrays.pop("root_sign")
-    good = arrays.pop("good", np.ones(len(arrays["run"]))) == 1
+    arrays = converted(path, NPZ).arrays
+    arrays["csi"] = np.sqrt(arrays["csi"]) * arrays.pop("sign")
+    good = arrays.pop("good")
     kept = {name: arrays[name][good] for name in ("rx_position", "station", "run", "csi")}
     return Raw({**arrays, **kept}, {"name": "wsr"})
 

@@ -7,10 +7,9 @@ import logging
 import os
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import cache, partial
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import yaml
@@ -207,24 +206,10 @@ def _fetch_files(wanted: PublicSet, timeout_s: float, retries: int) -> None:
         for name, source in files.items():
             if not _is_right(wanted.folder / name, source):
                 try:
-                    store.fetch(name, downloader=partial(_download, source.bytes, timeout_s))
+                    store.fetch(name, downloader=pooch.HTTPDownloader(timeout=timeout_s, chunk_size=CHUNK))
                 except (requests.RequestException, ValueError) as error:
                     raise DataError(_fault(source, error, wanted.name)) from None
             progress.advance(task, source.bytes)
-
-
-def _download(most: int, timeout_s: float, url: str, file: str, _: Any) -> None:
-    """Store what `url` sends, as pooch asks for it; ValueError where it is more than `most` bytes."""
-    import requests
-
-    left = most
-    with requests.get(url, stream=True, timeout=timeout_s) as response, open(file, "wb") as into:
-        response.raise_for_status()
-        for chunk in response.iter_content(CHUNK):
-            left -= len(chunk)
-            if left < 0:
-                raise ValueError("hash: more was sent than it has")
-            into.write(chunk)
 
 
 def _fault(source: Source, error: Exception, name: str) -> str:

@@ -119,7 +119,7 @@ def run(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             make = partial(build, config.model)
             with heeded.recording(reads):
                 fitted = fit_and_score(make, data, split, context, eval_on=None, keep=keep)
-                fitted.methods[0].answer(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
+                fitted.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
         except KeyboardInterrupt as stopped:
             if count == 1:
                 raise

@@ -14,9 +14,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
@@ -93,9 +94,9 @@ class Recorded(View):
         super().__init__(inner)
         self.means: list[Tensor] = []
 
-    def answer(self, batch: Batch) -> Prediction:
-        """See `Method.answer`."""
-        prediction = self.inner.answer(batch)
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
+        prediction = self.inner.predict(query)
         self.means.append(prediction.mean)
         return prediction
 
@@ -182,14 +183,14 @@ def draw_front(
 
 
 def others_of(
-    run: Opened, baselines: Sequence[str], peers: Sequence[str], ckpt: str, eval_on: str, cache: Path
+    run: Opened, baselines: Sequence[str], peers: Sequence[str], ckpt: str, eval_on: str
 ) -> dict[str, tuple[Method, float | None]]:
     """Baselines and the methods in other checkpoints, with the deciding figure of each."""
     figure, data = DECIDING[run.data.site.kind], run.data
     whole = Split("tradeoff", (run.split.folds[0],), "")
     methods: dict[str, tuple[Method, float | None]] = {}
     for name in baselines:
-        fitted = baseline(name, data, run.split, eval_on, cache)
+        fitted = baseline(name, data, run.split, eval_on)
         methods[name] = (fitted.methods[0], fitted.scores.figures()[figure])
     for path in peers:
         method, other = loading.load(path)

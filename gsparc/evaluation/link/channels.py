@@ -75,9 +75,9 @@ def channels(
             wanted = torch.from_numpy(frequency_hz)
             answer = method.from_uplink_at(batch.uplink, wanted, batch.noise_variance, antennas)
         else:
-            answer = method.answer(batch)
+            answer = method.predict(batch)
             mean = interpolated(answer.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
-            answer = Prediction(mean, answer.confidence, answer.variance)
+            answer = Prediction(mean, answer.variance, answer.unknown)
         none = torch.full((len(batch),), torch.nan)
         variance, confidence = (none if x is None else x for x in (answer.variance, answer.confidence))
         parts.append((answer.mean, variance, confidence))
@@ -97,7 +97,7 @@ def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tup
 
 def on_band(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
-    error, own = judged(Prediction(band.predicted, band.confidence, band.variance), band.true)
+    error, own = judged(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
     return Evidence(rows, data.moving[rows], error, own | rivals(data, fold, rows))
 
 

@@ -47,7 +47,8 @@ class SweepReport(Callback):
         folder = Path(config.hydra.runtime.output_dir)
         (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
         log.error("failed", exc_info=error)  # the job's own log keeps the traceback
-        text = f"job {folder.name} failed, others go on: {message}"
+        said = " ".join(config.hydra.overrides.task)
+        text = f"job {folder.name} ({said}) failed, others go on: {message}"
         Console(stderr=True, soft_wrap=True).print(text, style="red", markup=False, highlight=False)
         job_return.status = JobStatus.COMPLETED
         job_return.return_value = None

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import Prior
@@ -103,7 +102,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         raise ValueError("the training set is empty")
     assert site.array is not None and site.grid is not None and site.wavelength is not None
     watch = TimeBudget()
-    recovery, training = recovered(data, rows, platform_cache(), seed)
+    recovery, training = recovered(data, rows, seed)
     elapsed = watch.counted
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
         report(recovery, data, rows, run_dir / "array_recovery.csv")

@@ -1,16 +1,16 @@
-"""Cache of retrieved array vectors on disk, by dataset: a sweep solves each spectrum once."""
+"""Retrieved array vectors of a dataset, each solved once in a process, and their report."""
 
 from __future__ import annotations
 
 import csv
 import logging
 from dataclasses import fields
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from gsparc.data.assemble import identity
-from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.models.array_vectors.phase_retrieval import Recovered, recover
 from gsparc.models.target_rows import training_targets
@@ -18,44 +18,39 @@ from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
 
-AT_ONCE = 1024  # rows solved between two writes
-VERSION = 3  # raise it when phase retrieval changes its results
+AT_ONCE = 1024  # rows solved together, which bounds the memory
 NAMED = 8  # suspect images named in a log line
 
 
-def recovered(
-    data: Measurements, rows: np.ndarray, cache: Path | None, seed: int = 0
-) -> tuple[Recovered, Spent]:
-    """Array vectors of the given rows, cached where known, and the seconds they took when computed.
+@lru_cache(maxsize=1)
+def _kept(key: str) -> dict[str, np.ndarray]:
+    """What is known of the rows of the data last asked for, to be filled in; seconds of -1: not solved."""
+    return {}
 
-    Only these rows are read: vectors of a test set are never computed for a training run. The cache is
-    written after every `AT_ONCE` rows, so that an interrupted run continues there.
+
+def recovered(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[Recovered, Spent]:
+    """Array vectors of the given rows, and the seconds they took when computed.
+
+    Only these rows are read: vectors of a test set are never computed for a training run. Rows that this
+    process has solved for the same data, as a refit's are, are not solved again.
 
     Args:
         data: spectra of a static array.
         rows: (n,) sorted.
-        cache: folder; None for no cache.
         seed: of the random starts.
     """
-    path = None if cache is None else Path(cache) / f"array-v{VERSION}" / f"{identity(data)[:24]}.npz"
-    known = _read(path, len(data))
-    have = np.zeros(len(data), dtype=bool) if known is None else known["wall"] >= 0
-    missing = rows[~have[rows]]
-    if known is not None and have[rows].any():
-        log.info(
-            "array vectors of %d spectra are cached: training time includes the %.1f s they took to compute",
-            have[rows].sum(), known["wall"][rows][have[rows]].sum(),
-        )  # fmt: skip
+    known = _kept(f"{identity(data)} {seed}")
+    missing = rows[known["wall"][rows] < 0] if known else rows
+    if len(missing) < len(rows):
+        log.info("array vectors of %d spectra are known from before", len(rows) - len(missing))
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         watch = TimeBudget()
         recovery = recover(data.site, training_targets(data, part), data.tx[part], seed)
         spent = vars(watch.counted)
-        known = known or _empty(len(data), recovery)
+        if not known:
+            known.update(_empty(len(data), recovery))
         for name, values in known.items():
             values[part] = spent[name] / len(part) if name in spent else getattr(recovery, name)
-        if path is not None:
-            _write(path, known)
-    assert known is not None
     result = Recovered(**{f.name: known[f.name][rows] for f in fields(Recovered)})
     return result, Spent(*(float(known[f.name][rows].sum()) for f in fields(Spent)))
 
@@ -89,20 +84,3 @@ def _empty(count: int, like: Recovered) -> dict[str, np.ndarray]:
         **{k: np.zeros((count, *v.shape[1:]), dtype=v.dtype) for k, v in arrays.items()},
         **{f.name: np.full(count, -1.0) for f in fields(Spent)},
     }
-
-
-def _read(path: Path | None, count: int) -> dict[str, np.ndarray] | None:
-    if path is None or not path.exists():
-        return None
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            known = {f.name: file[f.name] for f in (*fields(Recovered), *fields(Spent))}
-    except Exception as error:  # whatever a damaged archive raises: it is only a cache
-        log.warning("cached array vectors are not readable and are computed anew: %s (%s)", path, error)
-        return None
-    return known if all(len(values) == count for values in known.values()) else None
-
-
-def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)

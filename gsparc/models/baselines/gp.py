@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Method, Prediction
@@ -21,7 +22,6 @@ from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
 from gsparc.models.reduced import Filled, MeanOnly, View
 from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
-from gsparc.ops import Pose
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Nearest, Sample, Values, given, most_likely
@@ -190,23 +190,22 @@ class GaussianProcess(Differentiable):
         if self.powers is not None:
             decibels, spread, share = self.powers.answer(queries)
             power = self._decode(decibels[:, None].to(dtype))
-            return Prediction(
-                power, (1 - share).to(dtype), entry_variance(spread.to(dtype), power, self.kind)
-            )
+            return Prediction(power, entry_variance(spread.to(dtype), power, self.kind), share.to(dtype))
         assert self.scores is not None
         result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
         mean = self._composed(result.mean, dtype)
         variance = (kernel.amplitude * result.left + self.lost).to(dtype)
-        confidence = (1 - result.left / (1 + kernel.noise)).to(dtype)
-        return Prediction(mean, confidence, entry_variance(variance, mean, self.kind))
+        unknown = (result.left / (1 + kernel.noise)).to(dtype)
+        return Prediction(mean, entry_variance(variance, mean, self.kind), unknown)
 
-    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+    def mean_at(self, query: Query) -> Tensor:
         """The mean (B, ...) of `predict` alone: the variance is most of a prediction."""
-        queries = self._queries(tx, rx)
+        assert self.site is not None
+        places, dtype = query.places(self.site), query.tx.dtype
         if self.powers is not None:
-            return self._decode(self.powers.mean_at(queries)[:, None].to(tx.dtype))
+            return self._decode(self.powers.mean_at(places)[:, None].to(dtype))
         assert self.scores is not None
-        return self._composed(self.scores.mean_at(queries, tx.dtype == torch.float64), tx.dtype)
+        return self._composed(self.scores.mean_at(places, dtype == torch.float64), dtype)
 
     def _composed(self, scores: Tensor, dtype: torch.dtype) -> Tensor:
         """Targets (B, ...) of components (B, P)."""
@@ -329,11 +328,11 @@ class ReducedMean(View):
         self._places = (scores.rows.float() - self._middle) * self._scale
 
     @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; Matern-3/2 in float32."""
-        where = self._site.moving(tx, rx).expand(len(tx), -1)
-        query = (where - self._middle) * self._scale
-        far = torch.linalg.vector_norm(query[:, None] - self._places, dim=-1)  # cdist: three times slower
+        where = self._site.moving(query.tx, query.rx).expand(len(query), -1)
+        scaled = (where - self._middle) * self._scale
+        far = torch.linalg.vector_norm(scaled[:, None] - self._places, dim=-1)  # cdist: three times slower
         scores = ((1 + far) * torch.exp(-far)) @ self._weights
         return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
 

@@ -53,8 +53,8 @@ class InverseDistance(Interpolator):
         weight = torch.from_numpy(weight / weight.sum(1, keepdims=True)).float()
         result = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind))
         blend = torch.bmm(weight[:, None], result.view(*row.shape, -1))[:, 0]
-        confidence = torch.from_numpy(np.exp(-distance[:, 0] / self.spacing)).float()
-        return Prediction(self._decode(blend), confidence=confidence)
+        unknown = torch.from_numpy(-np.expm1(-distance[:, 0] / self.spacing)).float()
+        return Prediction(self._decode(blend), unknown=unknown)
 
     def _learned(self) -> dict[str, Any]:
         return {"positions": torch.from_numpy(self.positions), "targets": torch.from_numpy(self.targets)}

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import from_real, heard, left_out_note, silent, training_targets
-from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -60,20 +60,15 @@ class Interpolator(Method):
             )
         return FitReport(start.spent, (*notes, *_runs_note(data, known)))
 
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; `ValueError` before `fit` or `restore`."""
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        return self._answered(self._queries(tx, rx), tx.dtype)
+        return self._answered(query.places(self.site), query.tx.dtype)
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """Predict at (B, 3) float64 [m], or (B, 6); see `Differentiable`."""
         return self._look_up(queries.detach().numpy())
-
-    def _queries(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Places (B, 3) float64 [m] of the moving end, or (B, 6) of both."""
-        assert self.site is not None
-        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
     def state(self) -> dict[str, Any]:
         """Target shape, number of rows, and what the subclass learned."""

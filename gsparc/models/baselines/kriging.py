@@ -192,8 +192,8 @@ class Kriging(Interpolator):
         else:
             towards = weighed(self.channels, torch.complex64)
             mean = torch.polar(10 ** (decibels / 20), towards.angle()).view(-1, *self.shape)
-        confidence = (1 - variance / self.variogram.total).clamp(0, 1)
-        return Prediction(mean, confidence, entry_variance(variance, mean, "rssi") if power else None)
+        unknown = (variance / self.variogram.total).clamp(0, 1)
+        return Prediction(mean, entry_variance(variance, mean, "rssi") if power else None, unknown)
 
     def _learned(self) -> dict[str, Any]:
         v = self.variogram

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
@@ -42,8 +43,7 @@ class Ridge(UplinkMethod):
             for penalty in PENALTIES:
                 self.maps, self.unit = _solve(*normal, penalty), unit
                 batch = data.batch(fold.val if len(fold.val) else fold.train)
-                assert batch.uplink is not None
-                miss = self.from_uplink(batch.uplink).mean - batch.target
+                miss = self.predict(batch).mean - batch.target
                 value = float((_power(miss) / _power(batch.target)).log10().mean())
                 if best is None or value < best[0]:
                     best = value, penalty, unit
@@ -69,11 +69,11 @@ class Ridge(UplinkMethod):
         """(B, M, F): M maps of F inputs each."""
         return uplink.flatten(1)[:, None] if self.inputs == "all" else self.own(uplink)
 
-    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """See `UplinkMethod.from_uplink`."""
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`; of the uplink alone."""
+        mean = torch.einsum("bmf,mfo->bmo", self._inputs(self.heard(query)), self.maps)
         assert self.site is not None and self.site.antennas is not None
-        mean = torch.einsum("bmf,mfo->bmo", self._inputs(uplink), self.maps)
-        return Prediction(mean.reshape(len(uplink), len(self.site.antennas), -1))
+        return Prediction(mean.reshape(len(query), len(self.site.antennas), -1))
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""

@@ -20,11 +20,11 @@ from torch import Tensor
 
 from gsparc.data.blocks import take
 from gsparc.data.links.stations import numbered
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.image_sources.run_factors import RunFactors, run_factors
 from gsparc.models.method import Method, Prediction
-from gsparc.ops import Pose
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import WaveKernel
@@ -159,26 +159,19 @@ class ComplexGP(Method):
         more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
         return f"factors of runs, relative to run {names[np.bincount(run).argmax()]:g}: {listed}{more}"
 
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        exact, kernel = tx.dtype == torch.float64, self.kernel
-        posterior = self._fitted().answer(self._moving(tx, rx), exact)
+        assert self.site is not None
+        dtype, kernel = query.tx.dtype, self.kernel
+        posterior = self._fitted().answer(query.places(self.site), dtype == torch.float64)
         share = posterior.left / (1 + kernel.noise)
-        mean = posterior.mean.to(tx.dtype.to_complex()).reshape(-1, *self.shape)
-        return Prediction(mean, (1 - share).to(tx.dtype).clamp(0, 1), (kernel.amplitude * share).to(tx.dtype))
+        mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
+        told = Prediction(mean, (kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
+        return self.runs.restored(told, query.run)
 
     def gradient_problem(self) -> str | None:
         """None; see `Method.gradient_problem`."""
         return None
-
-    def answer(self, batch: Batch) -> Prediction:
-        """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
-        return self.runs.restored(self.predict(batch.tx, batch.rx), batch.run)
-
-    def _moving(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Places (B, 3) float64 [m] of the moving end, (B, 6) of both."""
-        assert self.site is not None
-        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
     def _fitted(self) -> Posterior:
         if self.posterior is None:

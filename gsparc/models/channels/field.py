@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.channels.columns import Group, Slot, gather, query_ends, run_factors_of, static_place
 from gsparc.models.channels.common import Common
@@ -25,9 +26,9 @@ from gsparc.models.channels.covariance import (
     signals,
     specular,
 )
-from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.models.conditional import ConditionalField, LeftOutRows
 from gsparc.models.image_sources.run_factors import RunFactors
-from gsparc.ops import Pose
+from gsparc.models.method import Prediction
 from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
@@ -87,7 +88,6 @@ class ChannelField(ConditionalField):
     """
 
     kind = "diffuse"
-    reads_rows = True
 
     def __init__(self, site: Site, values: Values, channel: tuple[int, int]) -> None:
         self.site, self.values, self.channel = site, values, channel
@@ -159,41 +159,29 @@ class ChannelField(ConditionalField):
         heard = [(known.group, known.given.weights, known.scale) for known in weights]
         self.common = Common.of(values, heard) if len(self.stations) > 1 else None
 
-    def __call__(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
-        """See `ConditionalField`; in the phase and level of the largest run.
+    def __call__(self, query: Query) -> Prediction:
+        """See `ConditionalField`.
 
-        Args:
-            tx, rx: see `ConditionalField`.
-            station: (B,) int64 static ends; None takes those at the static places, the first of several at
-                one. Of one that no row was learned of, what ends have in common answers (`Common`).
+        Without stations those at the static places are asked, the first of several at one. Of one that no
+        row was learned of, what ends have in common answers (`Common`).
         """
-        moving, static, turned, nearest = query_ends(self.site, tx, rx)
-        station = self._numbers(station, nearest)
+        moving, static, turned, station = query_ends(self.site, query.tx, query.rx)
+        if query.station is not None and self.site.stations is not None:
+            station = query.station.cpu()
+        dtype, device = query.tx.dtype, query.tx.device
         count, longest = len(moving), max(len(each.group) for each in self._conditioned())
         parts = [
-            self._answer(moving[part], static[part], turned[part], station[part], tx.dtype)
+            self._answer(moving[part], static[part], turned[part], station[part], dtype)
             for part in torch.arange(count).split(max(CHUNK // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
-        device = tx.device
-        return Posterior(
+        told = Prediction(
             mean.to(device),
-            after.to(tx.dtype).to(device),
+            after.to(dtype).to(device),
+            (after / before.clamp_min(1e-300)).clamp(0, 1).to(dtype).to(device),
             share.to(device) if self.count else None,
-            (after / before.clamp_min(1e-300)).clamp(0, 1).to(tx.dtype).to(device),
         )
-
-    def _numbers(self, station: Tensor | None, nearest: Tensor) -> Tensor:
-        """Stations (B,) by number; a site of one end keeps no numbers, whatever its rows carry."""
-        return nearest if station is None or self.site.stations is None else station.cpu()
-
-    def answer(self, batch: Batch) -> Posterior:
-        """Answer rows of known stations, in the phase and level of their runs."""
-        posterior = self(batch.tx, batch.rx, batch.station)
-        turned: Posterior = self.runs.restored(posterior, batch.run)
-        if turned is posterior or posterior.explained is None:
-            return turned
-        return replace(turned, explained=posterior.explained * self.runs.factor(posterior.mean, batch.run))
+        return self.runs.restored(told, query.run)
 
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype

@@ -3,15 +3,14 @@
 A plane mirrors every end, each image with a complex gain of its own whose power all ends share: a wall that
 one antenna hardly shows is seen by many. Upright and level planes are looked at on a grid, the best are moved
 to where the likelihood is largest, and one by one kept while it rises by more than their numbers are worth
-(G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978)); then images in two of them.
+(G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978)).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import permutations
 
 import torch
 from torch import Tensor
@@ -30,66 +29,54 @@ STEP = 0.25  # wavelengths between offsets
 MOST_TURNS, MOST_OFFSETS = 96, 400  # of the grid
 PROMISING = 2000  # planes that are looked at again after the first was found
 STARTS = 3  # planes that are moved to their best, of which the best is tried
-APART = 1.0  # wavelengths between the images in two of them
+APART = 1.0  # wavelengths between the images of some end in two of them
 REFINED = 5  # halvings of the step
 LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
 PARAMETERS = 4  # of a plane: two angles, an offset and a power
-SAME = 0.25  # wavelengths between images of two sequences that are one
 
 Probes = tuple[Probe, ...]
 
 
 class _Searcher:
-    """Planes and images that are kept, and probes of few rows of few ends (`rough`) and of all with them."""
+    """Planes that are kept, and probes of few rows of few ends (`rough`) and of all with them."""
 
     def __init__(self, rough: Probes, probes: Probes, values: Values, wavelength: float) -> None:
         self.rough, self.probes, self.wavelength = rough, probes, wavelength
         self.values = values
         self.ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
-        self.planes, self.sequences, self.risen = values.planes[:0], list[Reflections](), 0.0
+        self.planes, self.risen = values.planes[:0], 0.0
 
-    def waves(self, probe: Probe, planes: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
-        """(W, n) of images in planes (P, 4)."""
-        values = replace(self.values, sequences=sequences, planes=planes)
+    def waves(self, probe: Probe, planes: Tensor) -> Tensor:
+        """(W, n) of the images in planes (W, 4)."""
+        values = replace(self.values, sequences=_each(planes), planes=planes)
         return image_waves(values, probe.group.slot, probe.group.places)
 
     def gains(
-        self, probes: Probes, planes: Tensor, sequences: tuple[Reflections, ...],
-        known: Callable[[Probe, Tensor], Tensor] = Probe.known,
-    ) -> Tensor:  # fmt: skip
-        """Rise of the log likelihood (W, levels) of each sequence alone."""
+        self, probes: Probes, planes: Tensor, known: Callable[[Probe, Tensor], Tensor] = Probe.known
+    ) -> Tensor:
+        """Rise of the log likelihood (W, levels) of each plane alone."""
 
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
-            return self.waves(probe, planes, tuple(sequences[i] for i in chunk.tolist()))
+            return self.waves(probe, planes[chunk])
 
-        return summed_gains(probes, len(sequences), waves, LEVELS, known)
+        return summed_gains(probes, len(planes), waves, LEVELS, known)
 
-    def best(self, planes: Tensor, sequences: tuple[Reflections, ...]) -> tuple[int, float, float]:
-        """Number of the best sequence, its level, and what it gains [nats]."""
-        gains = self.gains(self.probes, planes, sequences)
-        number = int(gains.argmax()) // len(LEVELS)
-        return number, LEVELS[int(gains[number].argmax())], float(gains[number].max())
-
-    def keep(self, planes: Tensor, sequence: Reflections, level: float, gain: float) -> None:
-        """One more image, in planes of which the last may be new."""
+    def keep(self, plane: Tensor, level: float, gain: float) -> None:
+        """One more plane (4,)."""
+        self.planes, self.risen = torch.cat([self.planes, plane[None]]), self.risen + gain
         self.rough, self.probes = (
-            tuple(probe.added(self.waves(probe, planes, (sequence,))[0], level) for probe in each)
+            tuple(probe.added(self.waves(probe, plane[None])[0], level) for probe in each)
             for each in (self.rough, self.probes)
         )
-        self.planes, self.risen = planes, self.risen + gain
-        self.sequences.append(sequence)
-
-    def is_new(self, planes: Tensor, sequences: Sequence[Reflections], least: float) -> bool:
-        """Whether the last image of some end is at least so many wavelengths from that in each other."""
-        placed = images(self.ends, planes, list(sequences))
-        away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
-        return not bool((away < least * self.wavelength).any())
 
     def starts(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
         """The best planes whose images of the ends are apart."""
         chosen: list[Tensor] = []
         for number in scores.argsort(descending=True).tolist():
-            if self.is_new(torch.stack([*chosen, grid[number]]), _single(len(chosen) + 1), APART):
+            planes = torch.stack([*chosen, grid[number]])
+            placed = images(self.ends, planes, list(_each(planes)))
+            away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
+            if not bool((away < APART * self.wavelength).any()):
                 chosen.append(grid[number])
             if len(chosen) == STARTS:
                 break
@@ -110,8 +97,10 @@ class _Searcher:
             normal = normal / normal.norm(dim=1, keepdim=True)
             away = plane[3] - plane[:3] @ middle + share * shift * moves[:, 2]
             tried = torch.cat([normal, (away + normal @ middle)[:, None]], 1)
-            number, level, gain = self.best(tried, _single(len(tried)))
-            plane = tried[number]
+            gains = self.gains(self.probes, tried)
+            best = int(gains.argmax()) // len(LEVELS)
+            plane, level = tried[best], LEVELS[int(gains[best].argmax())]
+            gain = float(gains[best].max())
         return plane, level, gain
 
 
@@ -119,7 +108,7 @@ def find_mirrors(
     coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], values: Values,
     wavelength: float, most: int,
 ) -> tuple[Tensor, tuple[Reflections, ...]]:  # fmt: skip
-    """Planes (W, 4) float64, local, and images in them; none where all together are not worth it.
+    """Planes (W, 4) float64, local, and an image in each; none where all together are not worth it.
 
     Args:
         coarse: few rows of few ends, for the grid.
@@ -138,7 +127,7 @@ def find_mirrors(
     grid, turn = candidates(rough, values, wavelength)
     while len(search.planes) < most:
         raise_if_cancelled()
-        scores = search.gains(search.rough, grid, _single(len(grid)), _about).max(1).values
+        scores = search.gains(search.rough, grid, _about).max(1).values
         if not len(search.planes):
             top = scores.topk(min(PROMISING, len(grid))).indices
             grid, scores = grid[top], scores[top]
@@ -146,18 +135,9 @@ def find_mirrors(
         plane, level, gain = max(moved, key=lambda m: m[2])
         if gain < PARAMETERS * worth:
             break
-        search.keep(torch.cat([search.planes, plane[None]]), (len(search.planes),), level, gain)
-    planes, pairs = search.planes, list(permutations(range(len(search.planes)), 2))
-    while True:
-        raise_if_cancelled()
-        pairs = [pair for pair in pairs if search.is_new(planes, [*search.sequences, pair], SAME)]
-        if not pairs:
-            break
-        number, level, gain = search.best(planes, tuple(pairs))
-        if gain < 2 * worth:
-            break
-        search.keep(planes, pairs.pop(number), level, gain)
-    return (planes, tuple(search.sequences)) if 2 * search.risen > LEAST * numbers else (planes[:0], ())
+        search.keep(plane, level, gain)
+    worth_it = 2 * search.risen > LEAST * numbers
+    return (search.planes, _each(search.planes)) if worth_it else (search.planes[:0], ())
 
 
 def candidates(probes: Probes, values: Values, wavelength: float) -> tuple[Tensor, float]:
@@ -180,8 +160,8 @@ def candidates(probes: Probes, values: Values, wavelength: float) -> tuple[Tenso
     return torch.cat(planes), turn
 
 
-def _single(count: int) -> tuple[Reflections, ...]:
-    return tuple((number,) for number in range(count))
+def _each(planes: Tensor) -> tuple[Reflections, ...]:
+    return tuple((number,) for number in range(len(planes)))
 
 
 def _about(probe: Probe, waves: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.conditional import LeftOutRows
@@ -32,7 +33,6 @@ from gsparc.models.image_sources.scene import steering
 from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
-from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
 from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out_group
@@ -253,11 +253,11 @@ class DirectionalGP(FramedMethod):
         return waves, uncertain, turned, coherence(turned, turned)
 
     # ---- predicting ----
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; the variance includes gains, noise and visibility."""
-        answering = self._exact() if tx.dtype == torch.float64 else self
-        query = answering._query(tx, rx)
-        return self._prediction(answering._sum(query), *answering._variance(query))
+        answering = self._exact() if query.tx.dtype == torch.float64 else self
+        seen = answering._query(query)
+        return self._prediction(answering._sum(seen), *answering._variance(seen))
 
     def _exact(self) -> DirectionalGP:
         """The same in float64."""
@@ -271,17 +271,17 @@ class DirectionalGP(FramedMethod):
         gains = query.probability[:, :, None] * self._gains(query)
         return self._stored(gains.mT @ wave_over_band(query.away, tones, self.power.dtype), tones)
 
-    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""
-        query = self._query(tx, rx)
-        gain = query.probability * wave(query.away, self.frame.carrier_hz)
-        gain = self._gains(query) * gain[:, :, None]
-        towards = self.sources - query.places.view(query.count, -1, 3).mean(1)[:, None]
-        return self._stored_paths(gain.movedim(1, -1), query.away, towards)
+        seen = self._query(query)
+        gain = seen.probability * wave(seen.away, self.frame.carrier_hz)
+        gain = self._gains(seen) * gain[:, :, None]
+        towards = self.sources - seen.places.view(seen.count, -1, 3).mean(1)[:, None]
+        return self._stored_paths(gain.movedim(1, -1), seen.away, towards)
 
-    def _query(self, tx: Tensor, rx: Pose) -> QueryGeometry:
+    def _query(self, query: Query) -> QueryGeometry:
         """Query geometry of receivers, their antennas in the regression's frame."""
-        flat, count = self._places(tx, rx)
+        flat, count = self._places(query)
         dtype = self.power.dtype
         retained = torch.zeros(0, len(flat), len(self.rows), dtype=dtype)
         if len(self.uncertain):

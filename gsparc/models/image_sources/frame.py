@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.conditional import LeftOutRows
 from gsparc.models.image_sources.rows import Rows, query_elements, static_array
 from gsparc.models.method import Method, Prediction
-from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
@@ -62,16 +62,16 @@ class FramedMethod(Method):
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.site
 
-    def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
+    def _places(self, query: Query) -> tuple[Tensor, int]:
         """Antennas of the moving end (B E, 3) float64 in the frame, and B.
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
         site = self._fitted()
         if site.moving_end == "rx":
-            places = query_elements(site, rx, len(tx), self.antennas)
+            places = query_elements(site, query.rx, len(query), self.antennas)
             return places.reshape(-1, 3) - self.frame.middle, len(places)
-        places = tx.cpu().double() - self.frame.middle
+        places = query.tx.cpu().double() - self.frame.middle
         array = static_array(site, self.antennas)
         if array is None:
             return places, len(places)
@@ -86,8 +86,7 @@ class FramedMethod(Method):
     def _prediction(self, mean: Tensor, variance: Tensor, prior: Tensor) -> Prediction:
         """From the mean (B, A, K), and expected squared error and power (B E,), normalised."""
         variance, prior = (v.reshape(len(mean), -1).mean(1) for v in (variance, prior))
-        confidence = (1 - variance / prior).clamp(0, 1)
-        return Prediction(mean, confidence=confidence, variance=variance * self.frame.scale**2)
+        return Prediction(mean, variance * self.frame.scale**2, (variance / prior).clamp(0, 1))
 
     def _stored_paths(
         self, gain: Tensor, away: Tensor, towards: Tensor

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.assemble import identity
+from gsparc.data.query import Query
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.conditional import LeftOutRows
@@ -30,7 +31,7 @@ from gsparc.models.image_sources.ensemble import (
 from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import KINDS, Offsets, estimate
-from gsparc.models.image_sources.query import VARIANCE_ROWS, Query
+from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
 from gsparc.models.image_sources.rows import (
     Rows,
     box_of,
@@ -46,7 +47,6 @@ from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import MeanOnly
-from gsparc.ops import Pose
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
@@ -172,7 +172,7 @@ class ImageSourceGP(FramedMethod):
     def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
         self.members = [Posterior(rows, scene) for scene in scenes]
-        self.query = Query(self.members)
+        self.query = Means(self.members)
 
     def _of(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """What these members alone say."""
@@ -226,7 +226,7 @@ class ImageSourceGP(FramedMethod):
 
     def _missed(self, batch: Batch, rows: Rows, scene: Scene) -> Tensor:
         """What a search's scene misses (n, ...) of a batch that it left out."""
-        mean = self._of(rows, [Member(scene, 1.0)]).predict(batch.tx, batch.rx).mean
+        mean = self._of(rows, [Member(scene, 1.0)]).predict(batch).mean
         return mean - batch.target / self.factors[:, None]
 
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
@@ -253,7 +253,7 @@ class ImageSourceGP(FramedMethod):
             apart = self.frame.inside(gather(data, self._rows_of(known, turn), most, self.seed))
             batch = data.batch(group)
             rows.append(group)
-            means.append(self._of(apart, members).predict(batch.tx, batch.rx).mean)
+            means.append(self._of(apart, members).predict(batch).mean)
         mean = torch.cat(means)
         return LeftOutRows(np.concatenate(rows), mean, torch.full((len(mean),), float("nan")))
 
@@ -298,22 +298,22 @@ class ImageSourceGP(FramedMethod):
         target[known] = offsets.removed(data.target[known], frequency, carrier)
         return replace(data, target=target)
 
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`.
 
         The variance is the posterior's plus that of the ensemble; the confidence is the explained share of
         the expected power.
         """
-        flat, _ = self._places(tx, rx)
+        flat, _ = self._places(query)
         tones = torch.from_numpy(self._fitted().tones())
-        query = self.query.exact if tx.dtype == torch.float64 else self.query
-        stack, variance, prior = query.means(flat, tones)  # (members, B E, R, K)
+        made = self.query.exact if query.tx.dtype == torch.float64 else self.query
+        stack, variance, prior = made.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
         return self._prediction(self._stored(mean, tones) / self.factors[:, None], variance, prior)
 
-    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums: one per source of every search, with the search's weight.
 
         Returns:
@@ -321,7 +321,7 @@ class ImageSourceGP(FramedMethod):
             vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
             the carrier [Hz].
         """
-        flat, count = self._places(tx, rx)
+        flat, count = self._places(query)
         carrier = self.frame.carrier_hz
         middle = flat[:, :3].reshape(count, -1, 3).mean(1)
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
@@ -367,7 +367,7 @@ class ImageSourceGP(FramedMethod):
                 for member, i in zip(twin.members, chosen, strict=True)
             ]
         whole = settings.get("confidence", True)
-        twin.query = Query(twin.members, VARIANCE_ROWS if whole else 0)
+        twin.query = Means(twin.members, VARIANCE_ROWS if whole else 0)
         return twin if whole else MeanOnly(twin)
 
     def state(self) -> dict[str, Any]:

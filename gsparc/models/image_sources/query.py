@@ -92,7 +92,7 @@ class PackedSources:
         return torch.addcmul(decay, root, decay)
 
 
-class Query:
+class Means:
     """Means of every process, and the variance of one, at new places.
 
     Args:
@@ -114,7 +114,7 @@ class Query:
         self.variance = RowVariance(members[0], place_of, variance_rows) if variance_rows else None
 
     @cached_property
-    def exact(self) -> Query:
+    def exact(self) -> Means:
         """The same in float64."""
         return in_double(self)
 

@@ -8,17 +8,13 @@ logarithm of its size, so that each factor has a closed form given the others.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.models.conditional import Posterior
 from gsparc.models.method import Prediction
-
-P = TypeVar("P", Prediction, Posterior)
 
 SWEEPS = 200
 SETTLED = 1e-9
@@ -56,17 +52,15 @@ class RunFactors:
         same = run.cpu()[:, None] == torch.from_numpy(self.runs)
         return torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
 
-    def factor(self, mean: Tensor, run: Tensor | None) -> Tensor:
-        """The same (B, 1, 1) in the dtype and on the device of channels."""
-        return self.of(run).to(mean.device)[:, None, None].to(mean.dtype)
-
-    def restored(self, answer: P, run: Tensor | None) -> P:
+    def restored(self, answer: Prediction, run: Tensor | None) -> Prediction:
         """A prediction for the largest run in the phase and level of rows of runs (B,)."""
         if run is None or len(self) == 1:
             return answer
-        level = self.of(run).to(answer.mean.device).abs().square().float()
+        of = self.of(run).to(answer.mean.device)
+        factor, level = of[:, None, None].to(answer.mean.dtype), of.abs().square().float()
         variance = None if answer.variance is None else answer.variance * level
-        return replace(answer, mean=answer.mean * self.factor(answer.mean, run), variance=variance)
+        explained = None if answer.explained is None else answer.explained * factor
+        return replace(answer, mean=answer.mean * factor, variance=variance, explained=explained)
 
     def aligned(self, data: Measurements) -> Measurements:
         """The channels in the phase and level of the largest run, as of one run."""

@@ -112,7 +112,7 @@ def _explained(field: ConditionalField, data: Measurements, fold: Fold, apart: b
     if not apart:
         field.condition(data, fold.train)
     batch = data.batch(fold.val)
-    result = field(batch.tx, batch.rx).explained
+    result = field(batch).explained
     assert result is not None
     own, target = (comparable(one, data.site) for one in (result, batch.target))
     return explained(own, target, data.site.kind != "csi")

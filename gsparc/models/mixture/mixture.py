@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
-from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
-from gsparc.ops import Pose
+from gsparc.models.conditional import ConditionalField, LeftOutRows
+from gsparc.models.method import Prediction
 
 
 class Mixture(ConditionalField):
@@ -72,24 +72,25 @@ class Mixture(ConditionalField):
             left = self._mean_left_out()
             self.residual.condition(residuals(left, data), left.rows)
 
-    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
+    def __call__(self, query: Query) -> Prediction:
         """The mean of all; what they disagree about is added to their variances.
 
         The variance errs high by what the residual explains.
         """
-        result = [member(tx, rx) for member in self.members]
+        result = [member(query) for member in self.members]
         pairs = list(zip(self.weights, result, strict=True))
         mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
-        apart = [(one.mean - mean).abs().square().flatten(1).mean(1) for one in result]
-        variance = torch.stack(
-            [w * (one.variance + a) for (w, one), a in zip(pairs, apart, strict=True)]
-        ).sum(0)
+        spreads, shares = [], []
+        for weight, one in pairs:
+            assert one.variance is not None and one.unknown is not None
+            apart = (one.mean - mean).abs().square().flatten(1).mean(1)
+            spreads.append(weight * (one.variance + apart))
+            shares.append(weight * one.unknown)
         parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
-        explained = torch.stack(parts).sum(0) if parts else None
-        unknown = torch.stack([weight * one.unknown for weight, one in pairs]).sum(0)
         if self.residual is not None:
-            mean = mean + self.share * self.residual(tx, rx).mean
-        return Posterior(mean, variance.to(mean.real.dtype), explained, unknown.to(mean.real.dtype))
+            mean = mean + self.share * self.residual(query).mean
+        variance, unknown = (torch.stack(each).sum(0).to(mean.real.dtype) for each in (spreads, shares))
+        return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
     def left_out(self) -> LeftOutRows:
         """The mean of all."""

@@ -147,7 +147,7 @@ def weighed(
     batch = data.batch(fold.val)
     predicted = []
     for field in solutions.values():
-        mean = field(batch.tx, batch.rx).mean
+        mean = field(batch).mean
         if len(rows):
             assert field.held is not None
             order = {row: place for place, row in enumerate(field.held.rows.tolist())}
@@ -192,7 +192,7 @@ def _held(
     for group in groups:
         field.condition(data, np.setdiff1d(rows, group))
         batch = data.batch(group)
-        answers.append(field(batch.tx, batch.rx))
+        answers.append(field(batch))
     field.condition(data, rows)
     mean, variance = (torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)
@@ -229,7 +229,7 @@ def weigh(
     val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
     if len(val):
         batch = data.batch(val)
-        means = (method.predict(batch.tx, batch.rx).mean for method in (field, process))
+        means = (method.predict(batch).mean for method in (field, process))
         own, plain, target = (comparable(values, data.site) for values in (*means, batch.target))
         explained = solution_weights.explained(own, target, data.site.kind != "csi")
         if spectra:

@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.models.conditional import LeftOutRows, Posterior
+from gsparc.models.conditional import LeftOutRows
 from gsparc.models.method_field import MethodField
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.ops import Pose
 
 
 class BearingField(MethodField):
@@ -41,10 +39,6 @@ class BearingField(MethodField):
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`; sources and kernels stay those of the search."""
         self.rows = self.method.condition(data, rows)
-
-    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
-        """See `ConditionalField`."""
-        return self.method.posterior(tx, rx)
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`."""

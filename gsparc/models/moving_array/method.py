@@ -18,12 +18,12 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Differentiable
-from gsparc.models.conditional import LeftOutRows, Posterior
+from gsparc.models.conditional import LeftOutRows
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
 from gsparc.models.moving_array.error_model import ErrorModel, fit_error_model, image_features
 from gsparc.models.moving_array.power_gp import Trend, TrendSettings, fit_trend
-from gsparc.models.moving_array.query import Array, Query, reduced
+from gsparc.models.moving_array.query import Array, Images, reduced
 from gsparc.models.moving_array.residual import Residual, fit_residual, left_out_error
 from gsparc.models.moving_array.triangulate import (
     MAX_UNEXPLAINED,
@@ -34,7 +34,6 @@ from gsparc.models.moving_array.triangulate import (
     unexplained_energy,
 )
 from gsparc.models.target_rows import heard, to_real, training_targets
-from gsparc.ops import Pose
 from gsparc.physics.lags import BLOCK, Lags
 from gsparc.physics.separable import Separable, separable
 from gsparc.processes.kernel import Kernel
@@ -279,36 +278,23 @@ class MovingArrayField(Differentiable):
 
     # -- answering ---------------------------------------------------------------------------------
 
-    def posterior(self, tx: Tensor, rx: Pose) -> Posterior:
-        """What is known at queries; `explained` are the sources' images alone."""
-        return self._posterior(self.where(tx, rx), tx.dtype)
-
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
-        posterior = self._posterior(queries, dtype)
-        return Prediction(posterior.mean, 1 - posterior.unknown, posterior.variance)
-
-    def _posterior(self, where: Tensor, dtype: torch.dtype) -> Posterior:
+        """See `Differentiable`; `explained` are the sources' images alone."""
         query, errors = self.query(), self.error_model
         if dtype == torch.float64:
             query, errors = query.exact, in_double(errors)
-        answer = query(where)
+        answer = query(queries)
         mean = answer.image.clamp_(0, 1)
         features = image_features(mean, answer.added / mean[0].numel())
         power = mean.flatten(1).square().mean(1)
         unknown, variance = errors.expected(answer.far, features, power)
-        return Posterior(mean, variance, answer.explained.clamp(0, 1), unknown)
+        return Prediction(mean, variance, unknown, answer.explained.clamp(0, 1))
 
-    def where(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Receivers' places (B, 3) float64 [m]; `ValueError` before `fit` or `restore`."""
-        if self.site is None:
-            raise ValueError(f"{self.name}: fit or restore it first")
-        return self._queries(tx, rx)
-
-    def query(self) -> Query:
+    def query(self) -> Images:
         """Answers with all that was found, made once."""
         if self._query is None:
             places = torch.from_numpy(self.positions)
-            self._query = Query(self.array(), self.basis, self.trends, self.residual, places)
+            self._query = Images(self.array(), self.basis, self.trends, self.residual, places)
         return self._query
 
     def size(self) -> int:
@@ -332,7 +318,7 @@ class MovingArrayField(Differentiable):
         return self._lags
 
     _lags: Lags | None = None
-    _query: Query | None = None
+    _query: Images | None = None
 
     def _images(self, targets: np.ndarray) -> Tensor:
         return torch.from_numpy(to_real(targets, "spectrum")).reshape(targets.shape)

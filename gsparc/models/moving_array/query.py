@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.power_gp import Trend
@@ -21,7 +22,6 @@ from gsparc.models.moving_array.residual import Residual
 from gsparc.models.moving_array.triangulate import bearings, mixture
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Filled, View
-from gsparc.ops import Pose
 from gsparc.ops.transforms import followed
 from gsparc.physics.lags import Lags
 from gsparc.physics.separable import Separable
@@ -74,7 +74,7 @@ class Found(NamedTuple):
     far: Tensor
 
 
-class Query:
+class Images:
     """What a fitted field answers with.
 
     Args:
@@ -102,7 +102,7 @@ class Query:
         return Found(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
 
     @cached_property
-    def exact(self) -> Query:
+    def exact(self) -> Images:
         """The same in float64."""
         return in_double(self)
 
@@ -142,13 +142,14 @@ class ReducedMean(View):
         basis = inner.basis if stride == 1 else inner.basis.thinned(stride)
         trends, residual = inner.trends[:searches], inner.residual.first(count)
         places = torch.from_numpy(inner.positions)
-        self._query = Query(inner.array(stride), basis, trends, residual, places)
-        self._method, self._count = inner, count
+        self._query = Images(inner.array(stride), basis, trends, residual, places)
+        self._count = count
 
     @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        return Prediction(self._query(self._method.where(tx, rx)).image.clamp_(0, 1))
+        assert self.inner.site is not None
+        return Prediction(self._query(query.places(self.inner.site)).image.clamp_(0, 1))
 
     def size(self) -> int:
         """Components kept."""

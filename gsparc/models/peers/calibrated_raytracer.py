@@ -13,13 +13,12 @@ from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import heard, to_real
-from gsparc.ops import Pose
 from gsparc.simulate.calibration import (
     GENERIC,
     Calibration,
@@ -141,11 +140,11 @@ class CalibratedRayTracer(Method):
         """See `Method.gradient_problem`."""
         return "rays are traced to a place anew"
 
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
         if self.site is None or self.learned is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        paths = self._trace(self.site.moving(tx, rx).expand(len(tx), -1).detach().cpu().double().numpy())
+        paths = self._trace(query.places(self.site).detach().numpy())
         if self.site.kind == "csi":
             return Prediction(torch.from_numpy((self._channels(paths) * self._factor).astype(np.complex64)))
         power = paths.received_power()

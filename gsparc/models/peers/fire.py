@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
@@ -96,8 +97,9 @@ class Fire(UplinkMethod):
         return FitReport(started.spent)
 
     @torch.no_grad()
-    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """See `UplinkMethod.from_uplink`."""
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`; of the uplink alone."""
+        uplink = self.heard(query)
         scale = rms(uplink)[:, None, None]
         own = self.own(uplink) / scale
         guess = self.network(own.flatten(0, 1))[0]

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.query import Query
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
@@ -28,13 +29,11 @@ class GaussianPeer(TrainedPeer):
     has_gaussians = True
 
     @torch.no_grad()
-    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+    def gaussians(self, query: Query) -> GaussianCloud:
         """See `HasGaussians`."""
         network = self.fitted()
         assert isinstance(network, GaussianNetwork)
-        emitted = [
-            network.emitted(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx) for i in range(len(tx))
-        ]
+        emitted = [network.emitted(one.tx, one.rx) for one in query.split(1)]
         return network.cloud(torch.stack(emitted).square().mean(0).sqrt())
 
 

@@ -22,7 +22,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Batch, Kind
+from gsparc.data.query import Batch
+from gsparc.data.schema import Kind
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     GaussianNetwork,
@@ -98,7 +99,7 @@ class ComplexGaussians(GaussianNetwork):
         return self
 
     @torch.no_grad()
-    def answer(self, tx: Tensor, rx: Pose) -> Tensor:
+    def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
         """A static receiver's view is frozen once."""
         if self.response is not None or rx.batched or self.training:
             return self(tx, rx)

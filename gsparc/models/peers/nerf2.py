@@ -21,7 +21,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Batch, Kind
+from gsparc.data.query import Batch
+from gsparc.data.schema import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Pose

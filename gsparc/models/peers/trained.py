@@ -14,7 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.datamodule import order
-from gsparc.data.schema import Batch, Kind, Measurements, Site
+from gsparc.data.query import Batch, Query
+from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.ops import Pose
@@ -81,7 +82,7 @@ class Network(nn.Module):
         return spectrum_loss(prediction, batch.target, self.ssim_weight).mean()
 
     @torch.no_grad()
-    def answer(self, tx: Tensor, rx: Pose) -> Tensor:
+    def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
         """The prediction at inference, which may keep state between calls."""
         return self(tx, rx)
 
@@ -214,14 +215,10 @@ class TrainedPeer(Method):
         return "its network answers in float32 and keeps no graph"
 
     @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+    def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; these peers give no confidence."""
         network = self.fitted()
-        parts = [
-            network.answer(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
-            for i in range(0, len(tx), QUERY_CHUNK)
-        ]
-        mean = torch.cat(parts)
+        mean = torch.cat([network.rendered(part.tx, part.rx) for part in query.split(QUERY_CHUNK)])
         return Prediction(mean if mean.is_complex() else mean.clamp(0, 1))
 
     def state(self) -> dict[str, Any]:

@@ -18,13 +18,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.baselines.distance_law import law_of
-from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.models.conditional import ConditionalField, LeftOutRows
+from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.settings import candidates, chosen_among, mixture
 from gsparc.models.target_rows import entry_variance, from_real, rows_of
-from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
@@ -99,19 +100,21 @@ class PowerField(ConditionalField):
             heard = np.flatnonzero(nearest.noise.numpy() <= self.process.kernel.noise)
             self.at = heard[cKDTree(self.process.places[heard]).query(loud.places)[1]]
 
-    def __call__(self, tx: Tensor, rx: Pose) -> Posterior:
+    def __call__(self, query: Query) -> Prediction:
         """See `ConditionalField`; (B, 1) linear powers.
 
         Raises:
             ValueError: before `condition`.
         """
-        process, places = self._conditioned(), self._places(tx, rx)
+        process, places = self._conditioned(), query.places(self.site)
         parts = [self._answer(process, part) for part in places.split(QUERIES)]
         mean, spread, share, explained = (torch.cat(part) for part in zip(*parts, strict=True))
-        mean, spread, share, explained = (part.to(tx.dtype) for part in (mean, spread, share, explained))
+        mean, spread, share, explained = (
+            part.to(query.tx.dtype) for part in (mean, spread, share, explained)
+        )
         power = self._power(mean)
         explained_power = self._power(explained) if self.count else None
-        return Posterior(power, entry_variance(spread, power, "rssi"), explained_power, share)
+        return Prediction(power, entry_variance(spread, power, "rssi"), share, explained_power)
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
@@ -171,10 +174,6 @@ class PowerField(ConditionalField):
         if self.process is None:
             raise ValueError("a field of powers: condition it first")
         return self.process
-
-    def _places(self, tx: Tensor, rx: Pose) -> Tensor:
-        """(B, 3) of the moving end, or (B, 6) of both, float64 [m]."""
-        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
     def _power(self, decibels: Tensor) -> Tensor:
         return from_real(decibels[:, None], "rssi", (1,))

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import check_arguments, or_word, switch, whole
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
@@ -347,12 +348,11 @@ class LearnedField(Method):
         """See `Method`; through an array all pixels follow from a few numbers."""
         return not self.settings.response.array
 
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
-        if len(tx) > QUERY_CHUNK:
-            chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
-            parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
-            return Prediction.joined(parts)
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
+        return Prediction.joined([self._rendered(part.tx, part.rx) for part in query.split(QUERY_CHUNK)])
+
+    def _rendered(self, tx: Tensor, rx: Pose) -> Prediction:
         if tx.dtype == torch.float64:
             return self._answered(*self._exact(rx.to(torch.float32)), tx, rx)
         with torch.no_grad():
@@ -385,7 +385,7 @@ class LearnedField(Method):
             return Prediction(mean, *model.error(result.unknown))
         if model.confidence is None:
             return Prediction(mean)
-        return Prediction(mean, model.confidence.normalised(model.site.moving(tx, rx)))
+        return Prediction(mean, unknown=1 - model.confidence.normalised(model.site.moving(tx, rx)))
 
     def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """The matrix of the static receiver, made anew after an edit; None for any other pose."""
@@ -399,14 +399,14 @@ class LearnedField(Method):
         return self.frozen
 
     @torch.no_grad()
-    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+    def gaussians(self, query: Query) -> GaussianCloud:
         """See `HasGaussians`; their attenuated emissions."""
         if self.model is None or not self.size():
             raise ValueError(f"{self.name}: nothing here is rendered from Gaussians")
         model, square = self.model, torch.zeros(self.size())
-        for i in range(len(tx)):  # one at a time: features of all would be gigabytes
-            square += model.features(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx)[0].square().sum(1)
-        return model.gaussians.cloud((square / max(len(tx), 1)).sqrt(), "emission of a Gaussian")
+        for one in query.split(1):  # features of all would be gigabytes
+            square += model.features(one.tx, one.rx)[0].square().sum(1)
+        return model.gaussians.cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
 
     # -- what it can do besides ----------------------------------------------------------------------
 

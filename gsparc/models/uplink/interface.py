@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.models.method import Method, Prediction
-from gsparc.ops import Pose
 
 
 @runtime_checkable
@@ -35,29 +34,24 @@ def rms(channels: Tensor) -> Tensor:
 class UplinkMethod(Method):
     """A method that needs the snapshot's own uplink; a position alone is no question to it."""
 
-    def answer(self, batch: Batch) -> Prediction:
-        """Predict from `batch.uplink` (B, U, L).
+    def heard(self, query: Query) -> Tensor:
+        """Return the uplinks (B, U, L) of a query.
 
         Raises:
-            ValueError: the data hold no uplink, or nothing was fitted.
+            ValueError: there is none, or nothing was fitted.
         """
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        if batch.uplink is None:
-            raise ValueError(f"{self.name}: reads a fresh uplink, and these data have none; take model=gp")
-        return self.from_uplink(batch.uplink, batch.noise_variance)
-
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """Always refused: `ValueError`."""
-        raise ValueError(f"{self.name}: answers snapshots with their uplink, not positions")
+        if query.uplink is None:
+            raise ValueError(
+                f"{self.name}: reads a fresh uplink, and positions alone have none: uplink= is needed, or "
+                "take model=gp"
+            )
+        return query.uplink
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`."""
         return "predictions follow from an uplink, not from a position"
-
-    @abstractmethod
-    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """Channels of the downlink (B, A, K) from uplinks (B, U, L), with noise powers (B,) where known."""
 
     def own(self, uplink: Tensor) -> Tensor:
         """Of uplinks (B, U, L), those (B, A, L) heard by the antennas that answer."""

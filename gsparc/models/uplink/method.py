@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
@@ -113,9 +114,9 @@ class UplinkField(UplinkMethod):
         """The sources of snapshots (B, U, L): directions, delays, gains."""
         return self._search(uplink, noise).sources
 
-    def from_uplink(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
-        """See `UplinkMethod.from_uplink`; the variance is the expected squared error per entry."""
-        return self._predict_at(uplink, noise, self._downlink)
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`; of the uplink alone."""
+        return self._predict_at(self.heard(query), query.noise_variance, self._downlink)
 
     def from_uplink_at(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
@@ -134,7 +135,7 @@ class UplinkField(UplinkMethod):
                 mean = mean / (1 + error)[:, None, None]
             variance = error * _power(mean)
         mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
-        return Prediction(mean, confidence=1 / (1 + error), variance=variance)
+        return Prediction(mean, variance, error / (1 + error))
 
     def _search(self, uplink: Tensor, noise: Tensor | None) -> SearchResult:
         aperture = self.search.aperture

@@ -7,7 +7,7 @@ import torch
 
 from gsparc.data.schema import Site
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import query_elements, static_array
 from gsparc.ops import Pose
 from gsparc.physics.waves import evenly_spaced
@@ -17,7 +17,7 @@ LANES = 16
 BEYOND = 1e6  # [m], a place that is near none
 
 
-def sources_form(method: ImageSourceGP, site: Site, query: Query) -> Form:
+def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
     """Of an ensemble's sources without clutter, whose gains `query` has."""
     pack, rotation = query.pack, np.eye(3) if site.rx_rotation is None else site.rx_rotation
     count, rows = len(pack.sources), len(pack.places)

@@ -231,7 +231,9 @@ def test_techtile_power_of_pickled_objects(tmp_path, caplog):
     folder = plane(tmp_path / "RECI-RF-1", np.eye(4, 3) + 3, [58_600_000.0, 1e6, 1e9, 0])
     arrays = raw_of_techtile_power(folder).arrays
     assert np.allclose(arrays["rssi_db"], [-12.321, -30, 0], atol=1e-3)  # of 58.6, 1 and 1,000 microwatts
-    assert np.array_equal(arrays["rx_position"], np.float32(np.eye(3) + 3)) and arrays["carrier_hz"] == 920e6
+    assert (
+        np.array_equal(arrays["rx_position"], np.float32(np.eye(3) + 3)) and arrays["frequency_hz"] == 920e6
+    )
     assert (
         "dataset=techtile_power"
         in read_any(plane(tmp_path / "b", np.random.rand(20, 3), [1e6] * 20)).notes[0]

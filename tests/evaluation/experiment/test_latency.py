@@ -24,7 +24,7 @@ class Waiting:
     def __init__(self, name: str, watch: WoundClock) -> None:
         self.name, self.watch, self.asked = name, watch, []
 
-    def answer(self, batch):
+    def predict(self, batch):
         self.asked.append(batch.tx)
         self.watch.wind(WAITS[self.name])
         return Prediction(torch.zeros(len(batch), 1))

@@ -60,9 +60,9 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
                 eval_on=None,
             )
             method, rows = fits.methods[0], split.folds[0].test
-            method.answer(data.batch(rows[:1]))
+            method.predict(data.batch(rows[:1]))
         unused = options.unheeded(reads, method, data) or ""
-        return {one.partition("=")[0] for one in unused.split(", ") if one}, method.answer(
+        return {one.partition("=")[0] for one in unused.split(", ") if one}, method.predict(
             data.batch(rows)
         ).mean
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,8 @@ ROOT = Path(__file__).parents[3]
 
 
 def of_job(folder: Path, mode: RunMode = RunMode.MULTIRUN):
-    return OmegaConf.create({"hydra": {"mode": mode, "runtime": {"output_dir": str(folder)}}})
+    about = {"runtime": {"output_dir": str(folder)}, "overrides": {"task": ["seed=3"]}}
+    return OmegaConf.create({"hydra": {"mode": mode, **about}})
 
 
 def failed(error: Exception) -> JobReturn:
@@ -35,7 +37,7 @@ def test_a_failure_is_said_and_kept_and_the_sweep_goes_on(tmp_path, capsys):
     assert job.status == JobStatus.COMPLETED and job.return_value is None
     assert (tmp_path / FAILURE).read_text() == "no such file\n"
     said = capsys.readouterr().err
-    assert f"job {tmp_path.name} failed, others go on: no such file" in said.replace("\n", " ")
+    assert f"job {tmp_path.name} (seed=3) failed, others go on: no such file" in said.replace("\n", " ")
 
 
 def test_a_single_run_and_a_good_job_are_left_alone(tmp_path):
@@ -99,5 +101,5 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
     assert done.returncode == 1, done.stderr
     assert done.stderr.count("failed, others go on") == 1 and "1 jobs failed" in done.stdout
     timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
-    assert len(timed) == 1 and "count-40" in timed[0]
+    assert timed == ["0"] and re.search(r"job 1 \(.*model\.field\.count=-1.*\) failed", done.stderr)
     assert (sweep / "sweep.csv").read_text().count("\n") == 2

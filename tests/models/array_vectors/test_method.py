@@ -12,6 +12,7 @@ from torch.utils.benchmark import Timer
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load, split_for
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.scores import score
 from gsparc.field.confidence import fit_errors
@@ -22,7 +23,7 @@ from gsparc.models.array_vectors.cross_validation import tune
 from gsparc.models.array_vectors.vector_gp import aligned_by, mirror_elements, refine_alignment, twin
 from gsparc.models.registry import method_class
 from gsparc.models.splat.array import ArrayField
-from gsparc.ops import SphereGrid
+from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.array_response import steering
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.processes.kernel import SmoothRough
@@ -140,7 +141,7 @@ def test_confidence_falls_and_error_grows_with_distance(known_campaign, small):
     data, method = known_campaign[0], small[0]
     batch = data.batch(np.array([40]))
     away = torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.3], [0, 0, 5.0]])
-    found = method.predict(batch.tx + away, batch.rx)
+    found = method.predict(Query(batch.tx + away, batch.rx))
     assert (found.confidence.diff() < 0).all() and (found.variance.diff() > 0).all()
     assert found.confidence[-1] == 0 and found.mean.min() >= 0 and found.mean.max() <= 1
     background = method.fitted().response.background
@@ -151,8 +152,8 @@ def test_position_errors_cost_smoothly(known_campaign, small):
     """The sensitivity hook: millimetres change a spectrum by little, centimetres by more."""
     data, method = known_campaign[0], small[0]
     batch = data.batch(np.arange(0, 160, 8))
-    still = method.predict(batch.tx, batch.rx).mean
-    moved = [method.predict(batch.tx + shift, batch.rx).mean for shift in (0.001, 0.01, 0.1)]
+    still = method.predict(batch).mean
+    moved = [method.predict(Query(batch.tx + shift, batch.rx)).mean for shift in (0.001, 0.01, 0.1)]
     error = [float((m - still).square().mean().sqrt()) for m in moved]
     assert error[0] < 0.02 and error[0] < error[1] < error[2]
 
@@ -165,12 +166,12 @@ def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, 
     few.fit(data, _fold(160), FitContext(tmp_path))
     assert few.fitted().emission.encoding.width == 40 and whole.fitted().emission.encoding.width == 128
     batch = data.batch(_fold(160).test)
-    said = [m.predict(batch.tx, batch.rx).mean for m in (whole, few)]
+    said = [m.predict(batch).mean for m in (whole, few)]
     assert (said[0] - said[1]).square().mean() < 5e-3 * batch.target.square().mean()
     monkeypatch.setattr(splat_init, "MOST_ROWS", 60)
     few.fit(data, _fold(160), FitContext(tmp_path))
     assert few.fitted().emission.encoding.width == 40
-    again = few.predict(batch.tx, batch.rx).mean
+    again = few.predict(batch).mean
     errors = [(found - batch.target).square().mean() for found in (again, said[1])]
     assert errors[0] < 1.5 * errors[1], errors
 
@@ -184,7 +185,7 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
     with pytest.raises(ValueError, match="all antennas of the declared array are at one place"):
         ArrayField(SMALL).fit(data, _fold(12), FitContext(tmp_path))
     with pytest.raises(RuntimeError, match="not been trained"):
-        ArrayField().predict(torch.zeros(1, 3), None)
+        ArrayField().predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
 
 
 @pytest.mark.parametrize("rows", [1, 3, 96])
@@ -195,7 +196,7 @@ def test_very_few_rows_and_duplicate_positions(known_campaign, tmp_path, rows):
     method = ArrayField(SMALL)
     method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 100)), FitContext(tmp_path))
     batch = data.batch(np.arange(4))
-    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
+    assert torch.isfinite(method.predict(batch).mean).all()
 
 
 @pytest.mark.slow
@@ -224,5 +225,5 @@ def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
     method = ArrayField()
     method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
     batch = data.batch(np.array([0]))
-    timer = Timer("method.predict(batch.tx, batch.rx)", globals={"method": method, "batch": batch})
+    timer = Timer("method.predict(batch)", globals={"method": method, "batch": batch})
     assert timer.blocked_autorange(min_run_time=0.3).median < 1e-3

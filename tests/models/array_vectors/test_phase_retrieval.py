@@ -1,4 +1,4 @@
-"""Array vectors recovered from published spectra: residuals, ambiguities, other normalisations, the cache."""
+"""Array vectors recovered from published spectra: residuals, ambiguities, scales, each solved once."""
 
 from __future__ import annotations
 
@@ -78,49 +78,23 @@ def test_very_few_spectra_and_a_zero_vector_of_a_zero_spectrum(known_campaign, r
     assert np.isfinite(found.vectors).all() and np.abs(found.vectors[-1]).max() < 1e-2
 
 
-def test_only_requested_rows_are_recovered_and_cached(known_campaign, tmp_path, monkeypatch, caplog):
+def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeypatch, caplog):
     caplog.set_level("INFO", "gsparc")
     data, _ = known_campaign
-    asked = []
-    inner = vector_cache.recover
+    data = replace(data, site=replace(data.site, sha256="fresh"))
+    asked, inner = [], vector_cache.recover
+    monkeypatch.setattr(vector_cache, "AT_ONCE", 10)
     monkeypatch.setattr(vector_cache, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
-    first, seconds = vector_cache.recovered(data, np.arange(10), tmp_path)
-    again, later = vector_cache.recovered(data, np.arange(5, 15), tmp_path)
-    assert asked == [10, 5] and seconds.wall > 0 and later.wall > seconds.wall / 2
+    first, seconds = vector_cache.recovered(data, np.arange(10))
+    again, later = vector_cache.recovered(data, np.arange(5, 25))
+    assert asked == [10, 8, 7] and seconds.wall > 0 and later.wall > seconds.wall / 2
     assert seconds.processor > 0 and seconds.processor / 2 < later.processor
     np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
+    assert "array vectors of 5 spectra are known from before" in caplog.messages
     other = replace(data, site=replace(data.site, sha256="another"))
-    vector_cache.recovered(other, np.arange(3), tmp_path)
-    assert asked == [10, 5, 3]
-    (line,) = (line for line in caplog.messages if "are cached" in line)
-    assert line.startswith("array vectors of 5 spectra") and "training time includes" in line
-
-
-def test_an_interrupted_recovery_resumes(known_campaign, tmp_path, monkeypatch):
-    data, _ = known_campaign
-    asked, whole = [], vector_cache.recover
-
-    def interrupted(site, images, places, seed):
-        asked.append(len(places))
-        if len(asked) == 3:
-            raise KeyboardInterrupt
-        return whole(site, images, places, seed)
-
-    monkeypatch.setattr(vector_cache, "AT_ONCE", 5)
-    monkeypatch.setattr(vector_cache, "recover", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        vector_cache.recovered(data, np.arange(20), tmp_path)
-    found, _ = vector_cache.recovered(data, np.arange(20), tmp_path)
-    assert asked == [5, 5, 5, 5, 5] and len(found.vectors) == 20
-
-
-def test_a_damaged_cache_is_computed_anew(known_campaign, tmp_path, caplog):
-    data, _ = known_campaign
-    vector_cache.recovered(data, np.arange(4), tmp_path)
-    file = next(tmp_path.rglob("*.npz"))
-    file.write_bytes(file.read_bytes()[:100])
-    found, _ = vector_cache.recovered(data, np.arange(4), tmp_path)
-    assert np.isfinite(found.vectors).all() and "computed anew" in caplog.text
+    vector_cache.recovered(other, np.arange(3))
+    vector_cache.recovered(other, np.arange(3), seed=1)
+    assert asked == [10, 8, 7, 3, 3]
 
 
 def test_report_names_suspect_images(known_campaign, tmp_path, caplog):

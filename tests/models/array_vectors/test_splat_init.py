@@ -11,7 +11,7 @@ from campaigns import compose
 from contexts import short
 from known_arrays import spectra
 
-from gsparc.data.files import platform_cache
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import seen_by_array
 from gsparc.models.array_vectors import splat_init
@@ -47,7 +47,7 @@ def process(trained):
     site, places = data.site, data.tx[fold.train]
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
     matrix, partner = steering(site.array, site.grid, site.wavelength).numpy(), mirror_elements(site.array)
-    found, _ = recovered(data, fold.train, platform_cache())  # the same solutions
+    found, _ = recovered(data, fold.train)  # the same solutions
     kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = aligned_by(found.vectors, places, partner, kernel)
     rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])
@@ -69,7 +69,7 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
 
 def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
     method, data, fold = trained
-    said, batch = method.predict(*_ends(data, fold.test)), data.batch(fold.test)
+    said, batch = method.predict(Query(*_ends(data, fold.test))), data.batch(fold.test)
     mean, variance = process
     background = torch.from_numpy(data.targets(fold.train).numpy().mean(0))
     known = spectra(data.site, torch.from_numpy(mean)).square()
@@ -81,11 +81,11 @@ def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
 def test_all_is_unknown_far_away_and_little_at_data(trained):
     method, data, fold = trained
     tx, rx = _ends(data, fold.train)
-    far = method.predict(tx[:10] + torch.tensor([9.0, -8.0, 3.0]), rx)
+    far = method.predict(Query(tx[:10] + torch.tensor([9.0, -8.0, 3.0]), rx))
     background = method.fitted().response.background
     torch.testing.assert_close(far.mean, background.expand(10, -1, -1), atol=1e-5, rtol=0)
     assert (far.confidence == 0).all() and (far.variance == far.variance[0]).all()
-    near = method.predict(tx, rx)
+    near = method.predict(Query(tx, rx))
     assert near.confidence.min() > 0.5 and near.variance.max() < 0.5 * far.variance[0]
     assert (method.fitted().unknown(tx, rx) < 0.05).all()
 
@@ -94,7 +94,7 @@ def test_the_frozen_field_is_the_rasterized_one_and_has_gradients(trained):
     method, data, fold = trained
     model, batch = method.fitted(), data.batch(fold.test[:3])
     live = model(batch.tx, batch.rx)
-    quick = method.predict(batch.tx, batch.rx)
+    quick = method.predict(batch)
     torch.testing.assert_close(live.mean.clamp(0, 1), quick.mean, atol=1e-3, rtol=0)
     (live.mean - batch.target).square().sum().backward()
     for parameter in (model.gaussians.means, model.gaussians.opacity_logits, model.emission.weight2):
@@ -111,7 +111,7 @@ def test_steps_are_taken_where_asked_for(known_campaign, tmp_path):
     moved = (more.fitted().gaussians.means - none.fitted().gaussians.means).abs().max()
     assert moved > 1e-6 and more.effects == "array"
     errors = [
-        (m.predict(*_ends(data, fold.test)).mean - data.targets(fold.test)).square().mean()
+        (m.predict(Query(*_ends(data, fold.test))).mean - data.targets(fold.test)).square().mean()
         for m in (more, none)
     ]
     assert errors[0] < 2 * errors[1]
@@ -122,7 +122,7 @@ def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):
     fold = Fold(np.arange(40), np.arange(40, 44), np.arange(44, 50))
     method = _trained(data, fold, tmp_path, "model.field.count=20", "init=sphere", steps=3)
     assert not method.fitted().tells_unknown
-    said = method.predict(*_ends(data, fold.test))
+    said = method.predict(Query(*_ends(data, fold.test)))
     assert (said.mean.flatten(1).amax(1) > 0.999).all() and said.variance is None
 
 

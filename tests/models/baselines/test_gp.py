@@ -10,6 +10,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from gsparc.data.load import load, split_for
+from gsparc.data.query import Query
 from gsparc.evaluation.scores import score
 from gsparc.models.baselines.gp import GaussianProcess, choose_kernel, principal_components
 from gsparc.ops import Pose
@@ -59,7 +60,7 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     )
     mean, deviation = library.predict(data.moving[fold.test], return_std=True)
     batch = data.batch(fold.test)
-    found = gp.predict(batch.tx, batch.rx)
+    found = gp.predict(batch)
     expected = torch.from_numpy(mean + target.mean(0)).float().view(-1, 4, 3, 2)
     assert torch.allclose(torch.view_as_real(found.mean), expected, atol=1e-4)
     # A complex entry holds two real numbers.
@@ -71,7 +72,7 @@ def test_it_knows_what_it_does_not_know(campaign, folds, tmp_path):
     gp = GaussianProcess()
     gp.fit(data, fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
-    near, far = gp.predict(batch.tx, batch.rx), gp.predict(batch.tx + 1000.0, batch.rx)
+    near, far = gp.predict(batch), gp.predict(Query(batch.tx + 1000.0, batch.rx))
     assert near.confidence.min() > far.confidence.max() and far.confidence.max() < 1e-6
     assert near.confidence.max() <= 1
     ratio = float(((near.mean - batch.target) ** 2).mean() / near.variance.mean())
@@ -85,7 +86,7 @@ def test_hardly_any_samples(campaign, folds, tmp_path, rows):
     few = type(fold)(fold.train[:rows], fold.val[:0], fold.test)
     gp = GaussianProcess()
     gp.fit(data, few, FitContext(tmp_path))
-    prediction = gp.predict(*(lambda b: (b.tx, b.rx))(data.batch(fold.test)))
+    prediction = gp.predict(Query(*(lambda b: (b.tx, b.rx))(data.batch(fold.test))))
     assert torch.isfinite(prediction.mean).all() and torch.isfinite(prediction.variance).all()
 
 
@@ -95,7 +96,7 @@ def test_equal_samples_at_one_place(campaign, folds, tmp_path):
     data.target[:] = data.target[0]
     gp = GaussianProcess()
     gp.fit(data, folds(12).folds[0], FitContext(tmp_path))
-    found = gp.predict(torch.zeros(2, 3), Pose(torch.zeros(3), torch.eye(3))).mean
+    found = gp.predict(Query(torch.zeros(2, 3), Pose(torch.zeros(3), torch.eye(3)))).mean
     assert torch.allclose(found, data.targets(np.array([0, 0])), atol=1e-5)
 
 

@@ -9,12 +9,14 @@ import pytest
 import torch
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines import kriging
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.registry import method_class
 from gsparc.models.target_rows import from_real, to_real
+from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 
 NAMES = ("zero", "mean", "nearest", "idw", "gp")
@@ -33,11 +35,11 @@ def test_every_baseline_serves_every_kind(campaign, folds, tmp_path, name, kind,
     data, fold = campaign(kind, 30, static_end), folds(30).folds[0]
     method = fitted(name, data, fold, tmp_path)
     batch = data.batch(fold.test)
-    found = method.predict(batch.tx, batch.rx)
+    found = method.predict(batch)
     assert found.mean.shape == batch.target.shape and found.mean.dtype == batch.target.dtype
     again = method_class(name)()
     again.restore(data.site, method.state())
-    assert torch.equal(again.predict(batch.tx, batch.rx).mean, found.mean)
+    assert torch.equal(again.predict(batch).mean, found.mean)
     assert again.size() == len(fold.train) + len(fold.val)
     for value in (found.confidence, found.variance):
         assert value is None or (value.shape == (len(batch),) and (value >= 0).all())
@@ -47,25 +49,25 @@ def test_every_baseline_serves_every_kind(campaign, folds, tmp_path, name, kind,
 def test_no_test_row_is_looked_at(campaign, folds, tmp_path, name):
     data, fold = campaign("csi", 30), folds(30).folds[0]
     batch = data.batch(fold.test)
-    clean = fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean
+    clean = fitted(name, data, fold, tmp_path).predict(batch).mean
     data.target[fold.test] = np.nan
-    assert torch.equal(fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean, clean)
+    assert torch.equal(fitted(name, data, fold, tmp_path).predict(batch).mean, clean)
 
 
 @pytest.mark.parametrize("name", ["mean", "nearest", "idw", "gp"])
 def test_validation_rows_are_learned_from(campaign, folds, tmp_path, name):
     data, fold = campaign("csi", 30), folds(30).folds[0]
     batch = data.batch(fold.val)
-    before = fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean
+    before = fitted(name, data, fold, tmp_path).predict(batch).mean
     data.target[fold.val] += 10
-    assert not torch.allclose(fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx).mean, before)
+    assert not torch.allclose(fitted(name, data, fold, tmp_path).predict(batch).mean, before)
 
 
 @pytest.mark.parametrize("name", ["nearest", "idw"])
 def test_a_sample_is_repeated_at_its_own_place(campaign, folds, tmp_path, name):
     data, fold = campaign("spectrum", 30), folds(30).folds[0]
     batch = data.batch(fold.train)
-    found = fitted(name, data, fold, tmp_path).predict(batch.tx, batch.rx)
+    found = fitted(name, data, fold, tmp_path).predict(batch)
     assert torch.allclose(found.mean, batch.target, atol=1e-4)
     assert found.confidence.min() > 0.999
 
@@ -76,7 +78,7 @@ def test_idw_weighs_by_inverse_squared_distance(campaign, folds, tmp_path):
     fold = type(folds(8).folds[0])(np.arange(3), np.arange(0), np.arange(0))
     method = InverseDistance(neighbours=2)
     method.fit(data, fold, FitContext(tmp_path))
-    found = method.predict(torch.tensor([[1.0, 0, 0]]), data.batch(np.arange(1)).rx).mean
+    found = method.predict(Query(torch.tensor([[1.0, 0, 0]]), data.batch(np.arange(1)).rx)).mean
     decibels = 10 * np.log10(data.target[:2, 0])
     assert 10 * torch.log10(found)[0, 0] == pytest.approx((4 * decibels[0] + decibels[1]) / 5, rel=1e-4)
     with pytest.raises(ValueError, match="neighbours"):
@@ -87,7 +89,7 @@ def test_mean_is_the_mean(campaign, folds, tmp_path):
     data, fold = campaign("spectrum", 30), folds(30).folds[0]
     rows = np.concatenate([fold.train, fold.val])
     batch = data.batch(fold.test)
-    found = fitted("mean", data, fold, tmp_path).predict(batch.tx, batch.rx).mean
+    found = fitted("mean", data, fold, tmp_path).predict(batch).mean
     assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6) and torch.equal(
         found[0], found[-1]
     )
@@ -102,7 +104,7 @@ def test_entries_never_measured_do_not_leak(campaign, folds, tmp_path, name):
         target = np.where(mask, data.target, np.complex64(rubbish))
         masked = Measurements(data.site, data.tx, data.rx_position, data.rx_rotation, target, mask=mask)
         batch = masked.batch(fold.test)
-        results.append(fitted(name, masked, fold, tmp_path).predict(batch.tx, batch.rx).mean)
+        results.append(fitted(name, masked, fold, tmp_path).predict(batch).mean)
     assert torch.equal(*results)
 
 
@@ -115,7 +117,7 @@ def test_encoding_is_undone(campaign, kind):
 
 def test_asking_before_fitting_is_an_error():
     with pytest.raises(ValueError, match="fit or restore"):
-        method_class("gp")().predict(torch.zeros(1, 3), None)
+        method_class("gp")().predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
 
 
 def test_kriging_lends_its_pivots_to_no_one(campaign, folds, tmp_path, monkeypatch):
@@ -125,7 +127,7 @@ def test_kriging_lends_its_pivots_to_no_one(campaign, folds, tmp_path, monkeypat
     seen = []
     solve = kriging.lu_solve
     monkeypatch.setattr(kriging, "lu_solve", lambda pair, right: seen.append(pair[1]) or solve(pair, right))
-    method.answer(data.batch(np.arange(3)))
+    method.predict(data.batch(np.arange(3)))
     assert len(seen) == 1 and not np.shares_memory(seen[0], method.system[1])
 
 
@@ -138,7 +140,9 @@ def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
     method = kriging.Kriging()
     report = method.fit(data, Fold(np.arange(60), np.arange(60, 70), np.arange(70, 80)), FitContext(tmp_path))
     assert method.system is None and "of 70 places each query's nearest 20" in report.notes[0]
-    error = 10 * torch.log10(method.answer(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[:, 0]
+    error = (
+        10 * torch.log10(method.predict(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[:, 0]
+    )
     assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
 
 

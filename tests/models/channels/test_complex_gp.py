@@ -8,6 +8,7 @@ from rooms import nmse, shoebox
 from scenes import error
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import complex_gp
 from gsparc.models.channels.complex_gp import ComplexGP
@@ -41,16 +42,16 @@ def test_dense_receivers_tell_and_far_away_nothing_is_said(tmp_path):
     data, fold = _dense()
     method, notes = _fit(data, fold)
     batch = data.batch(fold.test)
-    prediction = method.predict(batch.tx, batch.rx)
+    prediction = method.predict(batch)
     assert nmse(prediction.mean.numpy(), batch.target.numpy()) < 0.3
     missed = (prediction.mean - batch.target).abs().square().mean()
     assert 0.2 < prediction.variance.mean() / missed < 5
     assert len(notes) == 1 and notes[0].startswith("complex_gp: envelope")
     again = _restored(method, data.site, tmp_path)
-    torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, prediction.mean)
+    torch.testing.assert_close(again.predict(batch).mean, prediction.mean)
     one_run, _ = _fit(replace(data, run=np.full(len(data), 3)), fold)
-    assert torch.equal(one_run.predict(batch.tx, batch.rx).mean, prediction.mean)
-    far = method.predict(batch.tx, replace(batch.rx, position=batch.rx.position + 1000))
+    assert torch.equal(one_run.predict(batch).mean, prediction.mean)
+    far = method.predict(Query(batch.tx, replace(batch.rx, position=batch.rx.position + 1000)))
     assert far.mean.abs().max() < 1e-3 and far.confidence.max() < 1e-3
 
 
@@ -62,13 +63,13 @@ def test_many_rows_are_told_by_the_nearest(tmp_path, monkeypatch):
     assert near.label == "complex_gp (Vecchia 100)" and whole.label == "complex_gp"
     assert any("predicted from the 100 nearest" in note for note in notes), notes
     batch = data.batch(fold.test)
-    said, exactly = (method.predict(batch.tx, batch.rx) for method in (near, whole))
+    said, exactly = (method.predict(batch) for method in (near, whole))
     errors = [nmse(found.mean.numpy(), batch.target.numpy()) for found in (said, exactly)]
     assert errors[0] < 1.5 * errors[1] < 0.4, errors
     missed = (said.mean - batch.target).abs().square().mean()
     assert 0.2 < said.variance.mean() / missed < 5
     again = _restored(near, data.site, tmp_path)
-    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said.mean)
+    assert torch.equal(again.predict(batch).mean, said.mean)
 
 
 def test_places_visited_again_hid_all_others_from_the_nearest_rows(monkeypatch):
@@ -113,7 +114,7 @@ def test_runs_are_brought_together(tmp_path):
     for name, data in (("one", clean), ("known", spread), ("ignored", replace(spread, run=None))):
         method, notes = _fit(data, fold)
         batch = data.batch(fold.test)
-        errors[name] = nmse(method.predict(batch.tx, batch.rx).mean.numpy(), truth)
+        errors[name] = nmse(method.predict(Query(batch.tx, batch.rx)).mean.numpy(), truth)
         if name == "known":
             assert notes[1].startswith(
                 "complex_gp: factors of runs, relative to run 5: 5: 1 at 0 degrees, 6: "
@@ -123,7 +124,7 @@ def test_runs_are_brought_together(tmp_path):
             ratio = np.array(found) / factors
             assert np.abs(np.angle(ratio)).max() < 0.1 and np.abs(np.log(np.abs(ratio))).max() < 0.3
             again = _restored(method, data.site, tmp_path)
-            torch.testing.assert_close(again.answer(batch).mean, method.answer(batch).mean)
+            torch.testing.assert_close(again.predict(batch).mean, method.predict(batch).mean)
     assert errors["known"] < 1.5 * errors["one"] < 0.5 * errors["ignored"], errors
 
 
@@ -132,11 +133,11 @@ def test_rows_of_other_runs_were_scored_in_the_phase_of_the_largest(tmp_path):
     _, spread, fold = _in_runs([1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)])
     method, _ = _fit(spread, fold)
     batch = spread.batch(fold.test)
-    here = method.answer(batch).mean
+    here = method.predict(batch).mean
     assert nmse(here.numpy(), batch.target.numpy()) < 0.2 * error(method, spread, fold.test)
-    assert torch.equal(_restored(method, spread.site, tmp_path).answer(batch).mean, here)
+    assert torch.equal(_restored(method, spread.site, tmp_path).predict(batch).mean, here)
     strange = replace(batch, run=torch.full((len(batch),), 99))
-    assert torch.equal(method.answer(strange).mean, method.predict(batch.tx, batch.rx).mean)
+    assert torch.equal(method.predict(strange).mean, method.predict(Query(batch.tx, batch.rx)).mean)
 
 
 def test_factors_of_many_runs():

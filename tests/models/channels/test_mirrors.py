@@ -111,7 +111,7 @@ def test_planes_outlive_storing():
     field.condition(data, np.arange(len(data)))
     batch = data.batch(np.arange(9))
     again = restored(data.site, field.state())
-    torch.testing.assert_close(again.answer(batch).mean, field.answer(batch).mean)
+    torch.testing.assert_close(again(batch).mean, field(batch).mean)
     np.testing.assert_allclose(again.objects().planes, wall.numpy())
     assert "mirrors" in again.terms
 

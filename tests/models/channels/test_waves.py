@@ -10,6 +10,7 @@ from rooms import WAVELENGTH, nmse, shoebox
 from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
 from gsparc.models.channels.columns import bands, gather
@@ -74,7 +75,7 @@ def test_isotropic_term_alone_is_the_plain_process():
         field.values = replace(field.values, power=torch.tensor([1.0, plain.kernel.noise]).double())
         field.condition(data, np.concatenate([fold.train, fold.val]))
     batch = data.batch(fold.test)
-    before, after = plain.predict(batch.tx, batch.rx), field(batch.tx, batch.rx)
+    before, after = plain.predict(batch), field(batch)
     torch.testing.assert_close(after.mean, before.mean, rtol=1e-4, atol=1e-4)
     # Its power is the targets' mean square, the field's is that of largest likelihood.
     level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
@@ -159,7 +160,7 @@ def test_left_out_is_what_refitting_gives(correlated):
         again.condition(data, rest)
         batch = data.batch(np.array([row]))
         with torch.no_grad():
-            found = again(batch.tx, batch.rx)
+            found = again(batch)
         torch.testing.assert_close(found.mean[0], left.mean[row], rtol=1e-3, atol=1e-4)
         scale = field.weights[0].scale / again.weights[0].scale
         # A row's drift is also that of rows before and after it, which no query's is.
@@ -171,7 +172,7 @@ def test_far_away_nothing_is_known():
     data = _sent(60)
     field = _whole(data, mirrors=0)
     far = Pose(torch.tensor([3e4, 0.0, 0.0]), torch.eye(3))
-    found = field(torch.from_numpy(data.tx[:1]).float(), far)
+    found = field(Query(torch.from_numpy(data.tx[:1]).float(), far))
     assert found.unknown.item() > 0.999 and found.mean.abs().max() < 1e-3
     values, known = field.values, field.weights[0]
     place = torch.tensor([[3e4, 0.0, 0.0]], dtype=torch.float64)
@@ -215,7 +216,7 @@ def test_slopes_over_places():
     tx = torch.from_numpy(data.tx[:1]).float()
 
     def level(x):
-        found = field(tx, Pose(x, torch.eye(3)))
+        found = field(Query(tx, Pose(x, torch.eye(3))))
         return found.mean.real.sum() + found.variance.sum()
 
     known = place.clone().requires_grad_()
@@ -291,12 +292,12 @@ def test_a_restored_field_answers_the_same_and_a_fresh_one_is_refused(tmp_path):
     again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     batch = data.batch(np.arange(40, 60))
     with torch.no_grad():
-        before, after = field(batch.tx, batch.rx), again(batch.tx, batch.rx)
+        before, after = field(batch), again(batch)
     for name in ("mean", "variance", "explained", "unknown"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
     assert again.terms == field.terms
     with pytest.raises(ValueError, match="not conditioned"):
-        ChannelField(data.site, field.values, (1, 1))(batch.tx, batch.rx)
+        ChannelField(data.site, field.values, (1, 1))(batch)
     with pytest.raises(ValueError, match="known carrier"):
         initialise(replace(data, site=replace(data.site, carrier_hz=None)), np.arange(30), PLAIN)
 

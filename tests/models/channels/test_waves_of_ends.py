@@ -10,6 +10,7 @@ from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.covariance import (
@@ -112,10 +113,10 @@ def test_an_end_that_was_never_heard_has_the_direct_wave():
     field, _ = initialise(data, known, QUICK)
     batch, same = data.batch(left), data.batch(known)
     with torch.no_grad():
-        found = field.answer(batch)
-        of_places = field(batch.tx, batch.rx)
+        found = field(batch)
+        of_places = field(Query(batch.tx, batch.rx))
         torch.testing.assert_close(of_places.mean, found.mean)
-        heard = field.answer(same)
+        heard = field(same)
     missed = (found.mean - batch.target).abs().square().mean()
     assert missed < 0.9 * batch.target.abs().square().mean()
     assert 0.2 < float(missed / found.variance.mean()) < 4
@@ -128,7 +129,7 @@ def test_phases_that_nothing_tells_leave_little_to_say_of_an_end():
     field, _ = initialise(data, np.flatnonzero(data.station < 7), QUICK)
     batch = data.batch(np.flatnonzero(data.station >= 7))
     with torch.no_grad():
-        found = field.answer(batch)
+        found = field(batch)
     assert found.unknown.mean() > 0.7
     mean, target = found.mean.flatten().to(torch.complex128), batch.target.flatten().to(torch.complex128)
     one = batch.station == 7
@@ -147,7 +148,7 @@ def test_runs_of_all_ends_differ_by_one_phase():
     assert abs(abs(float(found.angle())) - 0.9) < 0.1
     batch = data.batch(fold.test)
     with torch.no_grad():
-        turned = field(batch.tx, batch.rx, batch.station).mean
+        turned = field(Query(batch.tx, batch.rx, batch.station)).mean
     right = answer_error(field, data, fold.test)
     assert right < 0.5 * nmse(turned.numpy(), batch.target.numpy())
 
@@ -159,7 +160,7 @@ def test_there_and_back_with_angles_to_ends(tmp_path):
     again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     batch = data.batch(np.arange(300, 400))
     with torch.no_grad():
-        before, after = field.answer(batch), again.answer(batch)
+        before, after = field(batch), again(batch)
     torch.testing.assert_close(after.mean, before.mean)
     torch.testing.assert_close(after.variance, before.variance)
 
@@ -180,7 +181,7 @@ def test_stations_together_are_asked_for_any_pair():
         elsewhere = asked.predict(tx=here[None].repeat(2, 0), rx=places[[1, 3]])
         assert elsewhere.confidence[0] > elsewhere.confidence[1] + 0.2
     batch = data.batch(rows[:40])
-    torch.testing.assert_close(again.answer(batch).mean, method.answer(batch).mean)
+    torch.testing.assert_close(again.predict(batch).mean, method.predict(batch).mean)
 
 
 def test_methods_of_one_end_are_refused_as_before():
@@ -215,5 +216,5 @@ def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
     method = for_links(lambda: Gsparc(EffectSettings(phase=False)), data)
     method.fit(data, fold, FitContext(stations="each"))
     batch = data.batch(fold.test)
-    by_place, by_row = method.predict(batch.tx, batch.rx), method.answer(batch)
+    by_place, by_row = method.predict(Query(batch.tx, batch.rx)), method.predict(batch)
     torch.testing.assert_close(by_place.mean, by_row.mean)

@@ -11,7 +11,7 @@ from releases import REAL
 from rooms import directed
 from scenes import error
 
-from gsparc.data.datasets.newrf import load_newrf
+from gsparc.data.load import load
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.experiment.study import turned
 from gsparc.models.directional.method import DirectionalGP
@@ -59,7 +59,7 @@ def test_occlusion_by_a_pillar_is_learned(pillar):
 def test_errors_are_as_large_as_expected(pillar):
     data, fold, _, method = pillar
     batch = data.batch(fold.test)
-    predicted = method.predict(batch.tx, batch.rx)
+    predicted = method.predict(batch)
     missed = (predicted.mean - batch.target).abs().square().mean((1, 2))
     assert 0.2 < float(missed.mean() / predicted.variance.mean()) < 5
     assert bool(((predicted.confidence >= 0) & (predicted.confidence <= 1)).all())
@@ -117,8 +117,8 @@ def test_paths_sum_to_the_prediction(pillar):
     other = DirectionalGP()
     other.restore(data.site, method.state())
     batch = data.batch(fold.test[:5])
-    want = method.predict(batch.tx, batch.rx)
-    gain, delay, direction, _ = other.paths(batch.tx, batch.rx)
+    want = method.predict(batch)
+    gain, delay, direction, _ = other.paths(batch)
     assert gain.shape == delay.shape == (5, 1, 7) and direction.shape == (5, 7, 3)
     torch.testing.assert_close(gain.sum(-1), want.mean[:, :, 0], atol=1e-6, rtol=1e-4)
 
@@ -193,7 +193,7 @@ def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
         data = replace(data, rx_position=np.concatenate([sources[:1], data.rx_position[1:]]))
     method, _ = fitted(data, fold)
     batch = data.batch(fold.test)
-    predicted, left = method.predict(batch.tx, batch.rx), method.left_out().mean
+    predicted, left = method.predict(batch), method.left_out().mean
     for part in (predicted.mean, predicted.variance, predicted.confidence, left):
         assert bool(torch.isfinite(part.abs()).all())
     assert error(method, data, fold.test) < 1.1
@@ -203,7 +203,7 @@ def test_the_conference_room_from_43_receivers():
     """A search finds nothing there: NMSE 1.1; a network along the rays leaves 0.17."""
     if not ROOM.exists():
         pytest.skip(f"real data not found at {ROOM}")
-    data = load_newrf(ROOM)
+    data = load({"name": "newrf", "file": str(ROOM)})
     fold = make_split(data.moving, SplitSettings(name="sparse")).folds[0]
     method, _ = fitted(data, fold)
     assert len(fold.train) + len(fold.val) == 43

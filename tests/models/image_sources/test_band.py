@@ -27,7 +27,7 @@ def test_the_whole_band_from_its_lowest_quarter(tones, width_hz, tmp_path):
     method = ImageSourceGP(searches=1, clutter=False)
     report = method.fit(replace(data, mask=mask), fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
-    predicted, true = method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()
+    predicted, true = method.predict(batch).mean.numpy(), batch.target.numpy()
     parts = np.array_split(np.arange(tones), QUARTERS)
     errors = [nmse(predicted[..., part], true[..., part]) for part in parts]
     log.info("%d tones: NMSE %s by quarter of the band, %.0f s", tones, np.round(errors, 4), report.seconds)

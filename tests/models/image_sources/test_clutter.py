@@ -19,7 +19,7 @@ from gsparc.models.image_sources.clutter.residual import Residual
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
@@ -133,13 +133,13 @@ def test_batched_queries_and_variance_include_clutter():
     members = [Posterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
     queries = _rows(6, seed=5).position
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    means, variance, _ = Query(members).means(queries, tone)
+    means, variance, _ = Means(members).means(queries, tone)
     for member, mean in zip(members, means, strict=True):
         asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
         waves = member.scene.over(member.scene.sequences).unobstructed(asked)
         expected = (waves[:, :, None] * gains(member, queries)).sum(1)
         torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
-    bare = Query(members[1:]).means(queries, tone)[1]
+    bare = Means(members[1:]).means(queries, tone)[1]
     assert not torch.allclose(variance, bare)
 
 

@@ -8,7 +8,7 @@ from gains import gains, phased
 
 from gsparc.models.image_sources import refine
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.query import Query
+from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene, correlations, steering
 from gsparc.models.image_sources.visibility_kernel import KernelVisibility
@@ -110,8 +110,8 @@ def test_packed_queries_equal_the_processes():
     members = [Posterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
     tones = torch.tensor([2.40e9, 2.42e9, 2.44e9], dtype=torch.float64)
     queries = torch.rand(7, 3, dtype=torch.float64) * 3
-    means, _, _ = Query(members).means(queries, tones)
-    bare, variance, prior = Query(members, variance_rows=0).means(queries, tones)
+    means, _, _ = Means(members).means(queries, tones)
+    bare, variance, prior = Means(members, variance_rows=0).means(queries, tones)
     assert torch.equal(bare, means) and variance.tolist() == [0] * 7 and prior.tolist() == [1] * 7
     for member, mean in zip(members, means, strict=True):
         found = gains(member, queries)
@@ -126,7 +126,7 @@ def test_variance_is_that_of_the_joint_gaussian():
     rows, scene = _rows(), _phased()
     query = torch.tensor([[1.0, 1.2, 0.4]], dtype=torch.float64)
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    _, variance, _ = Query([Posterior(rows, scene)]).means(query, tone)
+    _, variance, _ = Means([Posterior(rows, scene)]).means(query, tone)
     both = Rows(
         torch.cat([rows.position, query]),
         torch.cat([rows.frequency, tone]),
@@ -141,13 +141,13 @@ def test_variance_is_that_of_the_joint_gaussian():
 def test_variances_of_many_queries_are_those_of_each_alone():
     tones = torch.tensor([2.4e9], dtype=torch.float64)
     queries = torch.rand(5, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 3
-    query = Query([Posterior(_rows(), _phased()), Posterior(_rows(), _phased(0.7))], 10)
+    query = Means([Posterior(_rows(), _phased()), Posterior(_rows(), _phased(0.7))], 10)
     _, variance, prior = query.means(queries, tones)
     alone = [query.means(one[None], tones)[1:] for one in queries]
     torch.testing.assert_close(
         torch.stack([variance, prior], 1), torch.cat([torch.stack(p, 1) for p in alone])
     )
-    whole = Query([Posterior(_rows(), _phased())]).means(queries, tones)[1]
+    whole = Means([Posterior(_rows(), _phased())]).means(queries, tones)[1]
     assert bool((variance >= whole - 1e-5).all())  # fewer rows know less
     assert bool((variance <= prior).all())
 

@@ -14,6 +14,7 @@ from shoeboxes import as_arrays
 
 from gsparc import load
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
@@ -28,7 +29,7 @@ from gsparc.training.race import Behind, Race
 
 def _predicted(method, data, index):
     batch = data.batch(index)
-    return method.predict(batch.tx, batch.rx)
+    return method.predict(batch)
 
 
 def found_share(method, told, within=0.1, order=2):
@@ -64,7 +65,7 @@ def test_variance_is_of_the_size_of_the_error(small):
     assert 0.5 < prediction.variance.mean() / missed.mean() < 2
     assert prediction.confidence.min() > 0.9
     rx = data.batch(fold.test[:1]).rx
-    outside = method.predict(torch.zeros(1, 3), replace(rx, position=rx.position + 30.0))
+    outside = method.predict(Query(torch.zeros(1, 3), replace(rx, position=rx.position + 30.0)))
     assert outside.confidence[0] <= prediction.confidence.min()
 
 

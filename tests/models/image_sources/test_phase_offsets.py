@@ -50,7 +50,7 @@ def test_sources_are_found_through_unknown_offsets_that_are_estimated(offsets, t
     _, _, seen = _offset(data, offsets == "phase_timing")
     method, _ = fitted(seen, fold, tmp_path, search_rows=300, offsets=offsets)
     batch = data.batch(fold.test)
-    found, true = method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()
+    found, true = method.predict(batch).mean.numpy(), batch.target.numpy()
     scalar = (found.conj() * true).sum((1, 2)) / (np.abs(found) ** 2).sum((1, 2))
     if offsets == "none":
         assert nmse(found, true) > 0.5

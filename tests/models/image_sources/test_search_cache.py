@@ -52,7 +52,7 @@ def test_finished_searches_are_reused(tmp_path, counted):
         again, report = _fit(data, fold, tmp_path / "again", tmp_path / "cut" / "last.ckpt")
         assert begun == [1]
         batch = data.batch(fold.test)
-        assert torch.equal(whole.predict(batch.tx, batch.rx).mean, again.predict(batch.tx, batch.rx).mean)
+        assert torch.equal(whole.predict(batch).mean, again.predict(batch).mean)
         before = torch.load(tmp_path / "cut" / "last.ckpt", weights_only=True)
         assert report.seconds > before["spent_s"] and report.limited_by is None
     finally:

@@ -86,9 +86,9 @@ def test_four_antennas_at_a_hundred_places(four, tmp_path):
 def test_paths_of_each_antenna_sum_to_the_prediction(four):
     method, data, fold = four
     batch = data.batch(fold.test[:5])
-    gain, delay, direction, _ = method.paths(batch.tx, batch.rx)
+    gain, delay, direction, _ = method.paths(batch)
     assert gain.shape == delay.shape == (5, 4, method.size()) and direction.shape == (5, method.size(), 3)
-    assert torch.allclose(gain.sum(-1), method.predict(batch.tx, batch.rx).mean[..., 0], atol=1e-4)
+    assert torch.allclose(gain.sum(-1), method.predict(batch).mean[..., 0], atol=1e-4)
     antennas = torch.from_numpy(static_array(data.site, 4) + data.site.static_position)
     direct = torch.linalg.vector_norm(
         torch.from_numpy(data.moving[fold.test[:5]])[:, None] - antennas, dim=-1

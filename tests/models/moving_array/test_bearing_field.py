@@ -7,6 +7,7 @@ import pytest
 import torch
 from boxes import room_of_spectra
 
+from gsparc.data.query import Query
 from gsparc.field.initial import InitSettings
 from gsparc.models.fields import bearings
 from gsparc.models.moving_array.bearing_field import BearingField
@@ -37,7 +38,7 @@ def field(data, found):
 
 def missed(field, data, rows):
     batch = data.batch(rows)
-    return float((field(batch.tx, batch.rx).mean - batch.target).square().mean())
+    return float((field(batch).mean - batch.target).square().mean())
 
 
 def test_sources_are_found_within_the_settings(data, found):
@@ -53,8 +54,8 @@ def test_sources_are_found_within_the_settings(data, found):
 
 def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
     batch = data.batch(np.arange(1, 31, 2))
-    posterior, method = field(batch.tx, batch.rx), field.method
-    explained, mean, energy, _ = method.query()(method.where(batch.tx, batch.rx))
+    posterior, method = field(batch), field.method
+    explained, mean, energy, _ = method.query()(batch.places(data.site))
     torch.testing.assert_close(posterior.explained, explained.clamp(0, 1))
     added = method.basis.of(mean - explained)
     torch.testing.assert_close(added.square().sum(1), energy, rtol=1e-3, atol=1e-6)
@@ -69,9 +70,9 @@ def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
 
 def test_nothing_is_known_a_hundred_metres_away(data, field):
     batch = data.batch(ROWS[:8])
-    here = field(batch.tx, batch.rx)
+    here = field(batch)
     moved = dataclasses.replace(batch.rx, position=batch.rx.position + torch.tensor([100.0, 0, 0]))
-    there = field(batch.tx, moved)
+    there = field(Query(batch.tx, moved))
     assert here.unknown.max() < 0.5 and (there.unknown == 1).all()
     assert (there.variance > here.variance).all()
     prior = 2 * data.target[ROWS].astype(np.float64).var(0).mean() / 255**2
@@ -103,7 +104,7 @@ def test_a_restored_field_answers_the_same(data, field, tmp_path):
     torch.save(field.state(), tmp_path / "state.pt")
     again = BearingField.restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     batch = data.batch(np.arange(1, 20, 2))
-    ours, theirs = (vars(one(batch.tx, batch.rx)) for one in (field, again))
+    ours, theirs = (vars(one(batch)) for one in (field, again))
     for name, value in ours.items():
         torch.testing.assert_close(value, theirs[name])
     assert isinstance(again, BearingField)

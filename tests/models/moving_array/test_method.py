@@ -8,6 +8,7 @@ import torch
 from boxes import ROOM, TRANSMITTER, room_of_spectra
 from scipy.optimize import nnls
 
+from gsparc.data.query import Query
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
 from gsparc.models.baselines.gp import GaussianProcess
@@ -85,7 +86,7 @@ def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted
     assert ours.confidence.min() > 0 and ours.confidence.max() < 1
     near = data.batch(split.folds[0].train[:8])
     far = dataclasses.replace(near.rx, position=near.rx.position + torch.tensor([20.0, 0, 0]))
-    here, there = fitted.predict(near.tx, near.rx), fitted.predict(near.tx, far)
+    here, there = fitted.predict(near), fitted.predict(Query(near.tx, far))
     assert (here.confidence > there.confidence).all() and (here.variance < there.variance).all()
     assert torch.isfinite(there.mean).all() and there.mean.min() >= 0 and there.mean.max() <= 1
 

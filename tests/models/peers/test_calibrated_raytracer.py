@@ -184,14 +184,14 @@ def test_it_predicts_where_nobody_measured_and_is_stored(wall, tmp_path):
     for steps in (0, 60):
         method = CalibratedRayTracer(steps=steps, **settings)
         assert method.fit(data, FOLD, FitContext()).seconds > 0
-        said_db, true_db = (10 * torch.log10(v[:, 0]) for v in (method.answer(test).mean, test.target))
+        said_db, true_db = (10 * torch.log10(v[:, 0]) for v in (method.predict(test).mean, test.target))
         error[steps] = float((said_db - true_db).square().mean().sqrt())
     assert error[60] < 0.3 and error[60] < 0.5 * error[0]
     config = "model: {_target_: gsparc.models.peers.calibrated_raytracer.CalibratedRayTracer, depth: 2, "
     config += "diffraction: false, samples: 20000, batch: 100}"
     checkpoint.save(tmp_path / "model.ckpt", method, config)
     again, _ = loading.load(tmp_path / "model.ckpt")
-    torch.testing.assert_close(again.answer(test).mean, method.answer(test).mean, rtol=1e-4, atol=0)
+    torch.testing.assert_close(again.predict(test).mean, method.predict(test).mean, rtol=1e-4, atol=0)
 
 
 @pytest.mark.slow
@@ -206,5 +206,5 @@ def test_channels_are_predicted_up_to_one_factor(wall):
     method = CalibratedRayTracer(depth=2, diffraction=False, samples=20_000, batch=100)
     method.fit(data, FOLD, FitContext())
     test = data.batch(FOLD.test)
-    missed = (method.answer(test).mean - test.target).abs().square().sum() / test.target.abs().square().sum()
+    missed = (method.predict(test).mean - test.target).abs().square().sum() / test.target.abs().square().sum()
     assert missed < 0.05

@@ -10,6 +10,7 @@ from scenes import error, fold_of, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
 from gsparc.data.datasets.rfid import planar_array
+from gsparc.data.query import Query
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.peers.gsrf import fourier_legendre, terms
 from gsparc.models.peers.newrf import virtual_transmitters
@@ -169,7 +170,7 @@ def test_newrf_predicts_where_no_direction_was_measured(tmp_path):
     plain = error(fitted("gp", data, fold, tmp_path), data, fold.test)
     assert error(method, data, fold.test) < 0.3 * min(plain, 1.0)
     moved = Pose(where.rx.position + 0.5, where.rx.rotation)
-    assert not torch.allclose(method.predict(where.tx, where.rx).mean, method.predict(where.tx, moved).mean)
+    assert not torch.allclose(method.predict(where).mean, method.predict(Query(where.tx, moved)).mean)
 
 
 def test_kriging_knows_how_far_shadows_reach(tmp_path):
@@ -179,14 +180,14 @@ def test_kriging_knows_how_far_shadows_reach(tmp_path):
     assert 0.5 < law.range / 2.0 < 2 and 0.5 < law.total / 36 < 2
     method = fitted("kriging", data, fold, tmp_path)
     batch = data.batch(fold.test)
-    said = method.predict(batch.tx, batch.rx)
+    said = method.predict(batch)
     miss = 10 * np.log10(said.mean.numpy()) - decibels[fold.test]
-    known = 10 * np.log10(fitted("mean", data, fold, tmp_path).predict(batch.tx, batch.rx).mean.numpy())
+    known = 10 * np.log10(fitted("mean", data, fold, tmp_path).predict(batch).mean.numpy())
     assert (miss**2).mean() < 0.7 * ((known - decibels[fold.test]) ** 2).mean()
     sure = said.confidence.numpy()
     assert (miss[sure > np.median(sure)] ** 2).mean() < (miss[sure <= np.median(sure)] ** 2).mean()
     far = Pose(batch.rx.position[:1] + 1000.0, batch.rx.rotation[:1])
-    assert method.predict(batch.tx[:1], far).confidence < 0.05
+    assert method.predict(Query(batch.tx[:1], far)).confidence < 0.05
 
 
 def test_kriging_serves_spectra_and_repeated_places(tmp_path):
@@ -201,15 +202,15 @@ def test_kriging_maps_the_power_of_channels(tmp_path, campaign, folds):
     data, fold = campaign("csi", 60), folds(60).folds[0]
     method = fitted("kriging", data, fold, tmp_path)
     batch = data.batch(fold.test)
-    said = method.predict(batch.tx, batch.rx).mean
+    said = method.predict(batch).mean
     assert said.shape == batch.target.shape and said.is_complex()
     again = fitted("kriging", data, fold, tmp_path)
     again.restore(data.site, method.state())
-    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said)
+    assert torch.equal(again.predict(batch).mean, said)
     rows = data.batch(fold.train)  # at a measured place the map is the measurement, less the nugget
     method.variogram = type(method.variogram)(0.0, method.variogram.total, method.variogram.range)
     method._solve()
-    there = method.predict(rows.tx, rows.rx).mean
+    there = method.predict(rows).mean
     assert torch.allclose(there, rows.target, atol=1e-2 * float(rows.target.abs().max()))
 
 
@@ -219,4 +220,4 @@ def test_kriging_of_silent_training_channels_is_silent(tmp_path, campaign, folds
     data.target[np.concatenate([fold.train, fold.val])] = 0
     method = fitted("kriging", data, fold, tmp_path)
     batch = data.batch(fold.test)
-    assert method.predict(batch.tx, batch.rx).mean.abs().max() < 1e-15
+    assert method.predict(batch).mean.abs().max() < 1e-15

@@ -9,10 +9,12 @@ import yaml
 from clocks import wound
 from scenes import lobes, room
 
+from gsparc.data.query import Query
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import HasGaussians
 from gsparc.models.peers.trained import rate_factor
 from gsparc.models.registry import method_class
+from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 
 SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
@@ -39,7 +41,7 @@ def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
     method = brief(name)
     assert method.fit(data, fold, FitContext(tmp_path)).seconds > 0
     batch = data.batch(fold.test)
-    said = method.predict(batch.tx, batch.rx).mean
+    said = method.predict(batch).mean
     assert said.shape == batch.target.shape and said.dtype == batch.target.dtype
     assert torch.isfinite(said).all()
     cls = method_class(name)
@@ -47,10 +49,10 @@ def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
     checkpoint.save(tmp_path / "model.ckpt", method, yaml.safe_dump(config))
     again = loading.load(tmp_path / "model.ckpt")[0]
     # Another object may choose another of the equally good summation orders.
-    torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, said, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(again.predict(batch).mean, said, rtol=1e-5, atol=1e-6)
     twin = brief(name)
     twin.fit(data, fold, FitContext(tmp_path))
-    assert torch.equal(twin.predict(batch.tx, batch.rx).mean, said), "the same steps give the same model"
+    assert torch.equal(twin.predict(batch).mean, said), "the same steps give the same model"
 
 
 @pytest.mark.parametrize("name", ["gsrf", "newrf"])
@@ -65,7 +67,7 @@ def test_no_test_row_is_looked_at(tmp_path, name):
                 data.directions[i] = np.full_like(data.directions[i], np.nan)
         method = brief(name)
         method.fit(data, fold, FitContext(tmp_path))
-        answers.append(method.predict(batch.tx, batch.rx).mean)
+        answers.append(method.predict(batch).mean)
     assert torch.equal(*answers)
 
 
@@ -111,7 +113,7 @@ def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds)
     with pytest.raises(ValueError, match=r"ngrf: spectra need .* array"):
         brief("ngrf").fit(campaign("spectrum", 30), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match="gsrf: not fitted"):
-        brief("gsrf").predict(torch.zeros(1, 3), None)
+        brief("gsrf").predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
     with pytest.raises(ValueError, match="budget_s > 0"):
         brief("gsrf", budget_s=0)
 
@@ -129,17 +131,17 @@ def test_a_peer_shows_its_gaussians_and_what_they_emit(tmp_path, name, kind):
     method = brief(name)
     assert isinstance(method, HasGaussians)
     with pytest.raises(ValueError, match="not fitted"):
-        method.gaussians(torch.zeros(1, 3), None)
+        method.gaussians(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
     method.fit(data, fold, FitContext(tmp_path))
     one, other = (data.batch(fold.test[i : i + 1]) for i in (0, 1))
-    cloud, elsewhere = (method.gaussians(batch.tx, batch.rx) for batch in (one, other))
+    cloud, elsewhere = (method.gaussians(batch) for batch in (one, other))
     np.testing.assert_allclose(cloud.means, method.network.field.means.detach(), rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(cloud.quats, axis=1), 1)
     assert len(cloud) == method.size() and (cloud.strengths >= 0).all() and np.ptp(cloud.strengths) > 0
     assert (cloud.strengths != elsewhere.strengths).any()
     both = data.batch(fold.test[:2])
     square = (cloud.strengths**2 + elsewhere.strengths**2) / 2
-    np.testing.assert_allclose(method.gaussians(both.tx, both.rx).strengths ** 2, square, rtol=1e-5)
+    np.testing.assert_allclose(method.gaussians(both).strengths ** 2, square, rtol=1e-5)
 
 
 def test_planar_gaussians_are_shown_in_the_directions_that_they_brighten(tmp_path):
@@ -150,15 +152,15 @@ def test_planar_gaussians_are_shown_in_the_directions_that_they_brighten(tmp_pat
     with torch.no_grad():
         network.strengths.zero_()
         network.strengths[7] = 0.9
-    cloud = method.gaussians(batch.tx, batch.rx)
+    cloud = method.gaussians(batch)
     receiver = data.site.static_position
     np.testing.assert_allclose(np.linalg.norm(cloud.means - receiver, axis=1), 1, rtol=1e-5)
     assert cloud.strengths.argmax() == 7
-    brightest = int(method.predict(batch.tx, batch.rx).mean[0].argmax())
+    brightest = int(method.predict(batch).mean[0].argmax())
     towards = data.site.grid.directions().reshape(-1, 3)[brightest].double().numpy()
     turn = np.eye(3) if data.site.rx_rotation is None else data.site.rx_rotation
     assert turn @ towards @ (cloud.means[7] - receiver) > 0.95
     moving, fold = lobes(tmp_path, "rx")
     method.fit(moving, fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match="a receiver that moves"):
-        method.gaussians(batch.tx, batch.rx)
+        method.gaussians(batch)

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
@@ -70,7 +71,7 @@ def test_of_few_rows_it_is_the_plain_process(share):
     field.condition(data, rows)
     plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
     said = plain.fit(data, Fold(rows, rows[:0], np.arange(120, 160)), FitContext()).notes
-    told, found = plain.predict(batch.tx, batch.rx), field(batch.tx, batch.rx)
+    told, found = plain.predict(batch), field(batch)
     assert field.count == 0 and found.explained is None and field.terms == ("residual",)
     assert torch.allclose(found.mean, told.mean, rtol=1e-5)
     assert torch.allclose(found.variance, told.variance, rtol=1e-4)
@@ -97,7 +98,7 @@ def test_a_known_wall_explains_powers_behind_it(blocked):
     plain, _ = initialise(data, np.arange(160))
     plain.condition(data, np.arange(160))
     truth = db(batch.target)
-    errors = [np.mean((db(f(batch.tx, batch.rx).mean) - truth) ** 2) for f in (field, plain)]
+    errors = [np.mean((db(f(batch).mean) - truth) ** 2) for f in (field, plain)]
     assert field.terms == ("power", "residual") and errors[0] < 0.7 * errors[1], (errors, notes)
 
 
@@ -105,11 +106,11 @@ def test_far_away_the_variance_is_the_priors(blocked):
     data, field, _ = blocked
     near = data.batch(np.arange(5))
     far = Pose(near.rx.position + torch.tensor([0.0, 1e7, 0.0]), near.rx.rotation)
-    there, here = field(near.tx, far), field(near.tx, near.rx)
+    there, here = field(Query(near.tx, far)), field(near)
     assert here.unknown.max() < 0.6 and there.unknown.min() > here.unknown.max()
     bare = small_field(data)
     bare.condition(data, np.arange(50))
-    there = bare(near.tx, far)
+    there = bare(Query(near.tx, far))
     prior = 9.0 * (1 + 0.2 + 1)  # the level's own variance is learned, all else is not
     spread = there.variance.sqrt() / (math.log(10) / 10 * there.mean[:, 0])
     assert torch.all(spread.square() > 0.5 * prior) and torch.all(spread.square() <= prior * 1.001)
@@ -125,7 +126,7 @@ def test_left_out_rows_are_predicted_without_them():
     for i in (0, 7, 24):
         field.condition(data, np.delete(rows, i))
         batch = data.batch(np.array([i]))
-        told = field(batch.tx, batch.rx)
+        told = field(batch)
         assert torch.allclose(found.mean[i], told.mean[0], rtol=1e-4)
         assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
 
@@ -144,7 +145,7 @@ def test_both_ends_may_move():
     field, _ = initialise(data, np.arange(50))
     field.condition(data, np.arange(50))
     batch = data.batch(np.arange(50, 60))
-    assert torch.isfinite(field(batch.tx, batch.rx).mean).all()
+    assert torch.isfinite(field(batch).mean).all()
 
 
 def test_what_cannot_be_is_refused():
@@ -175,7 +176,7 @@ def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
     errors = []
     for init in (InitSettings("scene", file=str(tmp_path / "town.yaml")), InitSettings()):
         field = powers_of(data, rows, init)
-        errors.append(float(np.sqrt(np.mean((db(field(batch.tx, batch.rx).mean) - db(batch.target)) ** 2))))
+        errors.append(float(np.sqrt(np.mean((db(field(batch).mean) - db(batch.target)) ** 2))))
     assert errors[0] < 0.75 * errors[1], errors
 
 
@@ -184,16 +185,16 @@ def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch
     rows = np.arange(240)
     field.condition(data, rows)
     batch = data.batch(np.arange(240, len(data)))
-    whole, left = db(field(batch.tx, batch.rx).mean), field.left_out()
+    whole, left = db(field(batch).mean), field.left_out()
     monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
     near = copy.deepcopy(field)
     near.condition(data, rows)
     assert isinstance(near.process.posterior, Nearest) and near.terms == field.terms
-    assert np.sqrt(np.mean((db(near(batch.tx, batch.rx).mean) - whole) ** 2)) < 0.3
+    assert np.sqrt(np.mean((db(near(batch).mean) - whole) ** 2)) < 0.3
     assert np.array_equal(near.left_out().rows, left.rows)
     assert np.sqrt(np.mean((db(near.left_out().mean) - db(left.mean)) ** 2)) < 0.4
     again = restored(data.site, near.state())
-    assert torch.equal(again(batch.tx, batch.rx).mean, near(batch.tx, batch.rx).mean)
+    assert torch.equal(again(batch).mean, near(batch).mean)
     assert torch.equal(again.left_out().mean, near.left_out().mean)
 
 

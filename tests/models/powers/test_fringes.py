@@ -8,6 +8,7 @@ import torch
 from releases import REAL
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.models.powers.field import initialise, restored
 from gsparc.models.powers.fringes import Blend, sampled
@@ -66,7 +67,7 @@ def test_fringes_predict_better_than_the_process_alone(interfering):
     batch = data.batch(np.arange(400, 500))
     plain, _ = initialise(data, np.arange(400), fringes=False)
     plain.condition(data, np.arange(400))
-    errors = [np.mean((db(f(batch.tx, batch.rx).mean) - db(batch.target)) ** 2) for f in (field, plain)]
+    errors = [np.mean((db(f(batch).mean) - db(batch.target)) ** 2) for f in (field, plain)]
     assert field.terms == ("phase", "residual") and errors[0] < 0.95 * errors[1], (errors, notes)
 
 
@@ -74,8 +75,9 @@ def test_far_from_all_rows_the_process_is_left_alone(interfering):
     data, field, _ = interfering
     batch = data.batch(np.arange(3))
     far = Pose(batch.rx.position + 100.0, batch.rx.rotation)
-    there = field(batch.tx, far)
-    decibels, spread, share = (v.numpy() for v in field.process.answer(field._places(batch.tx, far)))
+    asked = Query(batch.tx, far)
+    there = field(asked)
+    decibels, spread, share = (v.numpy() for v in field.process.answer(asked.places(data.site)))
     assert np.allclose(db(there.mean), decibels, atol=1e-4) and np.allclose(there.unknown, share)
     slope = np.log(10) / 10 * there.mean[:, 0].numpy()
     assert np.allclose(there.variance.numpy(), spread * slope**2, rtol=1e-4)
@@ -88,7 +90,7 @@ def test_rows_are_predicted_by_solutions_that_never_saw_them(interfering):
     assert np.array_equal(found.rows, np.arange(400)) and set(fringes.blind) == set(range(5))
     error = db(found.mean) - db(data.targets(found.rows))
     batch = data.batch(np.arange(400))
-    seen = db(field(batch.tx, batch.rx).mean) - db(batch.target)
+    seen = db(field(batch).mean) - db(batch.target)
     assert np.mean(error**2) > np.mean(seen**2)
 
 
@@ -96,7 +98,7 @@ def test_slopes_of_places(interfering):
     data, field, _ = interfering
     batch = data.batch(np.arange(400, 404))
     places = batch.rx.position.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(field(batch.tx, Pose(places, batch.rx.rotation)).mean.sum(), places)
+    (slope,) = torch.autograd.grad(field(Query(batch.tx, Pose(places, batch.rx.rotation))).mean.sum(), places)
     assert torch.isfinite(slope).all() and slope.abs().max() > 0
 
 
@@ -106,7 +108,7 @@ def test_state_makes_it_again(interfering, tmp_path):
     again = restored(data.site, torch.load(tmp_path / "field.pt", weights_only=True))
     batch = data.batch(np.arange(400, 420))
     for name in ("mean", "variance", "explained", "unknown"):
-        one, other = (getattr(f(batch.tx, batch.rx), name) for f in (field, again))
+        one, other = (getattr(f(batch), name) for f in (field, again))
         assert torch.allclose(one, other, rtol=1e-5), name
     assert torch.allclose(field.left_out().mean, again.left_out().mean, rtol=1e-4)
 
@@ -146,5 +148,5 @@ def test_a_measured_plane():
     for fringes in (True, False):
         field, _ = initialise(data, np.flatnonzero(~test), fringes)
         field.condition(data, np.flatnonzero(~test))
-        errors.append(np.mean((db(field(batch.tx, batch.rx).mean) - db(batch.target)) ** 2))
+        errors.append(np.mean((db(field(batch).mean) - db(batch.target)) ** 2))
     assert errors[0] < errors[1], errors

@@ -10,6 +10,7 @@ import torch
 from releases import REAL
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
@@ -70,7 +71,7 @@ def test_one_process_of_neighbours_was_trusted_in_squares_that_nobody_walked():
     known, batch = np.sort(np.concatenate([fold.train, fold.val])), data.batch(fold.test)
     plain = GaussianProcess()
     plain.fit(data, Fold(known, known[:0], fold.test), FitContext())
-    both = [fitted(data, known)(batch.tx, batch.rx).mean, plain.predict(batch.tx, batch.rx).mean]
+    both = [fitted(data, known)(batch).mean, plain.predict(batch).mean]
     own, alone = ((db(one) - db(batch.target)).square().mean().sqrt() for one in both)
     assert own < 0.96 * alone, (own, alone)
 
@@ -82,7 +83,7 @@ def test_a_mixture_is_the_mean_of_its_members(silent):
     process, batch = field.process, data.batch(np.arange(140, 160))
     assert process is not None and len(process.members) > 1
     assert np.isclose(sum(share for share, _ in process.members), 1) and process.members[0][0] >= 0.3
-    places = field._places(batch.tx, batch.rx)
+    places = batch.places(data.site)
     mean, variance, unknown = process.answer(places)
     parts = [(share, *one.answer(places)) for share, one in process.members]
     assert torch.allclose(mean, sum(share * one for share, one, *_ in parts))
@@ -107,7 +108,7 @@ def test_a_mixture_is_stored_whole(monkeypatch, nearest):
         if not given:
             again.condition(data, rows)
             field.condition(data, rows)
-        told, found = (one(batch.tx, batch.rx) for one in (field, again))
+        told, found = (one(batch) for one in (field, again))
         assert torch.allclose(told.mean, found.mean, rtol=1e-6)
         assert torch.allclose(told.variance, found.variance, rtol=1e-5)
 
@@ -120,7 +121,7 @@ def test_a_mixture_has_slopes():
     tx, turned = batch.tx.double(), batch.rx.rotation.double()
 
     def mean(at: torch.Tensor) -> torch.Tensor:
-        return 10 * field(tx, Pose(at, turned)).mean.log10()
+        return 10 * field(Query(tx, Pose(at, turned))).mean.log10()
 
     assert torch.autograd.gradcheck(mean, place.requires_grad_(), eps=1e-5, atol=1e-4)
 

@@ -11,6 +11,7 @@ import torch
 from releases import REAL
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
@@ -42,7 +43,7 @@ def fit(method, data: Measurements, known: int):
 
 
 def error_db(method, batch) -> float:
-    found = method.predict(batch.tx, batch.rx).mean
+    found = method.predict(batch).mean
     return float((10 * torch.log10(found / batch.target)).square().mean().sqrt())
 
 
@@ -88,7 +89,7 @@ def test_intervals_cover_what_they_promise():
     data = town(420)
     method = GaussianProcess()
     batch, _ = fit(method, data, 300)
-    found = method.predict(batch.tx, batch.rx)
+    found = method.predict(batch)
     missed = 10 * torch.log10(found.mean / batch.target)[:, 0]
     deviation = found.variance.sqrt() / (np.log(10) / 10 * found.mean[:, 0])
     assert 0.83 < float((missed.abs() < 1.645 * deviation).float().mean()) < 0.97
@@ -98,9 +99,9 @@ def test_intervals_cover_what_they_promise():
 def test_a_mean_alone_has_no_variance():
     data, method = town(120), GaussianProcess()
     batch, _ = fit(method, data, 100)
-    lean = reduced(method, {"confidence": False}, {}).predict(batch.tx, batch.rx)
+    lean = reduced(method, {"confidence": False}, {}).predict(batch)
     assert lean.variance is None and method.knobs() == ("confidence",)
-    assert torch.allclose(lean.mean, method.predict(batch.tx, batch.rx).mean, rtol=1e-5)
+    assert torch.allclose(lean.mean, method.predict(batch).mean, rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -133,11 +134,11 @@ def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():
     data = town(160, shadowing_db=0.5)
     method = GaussianProcess()
     batch, _ = fit(method, data, 120)
-    here = method.predict(batch.tx, batch.rx).confidence
+    here = method.predict(batch).confidence
     assert here.mean() > 0.8
     away = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
     there = Pose(batch.rx.position[:5] + 3000.0 * away, batch.rx.rotation[:5])
-    assert method.predict(batch.tx[:5], there).confidence.max() < 0.01
+    assert method.predict(Query(batch.tx[:5], there)).confidence.max() < 0.01
 
 
 def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():

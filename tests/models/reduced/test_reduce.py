@@ -59,7 +59,7 @@ class Case(NamedTuple):
 
     def answer(self, method: Method | None = None, rows: np.ndarray | None = None) -> Prediction:
         batch = self.data.batch(self.fold.test if rows is None else rows)
-        return (method or self.method).predict(batch.tx, batch.rx)
+        return (method or self.method).predict(batch)
 
     def away(self, other: Method) -> float:
         """Relative squared distance of its answers and another's."""
@@ -214,7 +214,7 @@ def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
 def test_what_a_process_beside_adds_stays(field):
     both = field._replace(method=copy.copy(field.method))
     plain = both.answer(both.less(stride=2)).mean
-    beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(plain)))
+    beside = SimpleNamespace(predict=lambda query: SimpleNamespace(mean=torch.ones_like(plain)))
     both.method._average = (beside, 0.25)
     assert torch.allclose(0.75 * plain + 0.25, both.answer(both.less(stride=2)).mean)
 

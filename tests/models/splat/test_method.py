@@ -12,6 +12,7 @@ from scenes import fold_of
 
 from gsparc import load
 from gsparc.data.load import load as load_data
+from gsparc.data.query import Query
 from gsparc.models import checkpoint, loading
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
@@ -51,7 +52,7 @@ def test_images_smaller_than_the_window_of_ssim_train(tmp_path, caplog, height, 
     method, data, fold = fitted(tmp_path / "own.npz", tmp_path, *more)
     assert "smaller than SSIM's window" in caplog.text
     batch = data.batch(fold.test)
-    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
+    assert torch.isfinite(method.predict(batch).mean).all()
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -60,13 +61,13 @@ def test_every_kind_of_file_trains_predicts_and_reads_back(tmp_path, name):
     file = MAKERS[name](tmp_path / "own.npz")
     method, data, fold = fitted(file, tmp_path)
     batch = data.batch(fold.test)
-    said = method.predict(batch.tx, batch.rx)
+    said = method.predict(batch)
     assert said.mean.shape == batch.target.shape and said.mean.dtype == batch.target.dtype
     assert torch.isfinite(said.mean).all()
     assert ((said.confidence >= 0) & (said.confidence <= 1)).all()
     checkpoint.save(tmp_path / "model.ckpt", method, OmegaConf.to_yaml(compose(*brief(file)), resolve=True))
     again, _ = loading.load(tmp_path / "model.ckpt")
-    two = again.predict(batch.tx, batch.rx)
+    two = again.predict(batch)
     assert torch.equal(said.mean, two.mean) and torch.equal(said.confidence, two.confidence)
     asked = load(tmp_path / "model.ckpt")
     where = {data.site.moving_end: data.moving[fold.test[0]] + data.site.origin}
@@ -82,8 +83,8 @@ def test_a_loaded_field_predicts_new_poses(tmp_path):
     where = torch.tensor([[0.1, 0.2, -0.1]])
     quarter = torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]])
     still = torch.from_numpy(data.tx[:1]).float()
-    straight = method.predict(still, Pose.identity(where)).mean
-    turned = method.predict(still, Pose(where, quarter)).mean
+    straight = method.predict(Query(still, Pose.identity(where))).mean
+    turned = method.predict(Query(still, Pose(where, quarter))).mean
     assert torch.allclose(turned.roll(8, -1), straight, atol=1e-3)
     assert (turned - straight).abs().max() > 0.05
 
@@ -95,30 +96,30 @@ def test_many_queries_are_answered_in_chunks(tmp_path):
         method, data, _ = fitted(spectra(folder / "own.npz", moving=moving), folder)
         rows = np.resize(np.arange(len(data)), QUERY_CHUNK + 7)
         batch = data.batch(rows)
-        together = method.predict(batch.tx, batch.rx)
+        together = method.predict(batch)
         last = data.batch(rows[-3:])
         assert len(together.mean) == QUERY_CHUNK + 7 == len(together.confidence)
-        assert torch.allclose(together.mean[-3:], method.predict(last.tx, last.rx).mean, atol=1e-4)
+        assert torch.allclose(together.mean[-3:], method.predict(last).mean, atol=1e-4)
 
 
 def test_a_static_receiver_is_frozen_and_another_pose_is_not(tmp_path):
     method, data, _ = fitted(spectra(tmp_path / "own.npz"), tmp_path)
     batch = data.batch(np.arange(4))
-    quick = method.predict(batch.tx, batch.rx).mean
+    quick = method.predict(batch).mean
     slow = method.fitted()(batch.tx, batch.rx).mean.clamp(0, 1).detach()
     assert torch.allclose(quick, slow, atol=1e-5)
     moved = Pose(batch.rx.position + 0.5, batch.rx.rotation)
-    assert not torch.allclose(method.predict(batch.tx, moved).mean, quick, atol=1e-3)
+    assert not torch.allclose(method.predict(Query(batch.tx, moved)).mean, quick, atol=1e-3)
 
 
 def test_an_edit_after_a_prediction_is_seen_by_the_next(tmp_path):
     method, data, _ = fitted(spectra(tmp_path / "own.npz"), tmp_path)
     batch = data.batch(np.arange(4))
-    before = method.predict(batch.tx, batch.rx).mean
+    before = method.predict(batch).mean
     with torch.no_grad():
         method.model.gaussians.opacity_logits.fill_(-9.0)
         method.model.gaussians.version += 1
-    assert method.predict(batch.tx, batch.rx).mean.sum() < 0.1 * before.sum()
+    assert method.predict(batch).mean.sum() < 0.1 * before.sum()
 
 
 @pytest.mark.parametrize("cut", ["last.ckpt", "refit/last.ckpt"])
@@ -140,7 +141,7 @@ def test_refit_learns_from_validation_rows_too_and_keeps_a_learned_confidence(tm
     for refit in ("false", "true"):
         method, data, fold = fitted(file, tmp_path / refit, f"model.refit={refit}", f"init={start}")
         batch = data.batch(fold.val)
-        said = method.predict(batch.tx, batch.rx)
+        said = method.predict(batch)
         seen[refit] = float((said.mean - batch.target).square().mean()), said.confidence
     if start == "auto":  # what is unknown in closed form is known of these rows after
         assert seen["true"][0] < 0.8 * seen["false"][0] and (seen["true"][1] > seen["false"][1]).all()

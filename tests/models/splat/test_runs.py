@@ -11,7 +11,8 @@ from worlds import World, arrays
 from gsparc.commands.train import train
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.baseline_cache import baseline
+from gsparc.data.query import Query
+from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.scores import score, unseen_runs
 from gsparc.models import loading
 from gsparc.models.gsparc import Gsparc
@@ -37,8 +38,8 @@ def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
     rows = objects.split.folds[0].test
     again, _ = loading.load(tmp_path / "run" / "model.ckpt")
     batch = data.batch(rows)
-    assert torch.allclose(again.answer(batch).mean, method.answer(batch).mean, atol=1e-5)
-    turned = method.answer(batch).mean / method.predict(batch.tx, batch.rx).mean
+    assert torch.allclose(again.predict(batch).mean, method.predict(batch).mean, atol=1e-5)
+    turned = method.predict(batch).mean / method.predict(Query(batch.tx, batch.rx)).mean
     assert len(np.unique(np.round(np.angle(turned.flatten().numpy()), 3))) == 5  # a phase for each run
 
 
@@ -59,10 +60,10 @@ class Turned(Method):
     def __init__(self, data, phase: float) -> None:
         self.data, self.phase = data, phase
 
-    def answer(self, batch):
+    def predict(self, batch):
         return Prediction(self.data.targets(batch.index.numpy()) * np.exp(1j * self.phase))
 
-    fit = predict = state = restore = None  # type: ignore[assignment]
+    fit = state = restore = None  # type: ignore[assignment]
 
 
 def test_runs_that_were_not_learned_from_are_scored_after_their_best_phase():

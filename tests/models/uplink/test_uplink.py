@@ -70,7 +70,7 @@ def _relative(found, true) -> torch.Tensor:
 def _errors(method, data) -> torch.Tensor:
     """Relative errors of the test rows."""
     batch = data.batch(fold().test)
-    return _relative(method.answer(batch).mean, batch.target)
+    return _relative(method.predict(batch).mean, batch.target)
 
 
 def test_beats_ridge_by_more_than_three_decibels(fitted) -> None:
@@ -83,11 +83,11 @@ def test_beats_ridge_by_more_than_three_decibels(fitted) -> None:
 def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:
     """Whatever turns the uplink turns the prediction: offsets are the snapshot's, not the model's."""
     method, data = fitted
-    uplink = data.batch(fold().test[:4]).uplink
-    noise = torch.full((4,), float(data.noise_variance[0]))
-    plain = method.from_uplink(uplink, noise).mean
+    batch = data.batch(fold().test[:4])
+    plain = method.predict(batch).mean
     up, down = method.search.aperture.tones, method._downlink.tones
-    turned = method.from_uplink(uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up), noise).mean
+    uplink = batch.uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up)
+    turned = method.predict(replace(batch, uplink=uplink)).mean
     expected = plain * torch.polar(torch.ones(26), 0.4 - 0.15 * down)
     assert (turned - expected).abs().square().sum() < 1e-2 * expected.abs().square().sum()
 
@@ -97,7 +97,7 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
     method, data = fitted
     batch = data.batch(np.concatenate([fold().val, fold().test]))
     few = torch.from_numpy(data.site.subcarriers_hz[11:15])
-    whole = method.answer(batch), batch.target, 1.0
+    whole = method.predict(batch), batch.target, 1.0
     piece = method.from_uplink_at(batch.uplink, few, batch.noise_variance, slice(0, 1))
     for found, true, factor in (whole, (piece, batch.target[:, :1, 11:15], 0.5)):
         assert ((found.confidence > 0) & (found.confidence < 1)).all()
@@ -113,11 +113,11 @@ def test_peers_answer_and_keep(make, tmp_path) -> None:
     method = make()
     method.fit(data, fold(), FitContext(tmp_path))
     batch = data.batch(fold().test)
-    before = method.answer(batch).mean
+    before = method.predict(batch).mean
     assert before.shape == batch.target.shape
     checkpoint.save(tmp_path / "m.ckpt", method)
     again, _ = loading.load(tmp_path / "m.ckpt")
-    assert torch.allclose(again.answer(batch).mean, before)
+    assert torch.allclose(again.predict(batch).mean, before)
 
 
 @pytest.mark.parametrize("inputs", ["own", pytest.param("all", marks=pytest.mark.slow)])
@@ -128,7 +128,8 @@ def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     uplink[:, 0] = 0
     method = Ridge(inputs)
     method.fit(replace(data, uplink=uplink), fold(), FitContext())
-    predicted = method.from_uplink(torch.from_numpy(uplink[fold().test])).mean
+    heard = torch.from_numpy(uplink[fold().test])
+    predicted = method.predict(replace(data.batch(fold().test), uplink=heard)).mean
     assert torch.isfinite(predicted).all() and predicted[:, 1:].abs().min() > 0
     assert inputs == "all" or (predicted[:, 0] == 0).all()
 
@@ -138,7 +139,7 @@ def test_saved_and_restored(fitted, tmp_path) -> None:
     checkpoint.save(tmp_path / "m.ckpt", method)
     again, _ = loading.load(tmp_path / "m.ckpt")
     batch = data.batch(fold().test[:3])
-    assert torch.equal(again.answer(batch).mean, method.answer(batch).mean)
+    assert torch.equal(again.predict(batch).mean, method.predict(batch).mean)
 
 
 def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
@@ -146,10 +147,10 @@ def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
     with pytest.raises(ValueError, match="has none"):
         Ridge().fit(deaf(data), fold(), FitContext())
     batch = data.batch(fold().test[:2])
-    with pytest.raises(ValueError, match="not positions"):
-        method.predict(batch.tx, batch.rx)
+    with pytest.raises(ValueError, match="uplink= is needed"):
+        method.predict(replace(batch, uplink=None))
     with pytest.raises(ValueError, match="fit or restore"):
-        UplinkField().answer(batch)
+        UplinkField().predict(batch)
 
 
 def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None:

@@ -15,14 +15,15 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.models.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
+from gsparc.models.conditional import ConditionalField, LeftOutRows
+from gsparc.models.method import Prediction
 from gsparc.models.per_station import SAME_PLACE_M
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
 from gsparc.models.powers.together.network import Network, by_site, learn_network, network_of
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.target_rows import entry_variance, from_real
-from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
@@ -54,7 +55,6 @@ class JointPowerField(ConditionalField):
     """
 
     kind = "joint_powers"
-    reads_rows = True
 
     def __init__(
         self,
@@ -98,19 +98,16 @@ class JointPowerField(ConditionalField):
         self.whole = max(float(loud.decibels.var()), self.own.variance)
         self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
 
-    def __call__(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
+    def __call__(self, query: Query) -> Prediction:
         """See `ConditionalField`; (B, 1) linear powers.
 
-        Args:
-            tx: (B, 3) [m].
-            rx: one shared or B receiver poses.
-            station: (B,) int64, or None: who stands at either end; negative was never heard.
+        Without stations, who stands at either end is asked; a negative one was never heard.
 
         Raises:
             ValueError: before `condition`.
         """
         posterior, elsewhere = self._conditioned()
-        places, number = self._ends(tx, rx, station)
+        places, number = self._ends(query)
         if self.network is not None:
             places = torch.cat([places, number[:, None].clamp_min(0)], 1)
             number = torch.where(number < 0, NEVER, torch.from_numpy(self.network.site)[number.clamp_min(0)])
@@ -121,13 +118,9 @@ class JointPowerField(ConditionalField):
                 mean[chosen], left = of.answer(places[chosen], one)
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
-        mean, spread, share = (part.to(tx.dtype) for part in (mean, spread, share))
+        mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
         power = self._power(mean)
-        return Posterior(power, entry_variance(spread, power, "rssi"), None, share)
-
-    def answer(self, batch: Batch) -> Posterior:
-        """See `ConditionalField`; two stations may stand at one place."""
-        return self(batch.tx, batch.rx, batch.station)
+        return Prediction(power, entry_variance(spread, power, "rssi"), share)
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
@@ -167,14 +160,14 @@ class JointPowerField(ConditionalField):
             raise ValueError("a field of powers: condition it first")
         return self.posterior, self.elsewhere
 
-    def _ends(self, tx: Tensor, rx: Pose, station: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _ends(self, query: Query) -> tuple[Tensor, Tensor]:
         """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""
-        sender = tx.cpu().double()
-        receiver = rx.position.reshape(-1, 3).expand(len(tx), 3).cpu().double()
+        sender = query.tx.cpu().double()
+        receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3).cpu().double()
         moving, still = (sender, receiver) if self.site.static_end == "rx" else (receiver, sender)
         table = torch.from_numpy(self.places)
-        if station is not None:
-            number = station.cpu().long()
+        if query.station is not None:
+            number = query.station.cpu().long()
             still = torch.where(number[:, None] >= 0, table[number.clamp_min(0)], still)
             return torch.cat([moving, still], 1), number
         number = self._standing(still)

@@ -151,13 +151,7 @@ class Terms:
 
     @classmethod
     def read(cls, trend: Trend, state: dict[str, Any]) -> Terms:
-        """The terms whose `state()` this was.
-
-        Raises:
-            ValueError: with Gaussians along the paths, as earlier versions had them.
-        """
-        if state.get("shadow_db"):
-            raise ValueError("learned with Gaussians along paths, which are no more; train again")
+        """The terms whose `state()` this was."""
         names = ("nearest", "farthest", "inducing", "length", "place_db")
         return cls(trend, *(state[name] for name in names))
 

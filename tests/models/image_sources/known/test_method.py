@@ -36,7 +36,7 @@ def fitted(name: str, data, rows: np.ndarray, **init):
 
 def missed(field, data, rows: np.ndarray) -> float:
     batch = data.batch(rows)
-    return nmse(field(batch.tx, batch.rx).mean.numpy(), data.targets(rows).numpy())
+    return nmse(field(batch).mean.numpy(), data.targets(rows).numpy())
 
 
 def test_known_walls_tell_all_from_few_rows(room):

@@ -14,6 +14,7 @@ from scenes import fold_of
 import gsparc
 from gsparc.data.datasets.ble import BLE
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
@@ -168,7 +169,7 @@ def test_what_all_hear_alike_is_found(learned):
     data, fold, field, notes = learned
     assert field.unheard.place_db and not field.heard.place_db, notes
     batch = data.batch(fold.test)
-    found = field(batch.tx, batch.rx, batch.station)
+    found = field(batch)
     error = db(found.mean) - db(batch.target)
     assert np.mean(np.abs(error) < 1.645 * spread_db(found)) > 0.8
 
@@ -179,7 +180,7 @@ def test_a_station_never_heard_gains_from_the_others():
     asked = data.batch(np.flatnonzero(data.station == 3))
     field, notes = initialise(data, rows)
     field.condition(data, rows)
-    found = field(asked.tx, asked.rx)
+    found = field(Query(asked.tx, asked.rx))
     error = db(found.mean) - db(asked.target)
     places = torch.from_numpy(data.moving[asked.index.numpy()])
     still = torch.from_numpy(POSTS[3] - data.site.origin).expand(len(places), 3)
@@ -193,9 +194,9 @@ def test_either_end_may_be_the_station(learned):
     data, fold, field, _ = learned
     batch = data.batch(fold.test[:20])
     turned = Pose(batch.tx, batch.rx.rotation)
-    there, back = field(batch.tx, batch.rx), field(batch.rx.position, turned)
+    there, back = field(Query(batch.tx, batch.rx)), field(Query(batch.rx.position, turned))
     assert torch.allclose(there.mean, back.mean, rtol=1e-4)
-    assert torch.allclose(there.mean, field(batch.tx, batch.rx, batch.station).mean, rtol=1e-4)
+    assert torch.allclose(there.mean, field(batch).mean, rtol=1e-4)
 
 
 def test_silent_rows_say_that_powers_are_low():
@@ -211,7 +212,7 @@ def test_silent_rows_say_that_powers_are_low():
         field = JointPowerField(data.site, places_of(data, rows)[0], own, terms, terms)
         field.condition(silent, used)
         batch = data.batch(np.flatnonzero(quiet))
-        errors.append(np.mean((db(field(batch.tx, batch.rx, batch.station).mean) - db(batch.target)) ** 2))
+        errors.append(np.mean((db(field(batch).mean) - db(batch.target)) ** 2))
     assert errors[0] < errors[1]
     assert initialise(silent, rows)[1]
 
@@ -226,7 +227,7 @@ def test_a_station_whose_place_nobody_gave():
     assert any("place of station" in note for note in notes)
     assert np.linalg.norm((field.places - data.site.stations.position)[2, :2]) < 40
     batch = replace(data, site=site).batch(np.flatnonzero(data.station == 2)[:5])
-    assert torch.isfinite(field(batch.tx, batch.rx, batch.station).mean).all()
+    assert torch.isfinite(field(batch).mean).all()
 
 
 def test_rows_are_thinned_at_places_that_stations_share():
@@ -247,8 +248,6 @@ def test_what_it_refuses():
     own, terms = prior_of(data)
     with pytest.raises(ValueError, match="condition it first"):
         JointPowerField(data.site, POSTS, own, terms, terms).left_out()
-    with pytest.raises(ValueError, match=r"Gaussians along paths.*train again"):  # of an earlier version
-        Terms.read(terms.trend, {**terms.state(), "shadow_db": 1.0})
 
 
 def test_gsparc_learns_stations_together(tmp_path):
@@ -258,11 +257,11 @@ def test_gsparc_learns_stations_together(tmp_path):
     report = method.fit(data, fold, FitContext(tmp_path, stations="together"))
     assert any("6 stations in one model" in note for note in report.notes)
     batch = data.batch(fold.test)
-    said = method.answer(batch)
-    assert torch.allclose(said.mean, method.predict(batch.tx, batch.rx).mean, rtol=1e-4)
+    said = method.predict(batch)
+    assert torch.allclose(said.mean, method.predict(Query(batch.tx, batch.rx)).mean, rtol=1e-4)
     checkpoint.save(tmp_path / "m.ckpt", method)
     twin, _ = loading.load(tmp_path / "m.ckpt")
-    assert torch.allclose(said.mean, twin.answer(batch).mean, rtol=1e-5)
+    assert torch.allclose(said.mean, twin.predict(batch).mean, rtol=1e-5)
     predictor = gsparc.load(tmp_path / "m.ckpt")
     place, number = data.tx[fold.test[0]] + data.site.origin, int(data.station[fold.test[0]])
     post = POSTS[number]
@@ -285,7 +284,7 @@ def test_stations_at_one_place_are_told_apart_by_their_numbers():
     method = for_links(Gsparc, data)
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
     batch = data.batch(np.flatnonzero(data.station < 2))
-    assert np.abs(db(method.answer(batch).mean) - db(batch.target)).max() < 2
+    assert np.abs(db(method.predict(batch).mean) - db(batch.target)).max() < 2
 
 
 def test_halls_gain_over_a_process_of_each_sensor():
@@ -296,7 +295,7 @@ def test_halls_gain_over_a_process_of_each_sensor():
         method = for_links(make, data)
         method.fit(data, fold, FitContext(stations=stations))
         batch = data.batch(fold.test)
-        errors.append(np.mean((db(method.answer(batch).mean) - db(batch.target)) ** 2))
+        errors.append(np.mean((db(method.predict(batch).mean) - db(batch.target)) ** 2))
     assert errors[0] < errors[1], errors
 
 

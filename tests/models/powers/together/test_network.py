@@ -8,6 +8,7 @@ import torch
 from networks import Network, judged, network, reference
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.data.units import in_decibels
 from gsparc.models import checkpoint, loading
@@ -37,7 +38,7 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
     rx, result = Pose(places, torch.eye(3).expand(len(places), 3, 3)), []
     for number, still in enumerate(one.place):
         tx = torch.from_numpy(still - site.origin).float().expand(len(places), 3)
-        said = method.of(number).predict(tx, rx)
+        said = method.of(number).predict(Query(tx, rx))
         assert said.variance is not None
         result.append(in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy()))
     mean, spread = (np.stack(part, 1) for part in zip(*result, strict=True))

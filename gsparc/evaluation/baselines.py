@@ -1,0 +1,79 @@
+"""Baselines beside which a method is shown: which serve the data, and their fits."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
+from gsparc.evaluation.scores import Scores, score
+from gsparc.models.method import Method
+from gsparc.models.per_station import for_links, trained_stations
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
+
+log = logging.getLogger(__name__)
+
+BASELINES = ("zero", "mean", "nearest", "idw", "gp")
+
+
+def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
+    """Names of all plain methods that serve these measurements and rows."""
+    site, names = data.site, BASELINES
+    if site.kind == "rssi":
+        return (*names, "distance_law", "kriging")
+    carrier = site.carrier_hz is not None or (
+        site.stations is not None and site.stations.carrier_hz is not None
+    )
+    if site.kind != "csi" or not carrier:
+        return names
+    folds = split.folds if data.station is not None else ()  # of all stations of test rows enough are known
+    few = (trained_stations(method_class("complex_gp")(), data, fold)[1].any() for fold in folds)
+    return names if any(few) else (*names, "complex_gp")
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A baseline on every fold of a split.
+
+    Attributes:
+        methods: one fitted method per fold.
+        scores: pooled results.
+        train_s: fitting time of each fold [s].
+    """
+
+    methods: tuple[Method, ...]
+    scores: Scores
+    train_s: tuple[float, ...]
+
+
+def baseline(
+    name: str,
+    data: Measurements,
+    split: Split,
+    eval_on: str = "test",
+    learned: tuple[Measurements, Split] | None = None,
+) -> Fitted:
+    """Fit the baseline `name` with its default settings on each fold, and score it.
+
+    Args:
+        name: as in `gsparc.models.registry.METHODS`.
+        data: the dataset.
+        split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
+        eval_on: `train`, `val` or `test`.
+        learned: other measurements to learn from, and the folds of these; None: `data` and `split`.
+    """
+    own, before = learned or (data, split)
+    unseen = eval_on == "val" and learned is None
+    methods, seconds = [], []
+    for number, fold in enumerate(before.folds):
+        method = for_links(method_class(name), own)
+        known = replace(fold, val=fold.val[:0]) if unseen else fold
+        report = method.fit(own, known, FitContext(Path()))
+        for note in report.notes:
+            log.info("fold %d: %s", number, note)
+        methods.append(method)
+        seconds.append(report.seconds)
+    return Fitted(tuple(methods), score(methods, data, split, eval_on), tuple(seconds))
