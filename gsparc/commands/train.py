@@ -241,7 +241,7 @@ def _keep(
     for note in report.notes:
         log_of_models.info("%s", note)
     if not curve.read(context.run_dir):  # a method that trains in one piece
-        context.curve(report.seconds, fitted.name, report.error)
+        context.curve(report.seconds, fitted.name)
     marks = parts.marks(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)

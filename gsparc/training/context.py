@@ -14,6 +14,7 @@ import numpy as np
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.training import curve
 from gsparc.training.cost import NO_COST, Cost
+from gsparc.training.race import Race
 from gsparc.training.time_budget import NOTHING, Clock, Effort, Spent, TimeBudget
 
 if TYPE_CHECKING:
@@ -31,14 +32,12 @@ class FitReport:
         notes: what a reader must know (early stop, dropped components), one line each.
         limited_by: the clock whose seconds decided something, so that another machine's result may differ.
         cost: of each stage.
-        error: of rows held out, a share of their energy; NaN where none were.
     """
 
     seconds: float
     notes: tuple[str, ...] = ()
     limited_by: Clock | None = None
     cost: Cost = NO_COST
-    error: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,7 @@ class FitContext:
             `best_stations` says.
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
         leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
-        rival: error of another solution on these groups, as a share of the energy: searches end where the
-            first that is finished misses so much more that it will have no weight beside it.
+        race: the best of other solutions on these groups: searches end that fall behind.
         resume: what an interrupted run left, to go on from: a file, or the folder of a run of parts.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -79,7 +77,7 @@ class FitContext:
     stations: StationModels = "auto"
     split: SplitSettings | FileSettings | None = None
     leave_out: tuple[np.ndarray, ...] = ()
-    rival: float = math.inf
+    race: Race | None = None
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16

@@ -30,6 +30,7 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation, for_links
 from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose
+from gsparc.training import race
 from gsparc.training.context import FitReport
 
 SMALL = (
@@ -185,7 +186,8 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(fields, "LEAST_GAIN", -math.inf)
-    monkeypatch.setattr(solutions, "HOPELESS", math.inf)
+    monkeypatch.setattr(race, "HOPELESS", math.inf)
+    monkeypatch.setattr(solutions, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, budget_s=1e3)
     field = fitted.method.field
@@ -204,11 +206,15 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
 
 
-def test_a_search_is_left_out_where_few_sources_promise_nothing(monkeypatch, caplog):
-    monkeypatch.setattr(solutions, "HOPELESS", 0.0)
-    fitted = fit("channels", budget_s=8.0)
-    assert "init=sources is left out: few sources miss" in caplog.text
-    assert "sources" not in str(fitted.method.facts()["model/init"]).replace("few sources", "").split("+")
+def test_a_search_that_falls_behind_ends_and_so_do_those_that_follow(monkeypatch, caplog):
+    monkeypatch.setattr(race, "HOPELESS", 0.0)
+    monkeypatch.setattr(race, "SURE", -math.inf)
+    monkeypatch.setattr(race, "STALLED", 0.0)
+    fitted = fit("channels", budget_s=1e3)
+    for name in ("few sources", "sources"):
+        assert f"init={name} is left out: " in caplog.text
+    assert fitted.method.facts()["model/init"] == "diffuse"
+    assert "few sources" in fitted.report.cost.unused
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,9 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
-from gsparc.models.haste import CHOSEN_ON
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
-from gsparc.models.powers.settings import MEANS, MeanName, fit_powers
+from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
 from gsparc.models.reduced import Filled, MeanOnly, View
 from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
 from gsparc.processes.density import by_left_out

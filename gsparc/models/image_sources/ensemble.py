@@ -10,6 +10,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from functools import partial
 from itertools import takewhile
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,6 +22,7 @@ from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.processes.worker import Cancelled, after, cancelled_by, late_when
+from gsparc.training.race import Race, rowwise
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -29,7 +31,7 @@ QUADRATURE = 0.4  # initial `Scene.quadrature`
 SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
 ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
-BEATEN = 2.0  # times the error of a rival: sources that missed more had no weight in the end
+Look = Callable[[Rows, Scene, bool], None]  # of a search, with phases; whether it is the last
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
 
@@ -42,12 +44,12 @@ def search_many(
     budget: TimeBudget,
     clutter: bool,
     cache: SearchCache,
-    rival: float = math.inf,
+    look: Look | None = None,
 ) -> list[Member]:
     """One search per set of rows, best first; at least one, others while the budget lasts.
 
-    The first two that have reached the noise floor, or the first that is `beaten`, are the last: searches
-    of higher numbers do not start, or end without a result, whichever of them is finished first.
+    The first two that have reached the noise floor are the last: searches of higher numbers do not start, or
+    end without a result, whichever of them is finished first.
 
     Args:
         row_sets: rows of each search, unit mean power, about the middle of the scene.
@@ -58,9 +60,10 @@ def search_many(
         budget: effort of each, and what ends all together.
         clutter: search for occluding boxes and finite mirrors, too.
         cache: of finished searches.
-        rival: see `FitContext`.
+        look: at the first search after each of its rounds, and after the last.
 
     Raises:
+        Behind: a look says so.
         KeyboardInterrupt: by the user, within a step of each search.
     """
     errors: dict[int, float] = {}
@@ -74,15 +77,22 @@ def search_many(
     def unwanted(number: int) -> bool:
         """Whether those before it are all that is wanted."""
         before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
-        ended = at_noise_floor(before, noise_floor) or (len(before) > 0 and beaten(before[0], rival))
-        return stopped.is_set() or ended
+        return stopped.is_set() or at_noise_floor(before, noise_floor)
 
     def solve(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
-        rows = row_sets[number]
-        scene = Search(rows, transmitter, settings, seed + number, ends(ROUNDS_SHARE)).run()
-        scene = with_phases(rows, scene, QUADRATURE, noise_floor)
+        rows, ended = row_sets[number], ends(ROUNDS_SHARE)
+
+        def last_round() -> bool:
+            if look is not None and number == 0:
+                look(rows, with_phases(rows, search.scene, QUADRATURE, noise_floor), False)
+            return ended()
+
+        search = Search(rows, transmitter, settings, seed + number, last_round)
+        scene = with_phases(rows, search.run(), QUADRATURE, noise_floor)
         scene = refine(rows, learn_visibility(rows, scene, 10, settings.visibility), 20)
+        if look is not None and number == 0:
+            look(rows, scene, True)
         error = left_out_error(rows, scene)
         hidden = scene.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
         if clutter and not hidden and compact(rows):
@@ -126,6 +136,17 @@ def search_many(
     return sorted(members, key=lambda member: member.left_out)
 
 
+def raced(race: Race, group: np.ndarray, missed: Callable[[Rows, Scene], Tensor]) -> Look:
+    """Ends a search (`Behind`) that falls behind at rows `group` (n,) that it left out, and `missed` by."""
+    errors = [math.inf]
+
+    def look(rows: Rows, scene: Scene, last: bool) -> None:
+        what, before = f"{len(scene.sequences)} sources", 0.0 if last else errors[-1]
+        errors.append(race.looked(what, group, rowwise(missed(rows, scene)), before))
+
+    return look
+
+
 def refined(rows: Rows, member: Member) -> Member:
     """A search's result on rows that have changed a little."""
     scene = refine(rows, member.scene, 20)
@@ -146,11 +167,6 @@ def compact(rows: Rows) -> bool:
 def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2) -> bool:
     """Whether `least` searches have reached the noise floor."""
     return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
-
-
-def beaten(error: float, rival: float) -> bool:
-    """Whether a solution of such an error would hardly have weight beside one of error `rival`."""
-    return error > BEATEN * rival
 
 
 def ensemble_weights(members: list[Member]) -> Tensor:

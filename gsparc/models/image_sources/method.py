@@ -6,6 +6,7 @@ import copy
 import logging
 import math
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
@@ -15,14 +16,15 @@ from torch import Tensor
 
 from gsparc.data.assemble import identity
 from gsparc.data.query import Query
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.conditional import LeftOutRows
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
 from gsparc.models.image_sources.ensemble import (
+    Look,
     at_noise_floor,
-    beaten,
     ensemble_weights,
+    raced,
     refined,
     search_many,
 )
@@ -54,6 +56,7 @@ log = logging.getLogger(__name__)
 
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
+LOOKED_AT = 200  # rows of the group that a search leaves out, after each round
 ALONE = 3.0  # times the effort of a search beside others: here nothing else answers where it ends early
 
 
@@ -79,7 +82,6 @@ class ImageSourceGP(FramedMethod):
     name = "image_source_gp"
     held: LeftOutRows | None = None  # rows of `FitContext.leave_out`, by searches without them
     _groups: tuple[np.ndarray, ...] = ()
-    _rival = math.inf
     resumable = True  # finished searches are kept in `last.ckpt`
     takes_budget = True
 
@@ -108,7 +110,6 @@ class ImageSourceGP(FramedMethod):
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
         self.members: list[Posterior] = []
 
-    # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood.
 
@@ -119,7 +120,7 @@ class ImageSourceGP(FramedMethod):
         refuse(data.site, self.name)
         refuse_turning(data)
         known = np.concatenate([fold.train, fold.val])
-        self._groups, self._rival = context.leave_out, context.rival
+        self._groups = context.leave_out
         cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
         try:
             return self._fit(data, known, context, cache)
@@ -150,7 +151,11 @@ class ImageSourceGP(FramedMethod):
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
         row_sets = self._row_sets(data, known, self.searches)
-        members = self._search(row_sets, self.settings, budget, self.clutter, cache)
+        look = None
+        if self._groups and context.race is not None:
+            group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
+            look = raced(context.race, group, partial(self._missed, data.batch(group)))
+        members = self._search(row_sets, self.settings, budget, self.clutter, cache, look)
         if calibrated:
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
@@ -169,22 +174,27 @@ class ImageSourceGP(FramedMethod):
         self.members = [Posterior(rows, scene) for scene in scenes]
         self.query = Means(self.members)
 
+    def _of(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
+        """What these members alone say."""
+        twin = copy.copy(self)
+        twin._conditioned(rows, [member.scene for member in members])
+        twin.weights = ensemble_weights(members)
+        return twin
+
     def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
         scene, notes = self.members[0].scene, []
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else "all counted"
-        if beaten(min(member.left_out for member in members), self._rival):
-            ended = "far behind another solution"
         ended = "ended by the time budget" if budget.limited else ended
         notes.append(f"{len(members)} of {self.searches} searches ({ended}), {counts} sources")
         inside = int(scatterers(scene.sources, box_of(self.members[0].rows, scene.transmitter)).sum())
         notes.append(f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers")
         clutter = scene.clutter
         if len(clutter):
-            these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
-            notes.append(f"clutter: {these}")
+            boxes, patches = len(clutter.boxes), len(clutter.patches)
+            notes.append(f"clutter: {boxes} occluding boxes, {patches} finite mirrors")
         if (self.factors != 1).any():
             turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
             notes.append(
@@ -209,12 +219,15 @@ class ImageSourceGP(FramedMethod):
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
-        cache: SearchCache,
+        cache: SearchCache, look: Look | None = None,
     ) -> list[Member]:  # fmt: skip
         transmitter, floor = self._transmitter(), self.noise_floor
-        return search_many(
-            row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, self._rival
-        )
+        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, look)
+
+    def _missed(self, batch: Batch, rows: Rows, scene: Scene) -> Tensor:
+        """What a search's scene misses (n, ...) of a batch that it left out."""
+        mean = self._of(rows, [Member(scene, 1.0)]).predict(batch).mean
+        return mean - batch.target / self.factors[:, None]
 
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
         """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""
@@ -238,12 +251,9 @@ class ImageSourceGP(FramedMethod):
             if not members:
                 continue
             apart = self.frame.inside(gather(data, self._rows_of(known, turn), most, self.seed))
-            twin = copy.copy(self)
-            twin._conditioned(apart, [member.scene for member in members])
-            twin.weights = ensemble_weights(members)
             batch = data.batch(group)
             rows.append(group)
-            means.append(twin.predict(batch).mean)
+            means.append(self._of(apart, members).predict(batch).mean)
         mean = torch.cat(means)
         return LeftOutRows(np.concatenate(rows), mean, torch.full((len(mean),), float("nan")))
 
@@ -288,7 +298,6 @@ class ImageSourceGP(FramedMethod):
         target[known] = offsets.removed(data.target[known], frequency, carrier)
         return replace(data, target=target)
 
-    # ---- predicting ----
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`.
 
@@ -329,7 +338,6 @@ class ImageSourceGP(FramedMethod):
         predicted = (self.weights[:, None, None] * each).sum(0)
         return self._left_out(self.members[0].rows, predicted)
 
-    # ---- reductions ----
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
         return ("searches", "keep", "confidence")
@@ -362,7 +370,6 @@ class ImageSourceGP(FramedMethod):
         twin.query = Means(twin.members, VARIANCE_ROWS if whole else 0)
         return twin if whole else MeanOnly(twin)
 
-    # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         self._fitted()

@@ -77,6 +77,8 @@ def solve(
     if several or share_explained is not None:  # else it is of these rows already
         field.condition(data, known)
     seconds = budget.counted.wall
+    if several:
+        context.curve(seconds, "final")
     stages = {name: report.seconds for name, report in reports.items()}
     stages["weighing"] = max(init_s - sum(stages.values()), 0.0)
     stages["final weights"] = seconds - init_s

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.conditional import ConditionalField, LeftOutRows
 from gsparc.models.fields import INITIALISERS
+from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
@@ -29,6 +28,7 @@ from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.race import Behind, Race
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,6 @@ log = logging.getLogger(__name__)
 MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 GROUPS = 3  # of training rows, that solutions are weighed by
 FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
-HOPELESS = 1.5  # times the error of waves from all around, of few sources: more had no weight then
 OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what effort they are given
 CLUTTERED = ("sources", "scene", "joint_powers")  # initialisers to which `clutter` means something
 SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
@@ -73,20 +72,25 @@ def find(
     fields: dict[str, ConditionalField] = {}
     reports: dict[str, FitReport] = {}
     read: dict[str, set[str]] = {}
+    ended: dict[str, str] = {}
+    race: Race | None = None
+
+    def note(what: str, error: float) -> None:
+        context.curve(budget.counted.wall, what, error)
+
     for name, settings in plans:
         part = name.split()[-1]
-        if fields and context.resume is None and part in SEARCHES and budget.over():
-            log.info("init=%s is left out: the seconds were over", name)
-            continue
-        if part in SEARCHES and (why := _hopeless(name, reports)) is not None:
-            log.info("init=%s is left out: %s", name, why)
-            continue
-        within = replace(context, budget_s=budget.left_s)
+        if part in SEARCHES:
+            spent = fields and context.resume is None and budget.over()
+            if why := "the seconds were over" if spent else ended.get(part) or _reached(race):
+                log.info("init=%s is left out: %s", name, why)
+                continue
+        within, began = replace(context, budget_s=budget.left_s), budget.counted.wall
         if name.startswith("few "):
             within = replace(within, run_dir=Path(), resume=None)
         try:
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
-            within = replace(within, leave_out=leave_out, rival=least_error(reports.values()))
+            within = replace(within, leave_out=leave_out, race=race)
             with heeded.apart() as read[name], late_when(budget.over):
                 clutter = part not in CLUTTERED or effects.visibility is not False
                 field, report = INITIALISERS[part](data, rows, settings, clutter, within)
@@ -95,42 +99,35 @@ def find(
             fields[name] = field
             if part not in OPEN_ENDED:
                 field.held = _held(field, data, rows, groups)
+            if field.held is not None:
+                target = comparable(data.batch(field.held.rows).target, data.site)
+                one = Race.of(field.held.rows, comparable(field.held.mean, data.site), target, note)
+                if race is None or part not in SEARCHES:
+                    note(name, float(one.squared.mean()))
+                else:
+                    race.looked(name, one.rows, one.squared)
+                race = one if race is None or one.error < race.error else race
         except KeyboardInterrupt:
             if not name.startswith("few "):
                 raise
             raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
         except ValueError as error:
-            if len(parts) == 1 or name == init.name:
+            if isinstance(error, Behind):
+                ended[part], reports[name] = str(error), FitReport(budget.counted.wall - began)
+            elif len(parts) == 1 or name == init.name:
                 raise
             log.info("init=%s is left out: %s", name, error)
             fields.pop(name, None)
             continue
-        if field.held is not None:
-            target = comparable(data.batch(field.held.rows).target, data.site)
-            miss = solution_weights.error(comparable(field.held.mean, data.site), target)
-            report = replace(report, error=miss)
         reports[name] = report
     return fields, reports, read
 
 
-def least_error(reports: Iterable[FitReport]) -> float:
-    """Of rows held out, by the best of some solutions; infinity where none says."""
-    return min((one.error for one in reports if not math.isnan(one.error)), default=math.inf)
-
-
-def _hopeless(name: str, reports: dict[str, FitReport]) -> str | None:
-    """Why a search would gain nothing, by what one of `FEW` sources missed; None where it may.
-
-    Args:
-        name: of the search.
-        reports: of solutions found before.
-    """
-    if f"few {name}" not in reports or "diffuse" not in reports:
+def _reached(race: Race | None) -> str | None:
+    """Why no search can gain much, where another solution is as near as searches come; else None."""
+    if race is None or race.error > CONVERGED_ERROR:
         return None
-    few, waves = reports[f"few {name}"].error, reports["diffuse"].error
-    if not few > HOPELESS * waves:
-        return None
-    return f"few sources miss {few:.3f} of the energy, waves from all around {waves:.3f}"
+    return f"another solution misses {race.error:.4f} of the energy of rows held out"
 
 
 def weighed(

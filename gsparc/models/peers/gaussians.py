@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from gsparc.data.query import Query
-from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
@@ -48,7 +47,6 @@ class DeformedPeer(GaussianPeer):
         others: see `TrainedPeer`.
     """
 
-    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
     count: int = 500
     width: int = 64
     depth: int = 3

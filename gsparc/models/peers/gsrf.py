@@ -121,7 +121,7 @@ class GSRF(GaussianPeer):
         others: see `TrainedPeer`.
     """
 
-    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
+    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.042, "csi": 0.027}
     rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
     makes = ComplexGaussians
     name: str = "gsrf"

@@ -114,7 +114,7 @@ class NeRF2(TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
+    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.13}
     makes = MarchedField
     name: str = "nerf2"
     width: int = 64

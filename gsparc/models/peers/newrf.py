@@ -50,7 +50,7 @@ class NeWRF(TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    kinds: ClassVar[tuple[Kind, ...]] = ("csi",)
+    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.091}
     name: str = "newrf"
     width: int = 128
     depth: int = 4

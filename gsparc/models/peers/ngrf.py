@@ -38,7 +38,7 @@ class NGRF(TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    kinds: ClassVar[tuple[Kind, ...]] = ("csi", "spectrum")
+    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0038, "spectrum": 0.020}
     rates: ClassVar[dict[str, float]] = {
         "means": 3e-3, "log_extents": 5e-3, "gains": 1e-2, "antennas": 5e-3,
     }  # fmt: skip

@@ -21,6 +21,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.models.peers.gaussians import Deformation, DeformedPeer, GaussianNetwork, render_each
 from gsparc.models.peers.trained import Scene
@@ -108,6 +109,7 @@ class PlanarGaussians(GaussianNetwork):
 class SwiftWRF(DeformedPeer):
     """Spectra; settings as of `DeformedPeer`."""
 
+    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.031}
     rates: ClassVar[dict[str, float]] = {
         "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
     }  # fmt: skip

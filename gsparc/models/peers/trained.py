@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import count, pairwise
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import lightning.pytorch as L
@@ -25,6 +25,7 @@ from gsparc.training.time_budget import TimeBudget
 
 DEFAULT_BUDGET_S = 60.0
 FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
+SLACK = 3.0  # times the seconds that are wanted, after which a schedule of a table's steps is cut
 WARMUP = 0.02  # share of the training over which rates rise
 QUERY_CHUNK = 32  # bounds the memory of one prediction call
 
@@ -97,13 +98,12 @@ def perceptron(
 
 @dataclass(eq=False, kw_only=True)
 class TrainedPeer(Method):
-    """Learns from `fold.train` and `fold.val` together for a given time; nothing is chosen on `val`.
+    """Learns from `fold.train` and `fold.val` together in counted steps; nothing is chosen on `val`.
 
     Args:
-        budget_s: seconds of training in processor time per thread, so that a busy machine gives the same
-            training (on a quiet one they are the clock's). None takes 60.
-        max_steps: steps of the learning-rate schedule, which end training where the seconds do not: such a
-            run repeats exactly. None stretches the schedule to the seconds.
+        budget_s: seconds of training in processor time per thread. None takes 60.
+        max_steps: of the learning-rate schedule, which the seconds cut. None takes as many as the seconds
+            hold by `step_s`: a run repeats exactly unless its steps take `SLACK` times as long.
         batch_size: samples per step.
         rate: Adam's learning rate where `rates` names no other.
         seed: of initial weights and order of the samples.
@@ -112,7 +112,7 @@ class TrainedPeer(Method):
 
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
-    kinds: ClassVar[tuple[Kind, ...]]
+    step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare/cells)
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
@@ -142,18 +142,19 @@ class TrainedPeer(Method):
         return {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Train until the budget is spent.
+        """Train to the end of the schedule, or of the seconds.
 
         Raises:
             ValueError: a kind of data the method does not serve, or no training rows.
             RuntimeError: the loss became NaN or infinite.
         """
         assert self.budget_s is not None
-        budget = TimeBudget(self.budget_s, "processor")
+        limit = self.budget_s if self.max_steps else SLACK * self.budget_s
+        budget, kinds = TimeBudget(limit, "processor"), tuple(self.step_s)
         rows = np.sort(np.concatenate([fold.train, fold.val]))
-        if data.site.kind not in self.kinds:
+        if data.site.kind not in kinds:
             raise ValueError(
-                f"{self.name}: predicts {' and '.join(self.kinds)}; this dataset holds {data.site.kind}"
+                f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {data.site.kind}"
             )
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
@@ -163,19 +164,19 @@ class TrainedPeer(Method):
         self._train(data, rows, budget)
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        return FitReport(budget.counted.wall, (note,), budget.clock if self.steps != self.max_steps else None)
+        return FitReport(budget.counted.wall, (note,), budget.limited_by)
 
     def _train(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> None:
         network = self.fitted()
         optimizer = torch.optim.Adam(self._groups(network), eps=1e-15)
         base = [group["lr"] for group in optimizer.param_groups]
         draw = torch.Generator().manual_seed(self.seed)
-        for step in count():
-            progress = self._progress(step, budget)
-            if progress >= 1:
+        total = self.max_steps or self._steps_within(data.site.kind)
+        for step in range(total):
+            if step and budget.over():
                 break
             for group, rate in zip(optimizer.param_groups, base, strict=True):
-                group["lr"] = rate * rate_factor(progress)
+                group["lr"] = rate * rate_factor(step / total)
             batch = data.batch(order(self.seed, step, self.batch_size, rows))
             optimizer.zero_grad(set_to_none=True)
             loss = network.loss(batch, draw)
@@ -187,10 +188,10 @@ class TrainedPeer(Method):
             optimizer.step()
             self.steps = step + 1
 
-    def _progress(self, step: int, budget: TimeBudget) -> float:
-        """Share of the training that is over; step 0 is always taken."""
-        spent = budget.spent / budget.seconds if step else 0.0
-        return spent if self.max_steps is None or spent >= 1 else step / self.max_steps
+    def _steps_within(self, kind: Kind) -> int:
+        """Steps that the seconds hold by `step_s`; of other batches in proportion."""
+        assert self.budget_s is not None
+        return max(round(self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size), 1)
 
     def _groups(self, network: nn.Module) -> Iterator[dict[str, Any]]:
         for name, parameter in network.named_parameters():

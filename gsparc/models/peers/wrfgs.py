@@ -16,6 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.schema import Kind
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     Deformation,
@@ -69,6 +70,7 @@ class DeformedGaussians(GaussianNetwork):
 class WRFGSPlus(DeformedPeer):
     """Spectra; settings as of `DeformedPeer`."""
 
+    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.022}
     rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
     makes = DeformedGaussians
     name: str = "wrfgs"

@@ -22,7 +22,6 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.conditional import ConditionalField, LeftOutRows
-from gsparc.models.haste import haste
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.settings import candidates, chosen_among, mixture
@@ -34,7 +33,7 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, Rows, conditioned, trend_of_rows
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend, Walls, trend_of
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.time_budget import Effort, TimeBudget
 
 QUERIES = 512  # at a time: memory
 
@@ -205,14 +204,14 @@ def initialise(
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
     waves = walls is None and fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength)
-    pace = haste(budget)
+    chosen_on = (Effort() if budget is None else budget.effort).chosen_on
     if walls is not None:
         law, notes = law_of(seen, data.site)
         trend = replace(trend_of_rows(seen, law), walls=walls)
-        best = chosen_among(seen, [(trend, 0.0, ())], seed, pace)
+        best = chosen_among(seen, [(trend, 0.0, ())], seed, chosen_on)
         note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
         return PowerField(data.site, trend, best.kernel, seed), (note, *notes, *best.notes)
-    found, said = candidates(seen, data.site, seed, pace), list[str]()
+    found, said = candidates(seen, data.site, seed, chosen_on), list[str]()
     if waves:
         order = np.argsort(rows)
         plain = found[0].trend, found[0].kernel
@@ -222,7 +221,7 @@ def initialise(
         if waved is not None:  # their share was learned beside this process
             notes = (found[0].description, *found[0].notes, note)
             return PowerField(data.site, *plain, seed, waved), notes
-    ((_, first), *others), notes = mixture(seen, found, seed, pace)
+    ((_, first), *others), notes = mixture(seen, found, seed, chosen_on)
     assert isinstance(first.kernel, Kernel) and first.trend is not None
     return PowerField(data.site, first.trend, first.kernel, seed, None, others), (*notes, *said)
 

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
-from gsparc.models.haste import CHOSEN_ON, UNHURRIED, Haste
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SPREAD, groups
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
@@ -28,12 +27,14 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw, trend_of_rows
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import late, late_when
+from gsparc.processes.worker import late
+from gsparc.training.time_budget import Effort
 
 MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
-COMPARED_ON, LEAST_COMPARED_ON = 500, 150  # of them, constant and distance law; in haste
+CHOSEN_ON = Effort.chosen_on
+COMPARED_ON, LEAST_COMPARED_ON = 500, 150  # of them, constant and distance law; with little effort
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
@@ -49,7 +50,7 @@ AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more on
 
 
 def fit_powers(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int = CHOSEN_ON
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """A process of largest leave-one-out likelihood, and what must be said of it.
 
@@ -60,18 +61,18 @@ def fit_powers(
         site: where the still end is.
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
-        haste: see there.
+        chosen_on: rows that settings are chosen on, of more.
     """
-    trend, kernel, notes = choose_prior(rows, site, mean, seed, haste)
+    trend, kernel, notes = choose_prior(rows, site, mean, seed, chosen_on)
     process, more = conditioned(rows, trend, kernel, seed)
     return process, (*notes, *more)
 
 
 def choose_prior(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, haste: Haste = UNHURRIED
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int = CHOSEN_ON
 ) -> tuple[Trend, Kernel, tuple[str, ...]]:
     """The settings of `fit_powers` alone, and what must be said of them."""
-    best = chosen_among(rows, _trends(rows, site, mean), seed, haste)
+    best = chosen_among(rows, _trends(rows, site, mean), seed, chosen_on)
     return best.trend, best.kernel, (best.description, *best.notes)
 
 
@@ -97,17 +98,17 @@ class Candidate:
         return f"{word} {' and '.join(parts)}, {noise}, about {mean}"
 
 
-def candidates(rows: Rows, site: Site, seed: int, haste: Haste) -> list[Candidate]:
+def candidates(rows: Rows, site: Site, seed: int, chosen_on: int) -> list[Candidate]:
     """Of each mean law the settings of `choose_prior`, the best first; of few or very many rows the best."""
     trends = _trends(rows, site, "auto")
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
-        return [chosen_among(rows, trends, seed, haste)]
-    found = [chosen_among(rows, [one], seed, haste) for one in trends]
+        return [chosen_among(rows, trends, seed, chosen_on)]
+    found = [chosen_among(rows, [one], seed, chosen_on) for one in trends]
     return sorted(found, key=lambda one: -one.score)
 
 
 def mixture(
-    rows: Rows, found: list[Candidate], seed: int, haste: Haste
+    rows: Rows, found: list[Candidate], seed: int, chosen_on: int
 ) -> tuple[list[tuple[float, Prior]], tuple[str, ...]]:
     """Candidates with their shares in a mean, the largest first, and what must be said of them.
 
@@ -115,7 +116,7 @@ def mixture(
     """
     if len(found) == 1:
         return [(1.0, Prior(found[0].kernel, found[0].trend))], (found[0].description, *found[0].notes)
-    part = rows.drawn(haste.rows, seed)
+    part = rows.drawn(chosen_on, seed)
     posteriors = [conditioned(part, one.trend, one.kernel, seed)[0].posterior for one in found]
     gram, count = np.zeros((len(found),) * 2), 0.0
     for sides in SIDES:
@@ -139,13 +140,11 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
 
 
 def chosen_among(
-    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
+    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """The best of mean laws (each with its cost and notes), with its kernel."""
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
-    with late_when(haste.late):
-        pace = replace(haste, rows=min(haste.rows, COMPARED_ON)) if many else haste
-        best = _settings(rows, trends, seed, pace)
+    best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
     if not many:
         return best
     values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])  # given their nearest, all tell
@@ -154,14 +153,14 @@ def chosen_among(
 
 
 def _settings(
-    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, haste: Haste
+    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
     loud = rows if rows.silent.all() else rows.loud
-    loud = loud.at(draw(np.zeros(len(loud.places), bool), haste.rows, seed))
-    compared_on = min(COMPARED_ON, max(haste.rows // 2, LEAST_COMPARED_ON))
+    loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on, seed))
+    compared_on = min(COMPARED_ON, max(chosen_on // 2, LEAST_COMPARED_ON))
     few = loud.at(draw(np.zeros(len(loud.places), bool), compared_on, seed))
-    weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, haste.rows), seed))
+    weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, chosen_on), seed))
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     if both and not late():

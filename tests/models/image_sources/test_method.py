@@ -24,6 +24,7 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
+from gsparc.training.race import Behind, Race
 
 
 def _predicted(method, data, index):
@@ -120,12 +121,15 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
     assert "1 of 3 searches (ended by the time budget)" in report.notes[0]
 
 
-def test_a_search_far_behind_another_solution_is_the_last(tmp_path):
+def test_a_search_far_behind_another_solution_ends(tmp_path):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1)
     method = ImageSourceGP(searches=4, search_rows=60, margin=1.0, max_sources=2, clutter=False)
-    report = method.fit(data, fold, FitContext(tmp_path, rival=1e-9))
-    assert "searches (far behind another solution)" in report.notes[0]
-    assert len(method.members) == 1  # however many threads search
+    group, looks = fold.train[::3], []
+    target = data.batch(group).target
+    race = Race.of(group, 1.0001 * target, target, lambda what, error: looks.append((what, error)))
+    with pytest.raises(Behind, match="of the energy of rows held out"):
+        method.fit(data, fold, FitContext(tmp_path, leave_out=(group,), race=race))
+    assert looks and all(what.endswith("sources") and error > 0 for what, error in looks)
 
 
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):

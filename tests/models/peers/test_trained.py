@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from itertools import count
-
 import numpy as np
 import pytest
 import torch
@@ -74,16 +71,19 @@ def test_no_test_row_is_looked_at(tmp_path, name):
     assert torch.equal(*answers)
 
 
-def test_the_budget_ends_training_and_the_schedule_reaches_its_end(tmp_path, monkeypatch):
-    """Against a clock of equal steps: how long a step takes on a busy machine is not what is tested."""
+def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
+    """Seconds stretched it, and a busy machine took other steps; only many times the seconds cut it."""
     data, fold = lobes(tmp_path)
-    seen, ticks = [], count()
+    seen, clock = [], wound(monkeypatch).process_time
     monkeypatch.setattr("gsparc.models.peers.trained.rate_factor", lambda p: seen.append(p) or rate_factor(p))
-    monkeypatch.setattr("gsparc.training.time_budget.time.process_time", lambda: next(ticks) * 0.05)
-    torch.set_num_threads(1)
-    method = brief("swiftwrf", max_steps=None, budget_s=0.5)
-    assert method.fit(data, fold, FitContext(tmp_path)).limited_by == "processor"  # whatever the run's is
-    assert len(set(seen)) == method.steps > 3 and 0.8 < seen[-1] < 1 and sorted(seen) == seen
+    for slow_s, batch, steps in ((0.0, 8, 10), (0.4, 8, 10), (0.0, 16, 5), (1.5, 8, 1)):
+        method = brief("swiftwrf", max_steps=None, budget_s=0.31, batch_size=batch)
+        build = method.build
+        method.build = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
+        seen.clear()
+        report = method.fit(data, fold, FitContext(tmp_path))
+        assert report.limited_by == ("processor" if slow_s > 1 else None)
+        assert method.steps == steps and sorted(set(seen)) == [step / steps for step in range(steps)]
     assert rate_factor(0.0) < 0.1 < rate_factor(0.05) and rate_factor(1.0) < 0.05
 
 
@@ -100,14 +100,6 @@ def test_steps_that_are_given_repeat_exactly_or_the_clock_is_named(tmp_path, mon
         assert method.steps == (1 if slow_s > 1 else 3)
         weights.append(torch.cat([w.flatten() for w in method.fitted().state_dict().values()]))
     assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
-
-
-def test_budgets_are_processor_time(tmp_path):
-    torch.set_num_threads(1)
-    data, fold = lobes(tmp_path)
-    before = time.process_time()
-    brief("swiftwrf", max_steps=None, budget_s=0.5).fit(data, fold, FitContext(tmp_path))
-    assert 0.4 < time.process_time() - before < 3
 
 
 def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):

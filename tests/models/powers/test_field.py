@@ -18,7 +18,6 @@ from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models import fields
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.haste import haste
 from gsparc.models.image_sources.known.images import counted
 from gsparc.models.powers.field import PowerField, initialise, restored
 from gsparc.ops import Pose
@@ -164,9 +163,9 @@ def powers_of(data: Measurements, rows: np.ndarray, init: InitSettings) -> Power
 
 def test_settings_are_chosen_on_rows_that_no_clock_counts():
     """A busy machine chose on fewer rows: 5.573 dB beside two loops, 5.580 alone."""
-    chosen = [haste(FitContext(effort=effort, budget_s=1e-9).time_budget()) for effort in (1e-3, 1.0, 8.0)]
-    assert [each.rows for each in chosen] == [150, 1000, 2000] and all(each.late() for each in chosen)
-    assert haste(None).rows == 1000 and not haste(None).late()
+    chosen = [FitContext(effort=effort, budget_s=1e-9).time_budget() for effort in (1e-3, 1.0, 8.0)]
+    assert [each.effort.chosen_on for each in chosen] == [150, 1000, 2000]
+    assert all(each.over() for each in chosen)
 
 
 @pytest.mark.parametrize("rows", [20, 60])
