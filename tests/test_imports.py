@@ -32,7 +32,7 @@ ARROWS = {
     "models": "conf data field ops physics processes simulate training",
     "prediction": "data field locate models ops physics processes training",
     "locate": "data models processes training",
-    "evaluation": "conf data locate models prediction simulate training",
+    "evaluation": "conf data locate models prediction processes simulate training",
     "maps": "data evaluation models prediction processes training",
     "view": "data evaluation maps models ops prediction",
     "callbacks": "data evaluation field training",

@@ -127,7 +127,7 @@ class DataModule(pl.LightningDataModule, ABC):
         SettingError: a batch without rows.
     """
 
-    align = "auto"  # `dataset.align`, of every dataset: what of the rows' factors is free
+    free = "auto"  # `dataset.align`: what of each row's factor is free
 
     def __init__(self, name: str, batch_size: int = 16) -> None:
         super().__init__()
@@ -147,7 +147,7 @@ class DataModule(pl.LightningDataModule, ABC):
     @cached_property
     def measurements(self) -> Measurements:
         """All measurements, read when first asked for; rows far beyond all others are warned of."""
-        data = allowed(self.load(), self.align)
+        data = allowed(self.load(), self.free)
         for warning in outliers.warnings(data):
             log.warning("%s: %s", self.name, warning)
         return data

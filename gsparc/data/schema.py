@@ -14,7 +14,7 @@ from gsparc.data.blocks import take
 from gsparc.data.query import Batch
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
-from gsparc.physics.row_factors import Freedom
+from gsparc.physics.row_factors import Freedom, words
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
@@ -153,8 +153,7 @@ class Site:
     def need_phase(self, what: str) -> None:
         """`ValueError` where rows have phases of their own, so that `what` cannot be told."""
         if self.freedom != "none":
-            free = self.freedom.replace("+", ", ")
-            raise ValueError(f"{what}: channels are known up to {free} of each row, levels and shapes are")
+            raise ValueError(f"{what}: channels are known up to {words(self.freedom)} of each row")
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:

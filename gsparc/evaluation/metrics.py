@@ -117,7 +117,9 @@ class ChannelMetrics(SampleMetric):
     `power_mae_db` is the mean absolute error of a sample's power in dB, the figure of coverage maps.
     """
 
-    quantities = ("error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae", "power_db")
+    quantities: tuple[str, ...] = (
+        "error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae", "power_db",
+    )  # fmt: skip
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         # In stored units, which are near 1: fourth powers of 1e-90 or 1e90 under- or overflow.
@@ -166,7 +168,7 @@ class AlignedChannelMetrics(ChannelMetrics):
     `tone_rmse_db` is the error of levels at single subcarriers and antennas.
     """
 
-    quantities = (*ChannelMetrics.quantities, "tone_db2")
+    quantities: tuple[str, ...] = (*ChannelMetrics.quantities, "tone_db2")
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = (x.abs().double().flatten(1).numpy() for x in (prediction, target))

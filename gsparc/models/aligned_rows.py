@@ -24,7 +24,7 @@ from scipy.spatial.distance import cdist
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.physics.row_factors import Freedom, turning
+from gsparc.physics.row_factors import Freedom, turning, words
 from gsparc.processes.kernel import Kernel, WaveKernel
 from gsparc.processes.nearest import weights_of
 from gsparc.processes.neighbourhood import covering
@@ -81,7 +81,7 @@ def in_one_gauge(data: Measurements, fold: Fold) -> Measurements:
     gauge: Literal["carrier", "free"] = "carrier" if all(one.gauge == "carrier" for one in found) else "free"
     log.info(
         "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
-        len(known), site.freedom, float(np.mean([one.error for one in found])),
+        len(known), words(site.freedom), float(np.mean([one.error for one in found])),
         "the carrier's" if gauge == "carrier" else "free",
     )  # fmt: skip
     result = replace(data, target=target, run=None, site=replace(site, gauge=gauge))

@@ -17,6 +17,12 @@ FINE = 8  # delays tried within one over the bandwidth
 MOST_DELAYS = 1024
 
 
+def words(freedom: Freedom) -> str:
+    """For messages: `a phase and a delay`."""
+    parts = [f"a {part}" for part in freedom.split("+")]
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+
+
 def delays(tones: np.ndarray) -> np.ndarray:
     """Delays (T,) [s] that tones (K,) [Hz] tell apart, evenly spaced about 0."""
     tones = np.sort(tones)

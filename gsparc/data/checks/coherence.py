@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
-from gsparc.physics.row_factors import FREEDOMS, Freedom, delays, turning
+from gsparc.physics.row_factors import FREEDOMS, Freedom, delays, turning, words
 
 log = logging.getLogger(__name__)
 
@@ -51,11 +51,7 @@ class Coherence:
     freedom: Freedom
 
     def __str__(self) -> str:
-        own = (
-            ""
-            if self.freedom == "none"
-            else f"every row has a {self.freedom.replace('+', ', ')} of its own: "
-        )
+        own = "" if self.freedom == "none" else f"every row has {words(self.freedom)} of its own: "
         return (
             f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
             f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
